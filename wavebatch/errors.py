@@ -1,0 +1,13 @@
+"""The three errors of wavebatch; each is also the builtin that a caller would expect."""
+
+
+class ConfigError(ValueError):
+    """A chain file, option or parameter is wrong: nothing has been started."""
+
+
+class InputError(OSError):
+    """A file cannot be read as what it claims to be, or an output cannot be written."""
+
+
+class StageError(RuntimeError):
+    """A stage broke its contract while a block ran through it: a bug, never hidden."""
