@@ -1,0 +1,178 @@
+"""Output files that appear whole or not at all: written under a temporary name in the same folder, then published."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import filecmp
+import os
+import secrets
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from wavebatch.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: stale files then stay until somebody removes them
+    fcntl = None
+
+_PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
+_NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
+
+
+@contextlib.contextmanager
+def reporting(target: Path) -> Iterator[None]:
+    """Turns an operating system's error while `target` is written into one InputError line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{target}: cannot be written: {error.strerror or error}; {_remedy(error)}") from error
+
+
+def _remedy(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free space or choose another output folder"
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return "check the folder's permissions"
+    if error.errno == errno.ENOENT:
+        return "make the folder first"
+    return "choose another output folder"
+
+
+class Draft:
+    """A file being written: `file` is open under a temporary name, for reading too, and locked while its process lives.
+
+    target: the name it will have. overwrite: whether publishing replaces a file of that name.
+    Raises InputError where the folder cannot be written or, without overwrite, the target exists.
+    """
+
+    def __init__(self, target: Path, *, overwrite: bool) -> None:
+        self.target = Path(target)
+        self.overwrite = overwrite
+        if not overwrite and os.path.lexists(self.target):
+            raise InputError(_exists(self.target))
+        with reporting(self.target):
+            self.path, descriptor = _create(self.target.parent)
+        self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
+        self.published = False
+
+    def publish(self, *, same_is_fine: bool = False) -> None:
+        """Gives the finished file its name, at once; without overwrite an existing file is never replaced.
+
+        same_is_fine: an existing target with the very same bytes counts as published (what a killed run left).
+        """
+        with reporting(self.target):
+            self.file.flush()
+            os.fsync(self.file.fileno())
+            try:
+                if self.overwrite:
+                    os.replace(self.path, self.target)
+                else:
+                    _link(self.path, self.target)
+            except FileExistsError:
+                if not (same_is_fine and filecmp.cmp(self.path, self.target, shallow=False)):
+                    raise InputError(_exists(self.target)) from None
+            else:
+                self.published = True
+            _sync_folder(self.target.parent)
+        self.discard()
+
+    def discard(self) -> None:
+        """Closes and removes the temporary file; harmless when it is gone already."""
+        with contextlib.suppress(OSError):
+            os.unlink(self.path)
+        with contextlib.suppress(OSError):
+            self.file.close()
+
+    def withdraw(self) -> None:
+        """Takes a published file back, for when one that belongs to it could not be published."""
+        if self.published and not self.overwrite:
+            with contextlib.suppress(OSError):
+                os.unlink(self.target)
+
+
+def publish_together(drafts: Sequence[Draft]) -> None:
+    """Publishes drafts in order; the last one is the file whose presence says that all are there.
+
+    A failure takes the earlier ones back, except those that replaced an older file.
+    """
+    done: list[Draft] = []
+    try:
+        for draft in drafts:
+            draft.publish(same_is_fine=draft is not drafts[-1])
+            done.append(draft)
+    except BaseException:
+        for draft in done:
+            draft.withdraw()
+        for draft in drafts:
+            draft.discard()
+        raise
+
+
+def remove_stale(folder: Path) -> list[Path]:
+    """Removes the temporary files of dead processes from `folder` and returns their names.
+
+    A file whose lock somebody holds is being written and stays. On systems without file locks nothing is removed.
+    """
+    removed: list[Path] = []
+    if fcntl is None:
+        return removed
+    for path in sorted(Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")):
+        with contextlib.suppress(OSError):
+            descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.unlink(path)
+                removed.append(path)
+            finally:
+                os.close(descriptor)
+    return removed
+
+
+def _exists(target: Path) -> str:
+    return f"{target}: exists already; choose another output folder or replace it with --overwrite"
+
+
+def _create(folder: Path) -> tuple[Path, int]:
+    """A new locked file; tries again where `remove_stale` of another process took it before it was locked."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+    while True:
+        path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
+        descriptor = os.open(path, flags, 0o666)
+        if fcntl is None:
+            return path, descriptor
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            continue
+        except OSError:  # a file system without locks
+            return path, descriptor
+        if os.fstat(descriptor).st_nlink:
+            return path, descriptor
+        os.close(descriptor)
+
+
+def _link(path: Path, target: Path) -> None:
+    """Names the file `target` too, or raises FileExistsError; never replaces, even when two processes race."""
+    try:
+        os.link(path, target)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # No hard links here: an empty file of that name, made by one process only, keeps the place.
+        os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        os.replace(path, target)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Makes the new name survive a power cut; folders cannot be opened on Windows, nor synced everywhere."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
