@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+from wavebatch.io.header import STANDARD_DTYPES
 
 RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
@@ -136,6 +139,22 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
             records.append(ExtraRecord.undocumented(name, min(left, 255)))
             left -= min(left, 255)
     return records
+
+
+def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
+    """One point record: the standard fields as laspy names them, then the extra dimensions.
+
+    A field has its record's name; where that is empty or taken, " 2", " 3" ... follows.
+    """
+    standard = STANDARD_DTYPES[point_format]
+    fields = {name: standard[name] for name in standard.names}
+    for record in records:
+        name, number = record.name, 1
+        while not name or name in fields:
+            number += 1
+            name = f"{record.name} {number}"
+        fields[name] = record.dtype
+    return np.dtype(list(fields.items()))
 
 
 def choose_no_data(record: ExtraRecord, extremes: tuple[float, float] | None = None) -> np.ndarray | None:

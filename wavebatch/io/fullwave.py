@@ -10,10 +10,9 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.blocks import Digitizer
 from wavebatch.errors import ConfigError, InputError
-from wavebatch.io.extra import ExtraRecord
+from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,
-    STANDARD_DTYPES,
     WAVES_EXTERNAL,
     WAVES_INTERNAL,
     WKT_BIT,
@@ -21,7 +20,7 @@ from wavebatch.io.header import (
     Vlr,
 )
 from wavebatch.io.pointfile import PointFile, waveform_head
-from wavebatch.io.publish import Draft, publish_together, reporting
+from wavebatch.io.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.units import PS_PER_NS
 
 _FORMATS = {(1, 3): (4, 5), (1, 4): (4, 5, 9, 10), (1, 5): (9, 10)}
@@ -61,10 +60,9 @@ class FullwaveWriter:
         self.target = Path(target)
         numbers = _check_version(self.target, version, point_format)
         self._digitizers = {digitizer.index: digitizer for digitizer in _check_digitizers(self.target, digitizers)}
-        standard = STANDARD_DTYPES[point_format]
-        fields = [(name, standard[name]) for name in standard.names]
-        self.dtype = np.dtype(fields + [(record.name, record.dtype) for record in extra_bytes])
+        self.dtype = build_dtype(point_format, extra_bytes)
         self._internal, self._toward = internal, toward
+        encoding = 1 | (WAVES_INTERNAL if internal else WAVES_EXTERNAL)
         header = LasHeader(
             version=numbers,
             point_format=point_format,
@@ -72,14 +70,17 @@ class FullwaveWriter:
             scales=tuple(map(float, scales)),
             offsets=tuple(map(float, offsets)),
             vlrs=_build_vlrs(digitizers, wkt),
-            global_encoding=(WAVES_INTERNAL if internal else WAVES_EXTERNAL) | 1 | (WKT_BIT if wkt else 0),
+            global_encoding=encoding | (WKT_BIT if point_format >= 6 or (wkt and numbers >= (1, 4)) else 0),
             system_identifier=b"OTHER",
             generating_software=f"wavebatch {__version__}".encode(),
             creation=_CREATION,
         )
         self._file = PointFile(self.target, header, self.dtype, extra_bytes, overwrite=overwrite)
+        beside = self.target.with_suffix(".wdp")
         try:
-            self._packets = Draft(self.target.with_suffix(".wdp"), overwrite=overwrite or internal)
+            if not (internal or overwrite):
+                refuse_existing(beside)
+            self._packets = Draft(beside, overwrite=overwrite)
         except InputError:
             self._file.abort()
             raise

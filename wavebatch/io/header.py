@@ -213,8 +213,11 @@ def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
     Payloads are not read. The walk ends at the first record that runs over the end of the file.
     """
     found: list[Evlr] = []
-    if header.version < (1, 4) or not header.evlr_count or header.evlr_start < header.offset_to_points:
-        return found, header.evlr_count if header.version >= (1, 4) else 0
+    points_end = header.offset_to_points
+    if not header.compressed:
+        points_end += header.point_count * header.point_length
+    if header.version < (1, 4) or not header.evlr_count or header.evlr_start < points_end:
+        return found, header.evlr_count
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         start = header.evlr_start

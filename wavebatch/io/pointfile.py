@@ -20,7 +20,7 @@ from wavebatch.io.header import (
     has_record,
 )
 from wavebatch.io.laz import open_encoder
-from wavebatch.io.publish import Draft, reporting
+from wavebatch.io.publish import Draft, refuse_existing, reporting
 
 _COPY_SIZE = 1 << 22
 _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
@@ -45,9 +45,15 @@ class PointFile:
         header.vlrs = [vlr for vlr in header.vlrs if not has_record([vlr], "laszip encoded", 22204)]
         self._place_extra_bytes()
         self._statistics = Statistics(dtype, self._records)
+        if not overwrite:
+            refuse_existing(self.target)
         self.draft = Draft(self.target, overwrite=overwrite)
-        with self._guarded():
-            self._encoder = open_encoder(self.draft.file, header)
+        try:
+            with self._guarded():
+                self._encoder = open_encoder(self.draft.file, header)
+        except BaseException:
+            self.draft.discard()
+            raise
 
     def write(self, rows: np.ndarray) -> None:
         """Appends records (m,) of `dtype`."""
@@ -129,7 +135,8 @@ class Statistics:
 
     def __init__(self, dtype: np.dtype, records: Sequence[ExtraRecord]) -> None:
         self.count = 0
-        self._records = list(records)
+        fields = dtype.names[len(dtype.names) - len(records) :]
+        self._records = dict(zip(fields, records, strict=True))
         self._bits = np.zeros(256, np.int64)
         self._format_bits = 4 if "classification_flags" in dtype.names else 3
         self._axes = [name for name in ("X", "Y", "Z", "gps_time") if name in dtype.names]
@@ -141,9 +148,9 @@ class Statistics:
         self._bits += np.bincount(rows["bit_fields"], minlength=256)
         for name in self._axes:
             self._widen(name, rows[name])
-        for record in self._records:
+        for field, record in self._records.items():
             if record.code:
-                self._widen(record.name, rows[record.name], record.no_data)
+                self._widen(field, rows[field], record.no_data)
 
     def _widen(self, name: str, values: np.ndarray, no_data: np.ndarray | None = None) -> None:
         values = np.ascontiguousarray(values)
@@ -182,11 +189,11 @@ class Statistics:
 
     def ranged(self) -> list[ExtraRecord]:
         """The records with the extremes of what was written; without any value they declare none."""
-        return [self._range(record) for record in self._records]
+        return [self._range(field, record) for field, record in self._records.items()]
 
-    def _range(self, record: ExtraRecord) -> ExtraRecord:
+    def _range(self, field: str, record: ExtraRecord) -> ExtraRecord:
         shape = record.dtype.shape
-        names = [f"{record.name}\0{element}" for element in range(shape[0])] if shape else [record.name]
+        names = [f"{field}\0{element}" for element in range(shape[0])] if shape else [field]
         if any(name not in self._extremes for name in names):
             return record.with_range(None, None)
         least, largest = zip(*(self._extremes[name] for name in names), strict=True)

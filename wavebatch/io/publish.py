@@ -46,14 +46,12 @@ class Draft:
     """A file being written: `file` is open under a temporary name, for reading too, and locked while its process lives.
 
     target: the name it will have. overwrite: whether publishing replaces a file of that name.
-    Raises InputError where the folder cannot be written or, without overwrite, the target exists.
+    Raises InputError where the folder cannot be written.
     """
 
     def __init__(self, target: Path, *, overwrite: bool) -> None:
         self.target = Path(target)
         self.overwrite = overwrite
-        if not overwrite and os.path.lexists(self.target):
-            raise InputError(_exists(self.target))
         with reporting(self.target):
             self.path, descriptor = _create(self.target.parent)
         self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
@@ -67,6 +65,8 @@ class Draft:
         with reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
+            if fcntl is None:  # Windows names no open file anew
+                self.file.close()
             try:
                 if self.overwrite:
                     os.replace(self.path, self.target)
@@ -83,15 +83,21 @@ class Draft:
     def discard(self) -> None:
         """Closes and removes the temporary file; harmless when it is gone already."""
         with contextlib.suppress(OSError):
-            os.unlink(self.path)
-        with contextlib.suppress(OSError):
             self.file.close()
+        with contextlib.suppress(OSError):
+            os.unlink(self.path)
 
     def withdraw(self) -> None:
         """Takes a published file back, for when one that belongs to it could not be published."""
         if self.published and not self.overwrite:
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
+
+
+def refuse_existing(target: Path) -> None:
+    """Raises InputError where something of that name exists; publishing checks again."""
+    if os.path.lexists(target):
+        raise InputError(_exists(target))
 
 
 def publish_together(drafts: Sequence[Draft]) -> None:

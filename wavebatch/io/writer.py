@@ -102,8 +102,7 @@ class CloudWriter:
                 return
             beside = self.target.with_suffix(".wdp")
             self._refuse_input(beside)
-            draft = Draft(beside, overwrite=True)
-            draft.overwrite = self._overwrite
+            draft = Draft(beside, overwrite=self._overwrite)
             drafts.insert(0, draft)
             draft.file.write(head)
             copy_bytes(source, packets.start, packets.end, draft.file)
@@ -185,6 +184,11 @@ def _is_carried(vlr: Vlr, layout: OutputLayout) -> bool:
     return layout.packets is not None or not descriptor
 
 
+def _plain(value: Any) -> Any:
+    """NumPy's numbers as numbers, anything else that JSON does not know (paths) as text."""
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
 def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, Any], number: int) -> Vlr:
     """JSON with sorted keys and no time of day; what the input's header said of its maker is kept in it."""
     made_by = {
@@ -192,7 +196,7 @@ def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, A
         "generating_software": source.generating_software.split(b"\0")[0].decode("latin-1"),
     }
     account = {"wavebatch": __version__, "input_header": made_by, **provenance}
-    payload = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=str).encode()
+    payload = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain).encode()
     if len(payload) > 65535:
         raise ConfigError(f"{path}: the provenance of its output takes {len(payload)} bytes, a VLR holds 65535")
     return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
