@@ -1,0 +1,19 @@
+"""Seeded scenes with known echoes: as blocks for tests and benchmarks, or as strips with wave packets."""
+
+from wavebatch.simulate.blocks import flag_truth, simulate_block, simulate_blocks
+from wavebatch.simulate.pulses import PULSES, PulseModel, find_pulse
+from wavebatch.simulate.render import Recording
+from wavebatch.simulate.scenes import SCENES, Scene, find_scene
+
+__all__ = [
+    "PULSES",
+    "SCENES",
+    "PulseModel",
+    "Recording",
+    "Scene",
+    "find_pulse",
+    "find_scene",
+    "flag_truth",
+    "simulate_block",
+    "simulate_blocks",
+]

@@ -1,0 +1,98 @@
+"""Shapes of the simulated echo: Gaussian, skewed, with ringing, or a sum of components as real sensors have them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wavebatch.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class PulseModel:
+    """The system pulse: a main lobe, Gaussian or skewed, and lobes that follow or flank it.
+
+    The time of an echo is where the pulse of a flat target has its peak. A target that broadens the main lobe from
+    `sigma` to s adds the variance s^2 - sigma^2 to every lobe, and lobes lose height as they widen.
+    The amplitude of an echo is the height of the peak of all lobes together.
+    """
+
+    sigma: float = 2.0
+    """Standard deviation of the main lobe for a flat target [ns]."""
+    kappa: float = 0.0
+    """Skew of the main lobe (ALGORITHMS.md 0); its peak stays at the echo's time, its height is the amplitude."""
+    lobes: tuple[tuple[float, float, float], ...] = ()
+    """(height relative to the main lobe, delay [ns], sigma [ns]) of every further lobe."""
+
+    def with_ringing(self, share: float) -> PulseModel:
+        """The pulse with a lobe of -share at 4 sigma and +share at 8 sigma behind its peak."""
+        if share == 0:
+            return self
+        ring = ((-share, 4 * self.sigma, self.sigma), (share, 8 * self.sigma, self.sigma))
+        return replace(self, lobes=self.lobes + ring)
+
+
+PULSES: dict[str, PulseModel] = {
+    "gaussian": PulseModel(),
+    "skewed": PulseModel(kappa=0.1),
+    "riegl": PulseModel(1.85, 0.0, ((0.16, 2.4, 2.2), (0.04, 10.5, 2.2), (0.016, 20.0, 4.0), (0.008, 40.0, 8.0))),
+    "leica": PulseModel(3.0, 0.0, ((0.22, 7.2, 4.0), (0.03, 15.0, 5.0))),
+}
+"""Named pulses: riegl has the after-pulse of +4 % at 10.5 ns and the tail of the Q680i, leica its strong skew."""
+
+
+def find_pulse(name: str) -> PulseModel:
+    """The pulse called `name`; ConfigError when there is none."""
+    if name not in PULSES:
+        raise ConfigError(f"pulse {name!r} is unknown; choose one of {', '.join(PULSES)}")
+    return PULSES[name]
+
+
+def spread_lobes(
+    pulse: PulseModel, time: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Main lobe first, then the others: (time [ns], height [count], sigma [ns]) of echoes whose truth is given.
+
+    time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that the lobes peak at `amplitude`.
+    """
+    if not pulse.lobes:
+        return [(time, amplitude, sigma)]
+    shift = _find_peak(pulse, np.array([pulse.sigma]))[0][0]
+    grid = np.linspace(sigma.min(initial=pulse.sigma), sigma.max(initial=pulse.sigma), 129)
+    height = np.interp(sigma, grid, _find_peak(pulse, grid)[1])
+    main = amplitude / height
+    start = time - shift
+    parts = [(start, main, sigma)]
+    for share, delay, width, scale in _widen(pulse, sigma):
+        parts.append((start + delay, main * share * scale, width))
+    return parts
+
+
+def _widen(pulse: PulseModel, sigma: np.ndarray):
+    """(share, delay, width, loss of height relative to the main lobe) of every lobe under a target that broadens."""
+    extra = sigma**2 - pulse.sigma**2
+    for share, delay, own in pulse.lobes:
+        width = np.sqrt(np.maximum(own**2 + extra, 0.01 * own**2))
+        yield share, delay, width, own / width * sigma / pulse.sigma
+
+
+def _find_peak(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Delay of the peak behind the main lobe's centre [ns] and its height per unit of the main lobe, each (m,)."""
+    step = pulse.sigma / 200
+    x = np.arange(-400, 401)[:, None] * step
+    total = main_lobe(x / sigma, pulse.kappa)
+    for share, delay, width, scale in _widen(pulse, sigma):
+        total = total + share * scale * np.exp(-0.5 * ((x - delay) / width) ** 2)
+    at = np.argmax(total, axis=0)
+    return x[at, 0], total.max(axis=0)
+
+
+def main_lobe(z: np.ndarray, kappa: float) -> np.ndarray:
+    """Height of the unit pulse at z = (time - peak)/sigma: exp(-L^2/2), L = log1p(kappa z)/kappa (ALGORITHMS.md 0)."""
+    if abs(kappa) < 1e-6:
+        return np.exp(-0.5 * z * z)
+    inside = kappa * z
+    gone = inside <= -1 + 1e-6
+    level = np.log1p(np.where(gone, 0, inside)) / kappa
+    return np.where(gone, 0, np.exp(-0.5 * level * level)).astype(z.dtype)

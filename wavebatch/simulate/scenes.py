@@ -1,0 +1,139 @@
+"""The scenes: what lies under the laser, as probabilities of echoes, and what draws them."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from wavebatch.errors import ConfigError
+from wavebatch.simulate.draws import (
+    Drawn,
+    FoldedWidth,
+    HalfBroadened,
+    LogNormal,
+    LogUniform,
+    Mixture,
+    WithGaps,
+    WithinDepth,
+    draw_counts,
+    widen_on_slope,
+)
+from wavebatch.simulate.hazards import HAZARDS, draw_hazards
+from wavebatch.simulate.pulses import PulseModel
+from wavebatch.simulate.render import Recording
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A kind of land: how many echoes its waveforms hold, how strong, wide and far apart they are."""
+
+    name: str
+    meaning: str
+    counts: tuple[float, ...] = (0.0, 1.0)
+    """Probabilities of 0, 1, 2 ... echoes."""
+    amplitude: LogUniform | LogNormal | Mixture = LogNormal(25.0, 0.8, 5.0, 230.0)
+    width: FoldedWidth | HalfBroadened = FoldedWidth(0.35, 0.105)
+    times: WithinDepth | WithGaps = WithinDepth(30.0)
+    terrain: str = "flat"
+    """Name of the ground's shape, see simulate.geometry."""
+    beam_radius: float = 0.0
+    """1/e^2 radius of the footprint [m]; above 0, slopes widen the echoes."""
+    hazards: tuple[str, ...] = ()
+    """Names of hazards that replace all of the above."""
+    recording: Recording = field(default_factory=Recording)
+
+    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
+        """Echoes of n waveforms; incidence: angle between ray and ground's normal [rad], (n,)."""
+        if self.hazards:
+            return draw_hazards(rng, n, self.recording, self.hazards)
+        count = draw_counts(rng, n, self.counts)
+        waveform = np.repeat(np.arange(n), count)
+        time = self.times(rng, count, self.recording)
+        amplitude = self.amplitude(rng, len(waveform))
+        sigma = self.width(rng, np.repeat(count == 1, count), self.recording.pulse.sigma)
+        if self.beam_radius:
+            sigma, amplitude = widen_on_slope(sigma, amplitude, incidence[waveform], self.beam_radius)
+        order = np.lexsort((time, waveform)) if len(self.counts) > 2 else slice(None)
+        return Drawn(waveform, time[order], amplitude[order], sigma[order])
+
+
+def _scenes(*scenes: Scene) -> dict[str, Scene]:
+    return {scene.name: scene for scene in scenes}
+
+
+SCENES: dict[str, Scene] = _scenes(
+    Scene(
+        "flat",
+        "bare, level ground: one echo of the system's width in every waveform",
+        amplitude=LogNormal(60.0, 0.5, 10.0, 220.0),
+        width=FoldedWidth(0.0, 0.02),
+    ),
+    Scene(
+        "urban",
+        "streets, roofs, few trees: 0, 1, 2, 3 echoes at 5, 85, 8, 2 % (`open/urban` of ALGORITHMS.md 4.3)",
+        counts=(0.05, 0.85, 0.08, 0.02),
+        terrain="blocks",
+    ),
+    Scene(
+        "forest",
+        "canopy over ground: 0 to 5 echoes at 2, 25, 35, 25, 10, 3 % (ALGORITHMS.md 4.3)",
+        counts=(0.02, 0.25, 0.35, 0.25, 0.10, 0.03),
+        terrain="hills",
+    ),
+    Scene(
+        "slope",
+        "bare slopes of 0 to 40 degrees: one echo, widened and weakened by the angle of incidence",
+        amplitude=LogNormal(80.0, 0.3, 20.0, 220.0),
+        width=FoldedWidth(0.0, 0.0),
+        terrain="facets",
+        beam_radius=0.4,
+    ),
+    Scene(
+        "shore",
+        "water-free shore: wet sand that returns 4 to 25 counts beside dry sand, empty waveforms over pools, few reeds",
+        counts=(0.25, 0.67, 0.07, 0.01),
+        amplitude=Mixture(0.5, LogUniform(4.0, 25.0), LogNormal(90.0, 0.4, 30.0, 230.0)),
+        width=FoldedWidth(0.2, 0.03),
+        times=WithinDepth(15.0),
+        terrain="beach",
+    ),
+    Scene(
+        "empty",
+        "water or sky: 80 % of the waveforms hold nothing, the others one echo, seldom more",
+        counts=(0.80, 0.185, 0.012, 0.003),
+    ),
+    Scene(
+        "mixed",
+        "the strip of the release test: 1 to 4 echoes at 60, 24, 12, 4 %, amplitude 8 to 220 log-uniform, "
+        "half of them broadened up to 4 ns, gaps log-uniform 2.5 to 40 ns, noise 1.2",
+        counts=(0.0, 0.60, 0.24, 0.12, 0.04),
+        amplitude=LogUniform(8.0, 220.0),
+        width=HalfBroadened(0.02, 4.0 / 1.9),
+        times=WithGaps(2.5, 40.0),
+        terrain="hills",
+        recording=Recording(noise_std=1.2, pulse=PulseModel(sigma=1.9)),
+    ),
+    Scene(
+        "stiff",
+        "every hazard in equal shares: " + ", ".join(HAZARDS) + "; `stiff.near` and so on hold one of them",
+        hazards=tuple(HAZARDS),
+        recording=Recording(n_samples=96),
+    ),
+)
+"""Every scene by name."""
+
+
+def find_scene(name: str) -> Scene:
+    """The scene called `name`, also `stiff.<hazard>`; ConfigError with the nearest name when there is none."""
+    if name in SCENES:
+        return SCENES[name]
+    head, _, hazard = name.partition(".")
+    if head == "stiff" and hazard in HAZARDS:
+        doc = (HAZARDS[hazard].__doc__ or "").strip()
+        return replace(SCENES["stiff"], name=name, meaning=doc, hazards=(hazard,))
+    names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS)]
+    near = difflib.get_close_matches(name, names, 1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise ConfigError(f"scene {name!r} is unknown{hint} Choose one of {', '.join(SCENES)}")
