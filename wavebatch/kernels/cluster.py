@@ -1,0 +1,187 @@
+"""From candidate echoes to clusters of overlapping echoes, each with a window of samples to fit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.kernels.fit import OUTSIDE, Windows
+from wavebatch.kernels.signal import SMOOTH_GAIN
+
+
+RUN_LEVEL = 2.0
+"""Noise standard deviations of the smoothed signal above which echoes are one run."""
+
+
+class Candidates(NamedTuple):
+    """Echo candidates sorted by waveform, then time; times and widths in samples."""
+
+    waveform: np.ndarray
+    time: np.ndarray
+    amplitude: np.ndarray
+    width: np.ndarray
+
+
+class Clusters(NamedTuple):
+    """Runs of candidates that are fitted together, sorted by waveform."""
+
+    waveform: np.ndarray
+    """Row of each cluster (c,)."""
+    low: np.ndarray
+    """First sample of the cluster's window (c,)."""
+    high: np.ndarray
+    """One behind its last sample (c,)."""
+    first: np.ndarray
+    """Its first candidate (c,)."""
+    number: np.ndarray
+    """How many candidates it has (c,)."""
+
+
+def find_runs(smoothed: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Starts and ends (one behind) of the runs in which smoothed (s, n) exceeds level (n,), as waveform * s + sample.
+
+    Both come sorted; runs end with their waveform.
+    """
+    s, n = smoothed.shape
+    above = np.zeros((n, s + 2), np.int8)
+    above[:, 1:-1] = (smoothed > level).T
+    edge = np.diff(above, axis=1).ravel()
+    starts = np.flatnonzero(edge == 1)
+    ends = np.flatnonzero(edge == -1)
+    return starts - starts // (s + 1), ends - ends // (s + 1)
+
+
+def cluster_candidates(
+    candidates: Candidates, smoothed: np.ndarray, std: np.ndarray, *, margin: int, reach: int, most: int
+) -> Clusters:
+    """Candidates that stand on one run of signal above the noise; windows of neighbouring clusters do not overlap.
+
+    smoothed: [1 2 1]/4-filtered signal (s, n); std: noise of a raw sample (n,). margin: samples added on both sides of
+    a run; reach: samples a window extends at least on both sides of its outer candidates; most: candidates per cluster.
+    """
+    s, _ = smoothed.shape
+    waveform, sample = candidates.waveform, np.clip(np.rint(candidates.time), 0, s - 1).astype(np.int64)
+    starts, ends = find_runs(smoothed, (RUN_LEVEL * SMOOTH_GAIN) * std.astype(np.float32))
+    low, high = sample.copy(), sample + 1
+    if len(starts):
+        base = waveform * s
+        run = np.maximum(np.searchsorted(starts, base + sample, side="right") - 1, 0)
+        inside = (base + sample >= starts[run]) & (base + sample < ends[run])
+        low = np.where(inside, starts[run] - base, low)
+        high = np.where(inside, ends[run] - base, high)
+    joined = (waveform[1:] == waveform[:-1]) & (low[1:] < high[:-1])
+    joined = _limit_joins(joined, most)
+    first = np.flatnonzero(np.r_[True, ~joined]) if len(waveform) else np.empty(0, np.int64)
+    last = np.r_[first[1:], len(waveform)] - 1 if len(first) else first
+    outer_low = np.maximum(np.minimum(low[first] - margin, sample[first] - reach), 0)
+    outer_high = np.minimum(np.maximum(high[last] + margin, sample[last] + 1 + reach), s)
+    meet = waveform[first[1:]] == waveform[last[:-1]]
+    middle = (
+        np.where(
+            low[first[1:]] < high[last[:-1]], sample[first[1:]] + sample[last[:-1]], low[first[1:]] + high[last[:-1]]
+        )
+        // 2
+    )
+    outer_low[1:] = np.where(meet, np.maximum(outer_low[1:], np.minimum(middle, sample[first[1:]])), outer_low[1:])
+    outer_high[:-1] = np.where(
+        meet, np.minimum(outer_high[:-1], np.maximum(middle, sample[last[:-1]] + 1)), outer_high[:-1]
+    )
+    return Clusters(waveform[first], outer_low, outer_high, first, last - first + 1)
+
+
+def _limit_joins(joined: np.ndarray, most: int) -> np.ndarray:
+    """Joins (m - 1,) with every run of them cut after `most` members."""
+    if not len(joined):
+        return joined
+    position = np.arange(1, len(joined) + 1)
+    begin = np.maximum.accumulate(np.where(joined, 0, position))
+    return joined & ((position - begin) % most != 0)
+
+
+def cut_windows(
+    samples: np.ndarray,
+    baseline: np.ndarray,
+    std: np.ndarray,
+    waveform: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    length: int,
+    clip: float | None = None,
+) -> tuple[Windows, np.ndarray]:
+    """Windows of `length` samples that hold [low, high) of their waveforms, and the sample each begins at (m,).
+
+    samples: raw counts (n, s), contiguous. Samples outside [low, high) are put out of reach of every pulse.
+    clip: raw count from which a sample counts as clipped.
+    """
+    n, s = samples.shape
+    length = min(length, s)
+    begin = np.minimum(low, s - length)
+    flat = samples.reshape(-1)
+    views = np.lib.stride_tricks.as_strided(
+        flat, (n * s - length + 1, length), (flat.itemsize, flat.itemsize), writeable=False
+    )
+    raw = views[waveform * s + begin]
+    y = raw.astype(np.float32)
+    clipped = None
+    if clip is not None:
+        clipped = y >= clip
+        if not clipped.any():
+            clipped = None
+    y -= baseline[waveform][:, None]
+    position = np.arange(length, dtype=np.float32)
+    outside = position < (low - begin).astype(np.float32)[:, None]
+    outside |= position >= (high - begin).astype(np.float32)[:, None]
+    x = np.where(outside, OUTSIDE, position)
+    y[outside] = 0
+    if clipped is not None:
+        clipped &= ~outside
+    return Windows(y, x, std[waveform].astype(np.float64), clipped), begin
+
+
+def estimate_starts(
+    smoothed: np.ndarray, waveform: np.ndarray, sample: np.ndarray, width: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Amplitude, time and width of peaks by a log-parabola through five smoothed samples, weighted by the signal.
+
+    The width of the filter is taken off. Where the parabola fails: the sample itself and `width`.
+    """
+    s, n = smoothed.shape
+    flat = smoothed.reshape(-1)
+    offsets = np.arange(-2, 3)
+    at = np.clip(sample[None] + offsets[:, None], 0, s - 1)
+    y = flat[at * n + waveform].astype(np.float64)
+    peak = y[2]
+    floor = 0.05 * peak
+    used = np.maximum(y, floor[None])
+    weight = np.where((at == sample[None] + offsets[:, None]) & (y > floor), used * used, 0.0)
+    log = np.log(np.maximum(used, 1e-12))
+    x = offsets[:, None].astype(np.float64)
+    moments = [np.sum(weight * x**p, axis=0) for p in range(5)]
+    right = [np.sum(weight * log * x**p, axis=0) for p in range(3)]
+    c0, c1, c2 = solve_parabola(moments, right)
+    good = (c2 < -1e-4) & np.isfinite(c1)
+    safe = np.where(good, c2, -1.0)
+    shift = -c1 / (2 * safe)
+    good &= np.abs(shift) < 1.5
+    variance = -1 / (2 * safe)
+    time = sample + np.where(good, shift, 0.0)
+    narrow = np.sqrt(np.maximum(variance - 0.5, 0.1))
+    amplitude = np.where(good, np.exp(np.clip(c0 - c1 * c1 / (4 * safe), -20, 20)), peak)
+    amplitude *= np.where(good, np.sqrt(1 + 0.5 / narrow**2), 1.1)
+    return amplitude, time, np.where(good, narrow, width)
+
+
+def solve_parabola(s: list[np.ndarray], b: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coefficients of the weighted parabola from its moments s (five) and right-hand sides b (three), by Cramer."""
+    m0 = s[2] * s[4] - s[3] * s[3]
+    m1 = s[1] * s[4] - s[2] * s[3]
+    m2 = s[1] * s[3] - s[2] * s[2]
+    determinant = s[0] * m0 - s[1] * m1 + s[2] * m2
+    inverse = 1 / np.where(np.abs(determinant) > 1e-12, determinant, np.inf)
+    c0 = (b[0] * m0 - b[1] * m1 + b[2] * m2) * inverse
+    n1 = s[0] * s[4] - s[2] * s[2]
+    n2 = s[0] * s[3] - s[1] * s[2]
+    c1 = (-b[0] * m1 + b[1] * n1 - b[2] * n2) * inverse
+    c2 = (b[0] * m2 - b[1] * n2 + b[2] * (s[0] * s[2] - s[1] * s[1])) * inverse
+    return c0, c1, c2

@@ -1,0 +1,284 @@
+"""Decomposition of waveforms into echoes: clusters fitted in batches, grown where the residual asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.kernels.cluster import Candidates, Clusters, cut_windows
+from wavebatch.kernels.fit import (
+    BATCH,
+    Limits,
+    WidthPrior,
+    Windows,
+    evaluate_model,
+    fit_windows,
+    parameter_errors,
+)
+from wavebatch.kernels.gate import find_misfits
+from wavebatch.kernels.propose import propose_echo
+from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
+
+
+class Settings(NamedTuple):
+    """What a decomposition may do; widths in samples."""
+
+    width_ref: float
+    width_low: float
+    width_high: float
+    shape: PulseShape = GAUSSIAN
+    clip: float | None = None
+    tolerance: float = 1e-2
+    max_iterations: int = 40
+    grow: bool = True
+    acceptance: float = 15.0
+    max_echoes: int = 6
+    prior: WidthPrior | None = None
+    gate_residual: float = 4.2
+    gate_hermite: float = 11.9
+
+
+class Solution(NamedTuple):
+    """Echoes of c clusters with k echoes each; times in samples of the waveform."""
+
+    cluster: np.ndarray
+    """(c,)."""
+    parameters: np.ndarray
+    """Amplitude, time, width (c, 3, k)."""
+    errors: np.ndarray
+    """(c, 3, k)."""
+    misfit: np.ndarray
+    """Root mean square residual in noise standard deviations (c,)."""
+    chi2: np.ndarray
+    """(c,)."""
+    converged: np.ndarray
+    """(c,)."""
+    at_bound: np.ndarray
+    """(c, k)."""
+    clipped: np.ndarray
+    """Clipped samples in the window (c,)."""
+
+    def take(self, rows: np.ndarray) -> Solution:
+        """The clusters at `rows`."""
+        return Solution(*(field[rows] for field in self))
+
+
+class Problem(NamedTuple):
+    """Clusters to fit with k echoes: from candidates, or as trials that must beat the solution they came from."""
+
+    cluster: np.ndarray
+    """(c,)."""
+    start: np.ndarray
+    """(c, 3, k), times in samples of the waveform."""
+    target: np.ndarray
+    """chi2 that the fit must fall below; inf for clusters without an earlier solution (c,)."""
+
+    def take(self, rows: np.ndarray) -> Problem:
+        """The clusters at `rows`."""
+        return Problem(*(field[rows] for field in self))
+
+
+class _Work(NamedTuple):
+    samples: np.ndarray
+    baseline: np.ndarray
+    std: np.ndarray
+    clusters: Clusters
+    settings: Settings
+
+
+class _Step(NamedTuple):
+    """What came of one batch."""
+
+    solution: Solution
+    refused: np.ndarray
+    """Rows of the problem whose trial was not accepted."""
+    proposal: Problem | None
+    """Trials with one echo more, each for a row of the solution."""
+    parents: np.ndarray
+    """Those rows of the solution."""
+    unfinished: Problem
+    """What needs more iterations, with the parameters reached."""
+    unfinished_rows: np.ndarray
+
+
+def decompose_clusters(
+    samples: np.ndarray,
+    baseline: np.ndarray,
+    std: np.ndarray,
+    candidates: Candidates,
+    clusters: Clusters,
+    settings: Settings,
+) -> Iterator[Solution]:
+    """Solutions of all clusters, those with the same number of echoes together.
+
+    samples: raw counts (n, s); baseline, std: (n,). Every cluster appears in exactly one solution.
+    """
+    work = _Work(samples, baseline, std, clusters, settings)
+    trials: list[Problem] = []
+    parents: list[Solution] = []
+    k = 0
+    while k < clusters.number.max(initial=0) or trials:
+        k += 1
+        given = np.flatnonzero(clusters.number == k)
+        rows = clusters.first[given][:, None] + np.arange(k)
+        start = np.stack([candidates.amplitude[rows], candidates.time[rows], candidates.width[rows]], axis=1)
+        problem = _join([Problem(given, start, np.full(len(given), np.inf)), *trials])
+        before = _join(parents) if parents else None
+        trials, parents = [], []
+        for step in _solve(work, problem):
+            if len(step.refused):
+                yield before.take(step.refused - len(given))
+            final = np.ones(len(step.solution.cluster), bool)
+            if step.proposal is not None:
+                trials.append(step.proposal)
+                parents.append(step.solution.take(step.parents))
+                final[step.parents] = False
+            if final.any():
+                yield step.solution.take(np.flatnonzero(final))
+
+
+def _join(parts: list) -> tuple:
+    """Named tuples of arrays one behind the other."""
+    return type(parts[0])(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+
+
+LENGTHS = np.array([8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 65536])
+"""Window lengths: few, so that batches are large."""
+
+PATIENCE = 6
+"""Iterations of the first attempt; what has not converged then goes on together with others of any length."""
+
+
+def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
+    """The problem in batches of one window length.
+
+    Which attempt and which length a cluster gets depends on the cluster alone, never on its batch.
+    """
+    longest = work.samples.shape[1]
+    rows = np.arange(len(problem.cluster))
+    for lengths, iterations in ((LENGTHS, PATIENCE), (LENGTHS[5::2], work.settings.max_iterations)):
+        last = iterations == work.settings.max_iterations
+        needed = work.clusters.high[problem.cluster] - work.clusters.low[problem.cluster]
+        length = np.minimum(lengths[np.searchsorted(lengths, needed)], longest)
+        order = np.argsort(length, kind="stable")
+        unfinished: list[tuple[Problem, np.ndarray]] = []
+        for group in np.split(order, np.flatnonzero(np.diff(length[order])) + 1):
+            for begin in range(0, len(group), BATCH):
+                part = group[begin : begin + BATCH]
+                step = _solve_batch(work, problem.take(part), rows[part], int(length[part[0]]), iterations, last)
+                unfinished.append((step.unfinished, step.unfinished_rows))
+                yield step
+        if last or not unfinished:
+            return
+        problem = _join([part for part, _ in unfinished])
+        rows = np.concatenate([part for _, part in unfinished])
+
+
+def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, iterations: int, last: bool) -> _Step:
+    settings, cluster, clusters = work.settings, problem.cluster, work.clusters
+    windows, begin = cut_windows(
+        work.samples,
+        work.baseline,
+        work.std,
+        clusters.waveform[cluster],
+        clusters.low[cluster],
+        clusters.high[cluster],
+        length,
+        settings.clip,
+    )
+    start = problem.start.copy()
+    start[:, 1] -= begin[:, None]
+    limits = _limits(work, cluster, begin)
+    prior = settings.prior if problem.start.shape[2] > 1 else None
+    fit = fit_windows(
+        windows,
+        start,
+        limits,
+        settings.shape,
+        tolerance=settings.tolerance,
+        max_iterations=iterations,
+        hopeless_above=problem.target if np.isfinite(problem.target).any() else None,
+        prior=prior,
+    )
+    finished = np.ones(len(rows), bool) if last else fit.converged | fit.hopeless
+    parameters = fit.parameters.copy()
+    parameters[:, 1] += begin[:, None]
+    left = np.flatnonzero(~finished)
+    unfinished = Problem(cluster[left], parameters[left], problem.target[left])
+    done = np.flatnonzero(finished & ~fit.hopeless)
+    refused = [rows[finished & fit.hopeless]]
+
+    windows, begin = windows.take(done), begin[done]
+    model = evaluate_model(windows, fit.parameters[done], settings.shape)
+    chi2 = np.einsum("ml,ml->m", model[:, -1], model[:, -1]) / windows.std**2
+    cost = chi2 if prior is None else chi2 + prior.cost(fit.parameters[done], windows.std) / windows.std**2
+    errors = parameter_errors(windows, fit.parameters[done], model)
+    target = problem.target[done]
+    accepted = ~np.isfinite(target) | ((cost < target) & _is_resolved(fit.parameters[done], errors))
+    refused.append(rows[done[~accepted]])
+    used = np.maximum((windows.x >= 0).sum(axis=1), 1)
+    clipped = np.zeros(len(done), np.int64) if windows.clipped is None else windows.clipped.sum(axis=1)
+    solution = Solution(
+        cluster[done],
+        parameters[done],
+        errors,
+        np.sqrt(chi2 / used),
+        chi2,
+        fit.converged[done],
+        fit.at_bound[done],
+        clipped,
+    )
+    good = np.flatnonzero(accepted)
+    solution = solution.take(good)
+    proposal, parents = _propose(
+        settings, windows.take(good), solution, model[good], begin[good],
+        Limits(*(edge[done[good]] for edge in limits)),
+    )  # fmt: skip
+    return _Step(solution, np.concatenate(refused), proposal, parents, unfinished, rows[left])
+
+
+def _limits(work: _Work, cluster: np.ndarray, begin: np.ndarray) -> Limits:
+    """Amplitude from 0; time within 3 samples of the window; width within the settings: arrays (m, 3, 1)."""
+    settings = work.settings
+    low = np.empty((len(cluster), 3, 1))
+    high = np.empty_like(low)
+    low[:, 0], high[:, 0] = 0.0, 1e9
+    low[:, 1, 0] = work.clusters.low[cluster] - begin - 3.0
+    high[:, 1, 0] = work.clusters.high[cluster] - begin + 2.0
+    low[:, 2], high[:, 2] = settings.width_low, settings.width_high
+    return Limits(low, high)
+
+
+def _is_resolved(parameters: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """True (m,) where every two neighbouring echoes lie further apart than twice the error of their distance (H1)."""
+    order = np.argsort(parameters[:, 1], axis=1)
+    time = np.take_along_axis(parameters[:, 1], order, axis=1)
+    error = np.take_along_axis(errors[:, 1], order, axis=1)
+    gap = np.diff(time, axis=1)
+    return (gap > np.hypot(error[:, 1:], error[:, :-1])).all(axis=1) & (parameters[:, 0] > 0).all(axis=1)
+
+
+def _propose(
+    settings: Settings, windows: Windows, solution: Solution, model: np.ndarray, begin: np.ndarray, limits: Limits
+) -> tuple[Problem | None, np.ndarray]:
+    """Trials with one echo more for the solutions that leave something unexplained, and their rows."""
+    none = np.empty(0, np.int64)
+    if not settings.grow or solution.parameters.shape[2] >= settings.max_echoes or not len(solution.cluster):
+        return None, none
+    parameters = solution.parameters.copy()
+    parameters[:, 1] -= begin[:, None]
+    misfit = find_misfits(windows, parameters, model, settings.gate_residual, settings.gate_hermite)
+    rows = np.flatnonzero(misfit)
+    if not len(rows):
+        return None, none
+    start, gain = propose_echo(
+        windows.take(rows), parameters[rows], model[rows], Limits(*(edge[rows] for edge in limits)), settings.width_ref
+    )
+    hopeful = gain > 0.5 * settings.acceptance
+    rows, start = rows[hopeful], start[hopeful]
+    if not len(rows):
+        return None, none
+    start[:, 1] += begin[rows][:, None]
+    return Problem(solution.cluster[rows], start, solution.chi2[rows] - settings.acceptance), rows

@@ -1,0 +1,55 @@
+"""Filters of detectors along the samples of (s, n) arrays, with the noise they let through."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def gaussian_taps(width: float, reach: float = 3.0) -> np.ndarray:
+    """Half of a symmetric Gaussian filter: taps 0, 1, ... up to `reach` widths [samples], peak 1."""
+    return np.exp(-0.5 * (np.arange(int(np.ceil(reach * width)) + 1) / width) ** 2)
+
+
+def curvature_taps(width: float, reach: float = 4.0) -> np.ndarray:
+    """Half of the negative second derivative of a Gaussian, with zero sum; taps 0, 1, ... [samples]."""
+    x = np.arange(int(np.ceil(reach * width)) + 1) / width
+    taps = (1 - x * x) * np.exp(-0.5 * x * x)
+    total = taps[0] + 2 * taps[1:].sum()
+    bell = np.exp(-0.5 * x * x)
+    return taps - bell * total / (bell[0] + 2 * bell[1:].sum())
+
+
+def filter_energy(taps: np.ndarray) -> float:
+    """Sum of the squares of a symmetric filter given by its half: the gain of white noise variance."""
+    return float(taps[0] ** 2 + 2 * np.sum(taps[1:] ** 2))
+
+
+def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    """Signal (s, n) correlated along the samples with a symmetric filter given by its half; zero outside."""
+    s = len(signal)
+    total = np.float32(taps[0]) * signal
+    for i, tap in enumerate(taps[1:], start=1):
+        if i >= s:
+            break
+        part = np.float32(tap) * signal
+        total[i:] += part[:-i]
+        total[:-i] += part[i:]
+    return total
+
+
+def refine_peaks(filtered: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Time and height of peaks of filtered (s, n) by a parabola through the logarithms of three samples.
+
+    Where a neighbour is not positive, or the peak lies on the first or last sample, the sample itself.
+    """
+    s, n = filtered.shape
+    flat = filtered.reshape(-1)
+    left, middle, right = (flat[np.clip(sample + d, 0, s - 1) * n + waveform].astype(np.float64) for d in (-1, 0, 1))
+    good = (sample > 0) & (sample < s - 1) & (left > 0) & (right > 0)
+    a, b, c = (np.log(np.where(good, y, 1.0)) for y in (left, middle, right))
+    curve = a - 2 * b + c
+    good &= curve < -1e-12
+    shift = np.where(good, 0.5 * (a - c) / np.where(good, curve, -1.0), 0.0)
+    shift = np.clip(shift, -0.5, 0.5)
+    height = np.where(good, np.exp(b - 0.25 * (a - c) * shift), middle)
+    return sample + shift, height

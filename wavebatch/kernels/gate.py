@@ -1,0 +1,54 @@
+"""The gate: which fits leave something in their residual that noise does not (ALGORITHMS.md 4.2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.kernels.fit import Windows
+from wavebatch.kernels.signal import SMOOTH_GAIN
+
+HERMITE_REACH = 5.0
+"""Half-widths over which the Gauss-Hermite moments run."""
+
+
+def hermite_moments(windows: Windows, parameters: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Hermite residual moments h3, h4 of each echo (m, k): independent N(0, 1) for a right single echo.
+
+    The next two directions after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e.
+    rows: of `evaluate_model` at the parameters (m, 3, k).
+    """
+    k = parameters.shape[2]
+    _, time, width = parameters.astype(np.float32).transpose(1, 0, 2)[..., None]
+    pulse, by_time, by_width = rows[:, :k], rows[:, k : 2 * k], rows[:, 2 * k : 3 * k]
+    z = windows.x[:, None, :] - time
+    z *= 1 / width
+    np.clip(z, -HERMITE_REACH, HERMITE_REACH, out=z)
+    p3 = by_width * z
+    p4 = p3 * z
+    p3 *= np.float32(8)
+    p3 -= np.float32(12) * by_time
+    p4 *= np.float32(16)
+    p4 -= np.float32(48) * by_width
+    p4 += np.float32(12) * pulse
+    residual, std = rows[:, -1], windows.std[:, None]
+    return _project(p3, residual) / std, _project(p4, residual) / std
+
+
+def _project(direction: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Component of the residual (m, L) along each direction (m, k, L) of unit length."""
+    norm = np.einsum("mkl,mkl->mk", direction, direction)
+    return np.einsum("mkl,ml->mk", direction, residual) / np.sqrt(np.maximum(norm, 1e-12))
+
+
+def find_misfits(
+    windows: Windows, parameters: np.ndarray, rows: np.ndarray, residual_limit: float, hermite_limit: float
+) -> np.ndarray:
+    """True (m,) where the smoothed residual rises above its limit or an echo's h3^2 + h4^2 exceeds its own."""
+    residual = rows[:, -1]
+    smoothed = residual[:, :-2] + residual[:, 2:]
+    smoothed += residual[:, 1:-1]
+    smoothed += residual[:, 1:-1]
+    highest = 0.25 * smoothed.max(axis=1, initial=0)
+    h3, h4 = hermite_moments(windows, parameters, rows)
+    shape = (h3 * h3 + h4 * h4).max(axis=1)
+    return (highest > residual_limit * SMOOTH_GAIN * windows.std) | (shape > hermite_limit)

@@ -1,0 +1,46 @@
+"""Pairing of echoes with returns: one to one, nearest in time, for a whole block at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def match_returns(
+    echo_waveform: np.ndarray,
+    echo_time: np.ndarray,
+    return_waveform: np.ndarray,
+    return_time: np.ndarray,
+    tolerance: float,
+) -> np.ndarray:
+    """Row of the return that each echo is matched with, -1 where there is none, i8 (m,).
+
+    Pairs are mutual nearest neighbours of one waveform, not further apart than tolerance [ns]; taken pairs are put
+    aside and the rest is paired again until no pair is left. Both sides must be sorted by waveform.
+    """
+    matched = np.full(len(echo_waveform), -1, np.int64)
+    if not len(echo_waveform) or not len(return_waveform):
+        return matched
+    longest = max(np.abs(echo_time).max(), np.abs(return_time).max(initial=0.0))
+    stride = 4.0 * (longest + tolerance) + 1.0
+    echoes = np.argsort(echo_waveform * stride + echo_time, kind="stable")
+    returns = np.argsort(return_waveform * stride + return_time, kind="stable")
+    while len(echoes) and len(returns):
+        echo_key = echo_waveform[echoes] * stride + echo_time[echoes]
+        return_key = return_waveform[returns] * stride + return_time[returns]
+        to_return = _nearest(echo_key, return_key)
+        to_echo = _nearest(return_key, echo_key)
+        pair = (to_echo[to_return] == np.arange(len(echoes))) & (np.abs(echo_key - return_key[to_return]) <= tolerance)
+        if not pair.any():
+            break
+        matched[echoes[pair]] = returns[to_return[pair]]
+        taken = np.zeros(len(returns), bool)
+        taken[to_return[pair]] = True
+        echoes, returns = echoes[~pair], returns[~taken]
+    return matched
+
+
+def _nearest(keys: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Index of the nearest of sorted `others` for each key; of two equally near, the first."""
+    right = np.clip(np.searchsorted(others, keys), 0, len(others) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(keys - others[left] <= others[right] - keys, left, right)

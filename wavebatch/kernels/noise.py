@@ -1,0 +1,87 @@
+"""Noise of integer waveforms: level, standard deviation and spread of baselines, pooled over thousands (H10, H11)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, smooth_121
+from wavebatch.units import QUANTISATION_STD
+
+ROUNDS = 4
+"""Times that level and quiet samples are found from each other."""
+
+
+class PooledNoise(NamedTuple):
+    """Noise of one recorded sample over many waveforms [count]."""
+
+    level: float
+    """Mean of the quiet samples."""
+    std: float
+    """Standard deviation of a quiet sample about its waveform's baseline, at least 0.289."""
+    smoothed_std: float
+    """Standard deviation after the [1 2 1]/4 filter over 0.61237: larger than std where noise is coloured."""
+    spread: float
+    """Standard deviation of the true baseline between waveforms."""
+    share: float
+    """Share of quiet samples."""
+
+
+def first_level(signal: np.ndarray) -> tuple[float, float]:
+    """Most frequent value among the lower half of signal (s, n), and the spread below it: a start, echoes ignored."""
+    median = np.median(signal, axis=0)
+    low = signal[signal <= np.median(median) + 1]
+    values, counts = np.unique(low, return_counts=True)
+    level = float(values[np.argmax(counts)])
+    below = low[low <= level] - level
+    return level, max(float(np.sqrt(np.mean(below * below))), QUANTISATION_STD)
+
+
+def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> PooledNoise:
+    """Pooled noise of raw signal (s, n): standard deviation of quiet samples, right for rounded data (H10).
+
+    reach: samples next to a signal that are not quiet. limit: a smoothed sample further from the level than this many
+    standard deviations is signal.
+    """
+    signal = signal.astype(np.float32)
+    level, std = first_level(signal)
+    spread = 0.0
+    mean, number, quiet = np.zeros(signal.shape[1]), np.zeros(signal.shape[1]), np.zeros(signal.shape, bool)
+    for _ in range(ROUNDS):
+        width = limit * np.hypot(SMOOTH_GAIN * std, spread) + 0.25
+        quiet = find_quiet(signal - np.float32(level), width, reach)
+        mean, number = quiet_mean(signal - np.float32(level), quiet)
+        if not number.any():
+            return PooledNoise(level, std, std, 0.0, 0.0)
+        level += float(np.sum(mean * number, dtype=np.float64) / np.sum(number))
+        deviation = np.where(quiet, signal - np.float32(level), np.float32(0))
+        std, spread = _split_variance(deviation, number)
+    return PooledNoise(level, std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()))
+
+
+def _split_variance(deviation: np.ndarray, number: np.ndarray) -> tuple[float, float]:
+    """Standard deviation within waveforms and between their means, from deviations (0 where not quiet)."""
+    several = number >= 8
+    if not several.any():
+        total = np.sum(deviation.astype(np.float64) ** 2) / max(number.sum(), 1)
+        return max(float(np.sqrt(total)), QUANTISATION_STD), 0.0
+    part = deviation[:, several].astype(np.float64)
+    count = number[several].astype(np.float64)
+    total, squares = part.sum(axis=0), (part * part).sum(axis=0)
+    within = np.sum(squares - total * total / count) / np.sum(count - 1)
+    means = total / count
+    between = np.average(means * means, weights=count) - within * len(count) / np.sum(count)
+    return max(float(np.sqrt(max(within, 0.0))), QUANTISATION_STD), float(np.sqrt(max(between, 0.0)))
+
+
+def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
+    """Standard deviation of the smoothed quiet samples about their waveform's mean, as that of white noise."""
+    smoothed = smooth_121(signal)[1:-1]
+    inside = quiet[2:] & quiet[1:-1] & quiet[:-2]
+    if not inside.any():
+        return std
+    mean, number = quiet_mean(smoothed, inside)
+    deviation = np.where(inside, smoothed - mean, 0).astype(np.float64)
+    freedom = np.maximum(number - 1, 0).sum()
+    return float(np.sqrt(np.sum(deviation * deviation) / freedom) / SMOOTH_GAIN) if freedom else std

@@ -1,0 +1,56 @@
+"""Where one more echo would explain most: a score test at every sample of the window."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.kernels.fit import Limits, Windows, add_ridge, gram_matrix, parameter_units
+
+LEAST_NEW = 0.03
+"""Share of a new echo's energy that the present echoes must not be able to explain."""
+
+
+def _correlate(rows: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    """Rows (..., L) correlated along L with symmetric taps (centre first), zero outside."""
+    reach, length = len(taps) - 1, rows.shape[-1]
+    padded = np.zeros((*rows.shape[:-1], length + 2 * reach), np.float32)
+    padded[..., reach : reach + length] = rows
+    total = np.float32(taps[0]) * rows
+    for i in range(1, reach + 1):
+        pair = padded[..., reach - i : reach - i + length] + padded[..., reach + i : reach + i + length]
+        pair *= np.float32(taps[i])
+        total += pair
+    return total
+
+
+def propose_echo(
+    windows: Windows, parameters: np.ndarray, rows: np.ndarray, limits: Limits, width: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Start parameters (m, 3, k + 1) with the best new echo of the given width, and the fall of chi2 it promises (m,).
+
+    For every sample position the new echo's pulse is projected out of the span of the present echoes' derivatives;
+    what remains, correlated with the residual, gives the linearised fall of chi2, the new amplitude and the
+    correction of the present parameters (one Gauss-Newton step in which the new amplitude starts at zero).
+    rows: of `evaluate_model` at the parameters.
+    """
+    m, _, k = parameters.shape
+    taps = np.exp(-0.5 * (np.arange(int(np.ceil(3 * width)) + 1) / width) ** 2)
+    inside = (windows.x >= 0).astype(np.float32)
+    spread = _correlate(rows, taps).astype(np.float64)
+    energy = _correlate(inside, taps**2).astype(np.float64)
+    cross = spread[:, :-1]
+    explained = np.linalg.solve(add_ridge(gram_matrix(rows[:, :-1])), cross)
+    left = energy - np.einsum("mpl,mpl->ml", cross, explained)
+    usable = (left > LEAST_NEW * energy.max(axis=1, keepdims=True)) & (inside > 0)
+    amplitude = np.where(usable, np.maximum(spread[:, -1], 0) / np.where(usable, left, 1.0), 0.0)
+    score = amplitude**2 * left
+    place = np.argmax(score, axis=1)
+    problem = np.arange(m)
+    new = amplitude[problem, place]
+    change = -(explained[problem, :, place] * new[:, None]).reshape(m, 3, k) * parameter_units(parameters, windows.std)
+    start = np.empty((m, 3, k + 1))
+    start[:, 0, :k] = np.maximum(parameters[:, 0] + change[:, 0], 0.2 * parameters[:, 0])
+    start[:, 1, :k] = parameters[:, 1] + np.clip(change[:, 1], -width, width)
+    start[:, 2, :k] = parameters[:, 2] + np.clip(change[:, 2], -0.4 * parameters[:, 2], 0.3 * parameters[:, 2])
+    start[:, :, k] = np.stack([new, place.astype(np.float64), np.full(m, width)], axis=1)
+    return np.clip(start, limits.low, limits.high), score[problem, place] / windows.std**2

@@ -1,0 +1,90 @@
+"""Attributes: what a fitted echo says about its target."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.match import match_returns
+from wavebatch.units import FWHM_PER_SIGMA, SQRT_2PI
+
+
+@stage("attribute", makes=("amplitude", "amplitude_err"))
+def amplitude(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Peak of each echo above the baseline [DN], and its error."""
+    return echoes.with_attributes(amplitude=echoes.amplitude, amplitude_err=echoes.amplitude_err)
+
+
+@stage("attribute", makes=("echo_width", "echo_width_err"))
+def echo_width(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Full width at half maximum of each echo [ns], and its error: 2.354820 sigma of the fitted pulse's main part."""
+    factor = np.float32(_width_factor(system.kappa))
+    return echoes.with_attributes(echo_width=echoes.sigma * factor, echo_width_err=echoes.sigma_err * factor)
+
+
+def _width_factor(kappa: float) -> float:
+    """Full width at half maximum per sigma of a skewed pulse (section 0); 2.354820 without skew."""
+    half = FWHM_PER_SIGMA / 2
+    return FWHM_PER_SIGMA if abs(kappa) < 1e-6 else float(2 * np.sinh(half * kappa) / kappa)
+
+
+@stage("attribute", makes=("energy",))
+def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse."""
+    factor = np.float32(SQRT_2PI * np.exp(0.5 * system.kappa**2))
+    return echoes.with_attributes(energy=echoes.amplitude * echoes.sigma * factor)
+
+
+@stage("attribute", makes=("x", "y", "z", "point", "range_err"))
+def position(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *, tolerance: float = 2.5
+) -> EchoTable:
+    """Coordinates of each echo along its ray [m], relative to the returns of its packet; the return it is matched with.
+
+    Return locations are offset from the fit by an amount that the returns of a packet share (the outgoing pulse's
+    phase, a leading-edge detector): the offset is measured on the matched returns and taken off. Packets in which no
+    return is matched keep the raw location and are flagged. Source: LAS-WAVEFORMS 8.
+
+    tolerance: largest distance in time between an echo and the return it is matched with [ns], beyond half a sample.
+    """
+    waveform = echoes.waveform
+    offset = np.zeros(len(block))
+    known = np.zeros(len(block), bool)
+    point = np.full(len(echoes), -1, np.int64)
+    returns = block.returns
+    if returns is not None and len(returns):
+        reach = tolerance + 0.5 * block.spacing
+        match = match_returns(waveform, echoes.time, returns.waveform, returns.time, reach)
+        offset, known = _shared_offset(len(block), echoes, match, returns.time)
+        shifted = returns.time + offset[returns.waveform]
+        match = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
+        offset, known = _shared_offset(len(block), echoes, match, returns.time)
+        point = np.where(match >= 0, returns.point[match], -1)
+    along = echoes.time - offset[waveform]
+    xyz = block.origin[waveform] + block.direction[waveform] * along[:, None]
+    speed = np.sqrt(np.sum(block.direction**2, axis=1))
+    echoes = echoes.with_attributes(
+        x=xyz[:, 0],
+        y=xyz[:, 1],
+        z=xyz[:, 2],
+        point=point,
+        range_err=(echoes.time_err * speed[waveform]).astype(np.float32),
+    )
+    if returns is None:
+        return echoes
+    return echoes.with_flags(EchoFlag.ADDED, point < 0).with_flags(EchoFlag.UNANCHORED, ~known[waveform])
+
+
+def _shared_offset(
+    n: int, echoes: EchoTable, match: np.ndarray, return_time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Offset of the fits from the return locations per waveform [ns], weighted by the errors, and where it is known."""
+    rows = np.flatnonzero(match >= 0)
+    error = echoes.time_err[rows].astype(np.float64)
+    weight = 1.0 / np.maximum(np.where(np.isfinite(error), error, 1.0), 1e-3) ** 2
+    difference = echoes.time[rows] - return_time[match[rows]]
+    waveform = echoes.waveform[rows]
+    total = np.bincount(waveform, weight, minlength=n)
+    offset = np.bincount(waveform, weight * difference, minlength=n) / np.where(total > 0, total, 1.0)
+    return offset, total > 0

@@ -1,0 +1,281 @@
+"""Decomposers: what candidates become when a model of the waveform is fitted to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.closed_form import fit_closed_form
+from wavebatch.kernels.cluster import Candidates, Clusters, cluster_candidates, cut_windows
+from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
+from wavebatch.kernels.fit import WidthPrior
+from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseShape
+from wavebatch.kernels.signal import smooth_121, transpose_samples
+from wavebatch.units import SQRT_PI
+
+MARGIN = 1.6
+"""Windows extend this many system widths beyond the signal above the noise."""
+
+REACH = 3.0
+"""Windows extend at least this many system widths beyond the outer candidates."""
+
+MOST_JOINED = 6
+"""Candidates on one run of signal beyond which it is fitted in parts."""
+
+
+@stage("decompose")
+def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """The detector's echoes as they are, without a fit and without errors."""
+    return _flag_plain(block, noise, system, echoes)
+
+
+@stage("decompose")
+def closed_form(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    fraction: float = 0.2,
+    steps: int = 2,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A Gaussian for every candidate on its own: a closed form and a few Gauss-Newton steps.
+
+    At the Cramer-Rao bound for isolated echoes; overlapping echoes are cut apart half-way between them and therefore
+    biased. Source: Guo (2011); ALGORITHMS 4.1.
+
+    fraction: samples of at least this share of the peak enter the closed form.
+    steps: Gauss-Newton steps after it.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    start = _start_closed_form(block, noise, system, echoes, fraction)
+    settings = _settings(block, system, GAUSSIAN, tolerance=1e-6, max_iterations=steps + 1, grow=False)
+    return _decompose(block, noise, system, start, settings, most=1, significance=significance)
+
+
+@stage("decompose")
+def gaussian(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    max_iterations: int = 40,
+    tolerance: float = 0.01,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
+
+    Batched Levenberg-Marquardt; widths within 0.7 and 4 system widths, times within the window; no echo is added.
+    Source: Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
+
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that another step may still promise when a fit is done.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    settings = _settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    return _decompose(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+@stage("decompose")
+def adaptive(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    acceptance: float = 0.0,
+    max_echoes: int = 6,
+    gate_residual: float = 4.2,
+    gate_hermite: float = 11.9,
+    width_prior: float = 0.05,
+    max_iterations: int = 40,
+    tolerance: float = 0.05,
+    significance: float = 5.0,
+) -> EchoTable:
+    """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
+
+    Each cluster of candidates is fitted with the strip's pulse. Where the smoothed residual or its Gauss-Hermite
+    moments leave the range of noise, a score test places one more echo, and the fit with it is kept if chi2 falls
+    enough and the echoes can be told apart. Source: ALGORITHMS 2.3, 4.2, H1, H3.
+
+    acceptance: least fall of chi2 for which an echo is added; 0 takes the strip's own from the survey.
+    max_echoes: echoes per cluster up to which a fit grows.
+    gate_residual: largest smoothed residual of a complete fit, in standard deviations.
+    gate_hermite: largest h3^2 + h4^2 of a complete fit.
+    width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths.
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that another step may still promise when a fit is done.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    settings = _settings(
+        block,
+        system,
+        pulse_shape(system, block.spacing),
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        grow=True,
+        acceptance=acceptance or system.acceptance,
+        max_echoes=max_echoes,
+        prior=WidthPrior(system.sigma_ref / block.spacing, width_prior * system.sigma_ref / block.spacing),
+        gate_residual=gate_residual,
+        gate_hermite=gate_hermite,
+    )
+    return _decompose(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
+    """The strip's pulse in samples: learned, skewed or Gaussian, whichever the survey set."""
+    if len(system.components) > 1:
+        weight, delay, sigma = system.components[0]
+        rest = tuple(
+            (w * s / (weight * sigma), (d - delay) / spacing, (s * s - sigma * sigma) / spacing**2)
+            for w, d, s in system.components[1:]
+        )
+        return PulseShape(components=rest)
+    return PulseShape(kappa=system.kappa) if abs(system.kappa) >= NO_SKEW else GAUSSIAN
+
+
+def _settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
+    ref = system.sigma_ref / block.spacing
+    low = 0.7 * ref
+    narrowest = min((extra for _, _, extra in shape.components), default=0.0)
+    low = max(low, np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
+    return Settings(ref, low, 4.0 * ref, shape=shape, clip=system.saturation, **options)
+
+
+def _decompose(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    settings: Settings,
+    *,
+    most: int,
+    significance: float,
+) -> EchoTable:
+    """Candidates in ns -> clusters -> fits -> flagged table in ns."""
+    spacing = block.spacing
+    candidates = Candidates(
+        echoes.waveform.astype(np.int64),
+        echoes.time / spacing,
+        np.maximum(echoes.amplitude.astype(np.float64), 0.0),
+        np.clip(echoes.sigma.astype(np.float64) / spacing, settings.width_low, settings.width_high),
+    )
+    signal = transpose_samples(block.samples)
+    signal -= noise.baseline
+    ref = settings.width_ref
+    clusters = cluster_candidates(
+        candidates,
+        smooth_121(signal),
+        noise.std,
+        margin=int(np.ceil(MARGIN * ref)),
+        reach=int(np.ceil(REACH * ref)),
+        most=most,
+    )
+    del signal
+    solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
+    return _table(block, noise, system, clusters, list(solutions), significance)
+
+
+def _table(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    clusters: Clusters,
+    solutions: list[Solution],
+    significance: float,
+) -> EchoTable:
+    if not solutions:
+        return EchoTable.empty()
+    flat = [_flatten(clusters, solution) for solution in solutions]
+    waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
+    amplitude, time, width = parameters.T
+    energy = amplitude * amplitude * width * SQRT_PI
+    last = block.samples.shape[1] - 1
+    keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
+    keep &= np.isfinite(errors).all(axis=1)
+    waveform, time, amplitude, width = waveform[keep], time[keep], amplitude[keep], width[keep]
+    errors = errors[keep]
+    table = EchoTable.build(
+        waveform,
+        time * block.spacing,
+        amplitude,
+        width * block.spacing,
+        time_err=errors[:, 1] * block.spacing,
+        amplitude_err=errors[:, 0],
+        sigma_err=errors[:, 2] * block.spacing,
+        residual=misfit[keep],
+        flags=flags[keep],
+    )
+    return _flag_plain(block, noise, system, table)
+
+
+def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
+    """One row per echo: waveform, parameters (m, 3), errors (m, 3), misfit, flags."""
+    k = solution.parameters.shape[2]
+    flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
+    flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
+    if k > 1:
+        flags |= int(EchoFlag.OVERLAPPED)
+    return (
+        np.repeat(clusters.waveform[solution.cluster], k),
+        solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
+        solution.errors.transpose(0, 2, 1).reshape(-1, 3),
+        np.repeat(solution.misfit, k),
+        flags.reshape(-1),
+    )
+
+
+def _flag_plain(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:
+    """Flags that need no fit: weak, near an edge, narrow, saturated."""
+    last = (block.samples.shape[1] - 1) * block.spacing
+    table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
+    edge = np.minimum(table.time, last - table.time) < table.sigma
+    table = table.with_flags(EchoFlag.NEAR_EDGE, edge)
+    narrow = table.sigma + 3 * np.nan_to_num(table.sigma_err) < system.sigma_ref
+    table = table.with_flags(EchoFlag.NARROW, narrow & (table.sigma < 0.93 * system.sigma_ref))
+    if system.saturation is None:
+        return table
+    return _flag_saturated(block, system.saturation, table)
+
+
+def _flag_saturated(block: WaveformBlock, level: float, table: EchoTable) -> EchoTable:
+    """Echoes with clipped samples within 1.5 widths of their centre; amplitudes that are guesses (H6)."""
+    rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
+    if not len(rows):
+        return table
+    sample = np.arange(block.samples.shape[1]) * block.spacing
+    near = np.abs(sample - table.time[rows, None]) <= 1.5 * table.sigma[rows, None]
+    clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
+    saturated = np.zeros(len(table), bool)
+    saturated[rows] = clipped
+    guess = saturated & (table.amplitude > 2.5 * level)
+    table = table.with_flags(EchoFlag.SATURATED, saturated)
+    return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)
+
+
+def _start_closed_form(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, fraction: float
+) -> EchoTable:
+    """The candidates with amplitude, time and width from the closed form where it holds."""
+    ref = system.sigma_ref / block.spacing
+    waveform = echoes.waveform.astype(np.int64)
+    s = block.samples.shape[1]
+    peak = np.clip(np.rint(echoes.time / block.spacing), 0, s - 1).astype(np.int64)
+    reach = min(int(np.ceil(2.5 * ref)), s)
+    at = peak[:, None] + np.arange(-reach, reach + 1)
+    inside = (at >= 0) & (at < s)
+    y = block.samples[waveform[:, None], np.clip(at, 0, s - 1)] - noise.baseline[waveform][:, None]
+    amplitude, shift, width, holds = fit_closed_form(np.where(inside, y, 0.0), fraction)
+    holds &= (width > 0.7 * ref) & (width < 4.0 * ref)
+    return replace(
+        echoes,
+        amplitude=np.where(holds, amplitude, echoes.amplitude).astype(np.float32),
+        time=np.where(holds, (peak + shift) * block.spacing, echoes.time),
+        sigma=np.where(holds, width * block.spacing, echoes.sigma).astype(np.float32),
+    )

@@ -1,0 +1,103 @@
+"""Detectors: where a waveform holds echoes. Times in ns; widths are first guesses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.cluster import estimate_starts
+from wavebatch.kernels.filters import (
+    curvature_taps,
+    filter_energy,
+    filter_symmetric,
+    gaussian_taps,
+    refine_peaks,
+)
+from wavebatch.kernels.signal import SMOOTH_GAIN, find_peaks, smooth_121, transpose_samples
+
+TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
+"""Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
+
+
+def _signal(block: WaveformBlock, noise: Noise) -> np.ndarray:
+    """Signal above the baseline, float32 (s, n)."""
+    signal = transpose_samples(block.samples)
+    signal -= noise.baseline
+    return signal
+
+
+def _table(
+    block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
+) -> EchoTable:
+    """Candidates in samples as a table in ns."""
+    return EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
+
+
+@stage("detect")
+def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.0) -> EchoTable:
+    """Echoes at the local maxima of the [1 4 6 4 1]/16-smoothed waveform.
+
+    Time, amplitude and width come from a log-parabola through five samples around the maximum. Never splits a broad
+    echo. Source: Wagner et al. (2007), max-detection; smoothing as in ALGORITHMS 1.1.
+
+    threshold: least height above the baseline, in standard deviations of the smoothed noise.
+    """
+    smoothed = smooth_121(_signal(block, noise))
+    twice = smooth_121(smoothed)
+    waveform, sample = find_peaks(twice, np.float32(threshold * TWICE_SMOOTHED_GAIN) * noise.std)
+    ref = system.sigma_ref / block.spacing
+    amplitude, time, width = estimate_starts(smoothed, waveform, sample, ref)
+    return _table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
+
+
+@stage("detect")
+def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.27) -> EchoTable:
+    """Echoes at the maxima of the correlation with the system pulse: the most sensitive detector of weak echoes.
+
+    Sub-sample times by a parabola through the logarithms of three correlations (1.00-1.04 of the Cramer-Rao bound
+    for an isolated echo of the system's width). Source: ALGORITHMS 1.1 (4), 1.3, 4.1.
+
+    threshold: least correlation, in standard deviations of the filtered noise; 4.27 lets noise through in 0.1 % of 200
+    samples.
+    """
+    ref = system.sigma_ref / block.spacing
+    taps = gaussian_taps(ref)
+    energy = filter_energy(taps)
+    correlation = filter_symmetric(_signal(block, noise), taps)
+    waveform, sample = find_peaks(correlation, np.float32(threshold * np.sqrt(energy)) * noise.std)
+    time, height = refine_peaks(correlation, waveform, sample)
+    return _table(block, waveform, time, height / energy, np.full(len(waveform), ref))
+
+
+@stage("detect")
+def second_derivative(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    *,
+    threshold: float = 4.0,
+    scale: float = 0.7,
+    level: float = 4.0,
+) -> EchoTable:
+    """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
+
+    The derivative is taken of the waveform smoothed by a Gaussian. Equal echoes are told apart from
+    1.48 sqrt(s^2 + a^2) on, a the smoothing. Source: Hofton et al. (2000), inflection points; ALGORITHMS 1.2, 2.2.
+
+    threshold: least curvature, in standard deviations of the filtered noise.
+    scale: width of the smoothing, in widths of the system pulse.
+    level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
+    """
+    signal = _signal(block, noise)
+    smoothed = smooth_121(signal)
+    ref = system.sigma_ref / block.spacing
+    taps = curvature_taps(max(scale * ref, 0.7))
+    curvature = filter_symmetric(signal, taps)
+    waveform, sample = find_peaks(curvature, np.float32(threshold * np.sqrt(filter_energy(taps))) * noise.std)
+    s, n = smoothed.shape
+    high = smoothed.reshape(-1)[sample * n + waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
+    waveform, sample = waveform[high], sample[high]
+    time, _ = refine_peaks(curvature, waveform, sample)
+    amplitude = smoothed.reshape(-1)[sample * n + waveform]
+    return _table(block, waveform, time, amplitude, np.full(len(waveform), ref))

@@ -1,0 +1,54 @@
+"""Noise stages: the level without signal, and its spread, of every waveform."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, transpose_samples
+from wavebatch.units import QUANTISATION_STD
+
+
+@stage("noise")
+def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, limit: float = 3.5) -> Noise:
+    """Baseline of each waveform from its quiet samples, drawn towards the strip's; standard deviation of the strip.
+
+    The standard deviation is that of the pooled quiet samples of the whole strip (survey): of a single waveform
+    rounded to whole counts it could not be estimated (H10). The baseline is the best linear estimate from the mean
+    of the waveform's own quiet samples and the strip's baseline, given how much baselines scatter between waveforms.
+
+    guard: samples next to a signal are not quiet; how far, in widths of the system pulse.
+    limit: a smoothed sample further from the strip's baseline than this is signal, in noise standard deviations.
+    """
+    n = len(block)
+    std = max(system.noise_std, QUANTISATION_STD)
+    signal = transpose_samples(block.samples)
+    signal -= np.float32(system.baseline)
+    reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
+    spread = system.baseline_spread
+    quiet = find_quiet(signal, np.float32(limit * SMOOTH_GAIN * np.hypot(std, spread)), reach)
+    mean, number = quiet_mean(signal, quiet)
+    trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
+    baseline = system.baseline + trust * mean
+    return Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
+
+
+@stage("noise")
+def tail(block: WaveformBlock, system: SystemPulse, *, samples: int = 16) -> Noise:
+    """Baseline and standard deviation of each waveform from its last samples.
+
+    For sensors whose baseline drifts and whose waveforms end in silence. The standard deviation is never less than the
+    strip's.
+
+    samples: how many samples at the end are taken for noise.
+    """
+    if samples < 2:
+        raise ValueError(f"samples must be at least 2, got {samples}")
+    end = transpose_samples(block.samples[:, -samples:])
+    baseline = np.median(end, axis=0)
+    deviation = end - baseline
+    std = np.sqrt(np.sum(deviation * deviation, axis=0) / max(len(end) - 1, 1))
+    return Noise(
+        baseline.astype(np.float32), np.maximum(std, max(system.noise_std, QUANTISATION_STD)).astype(np.float32)
+    )
