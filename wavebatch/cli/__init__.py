@@ -1,0 +1,59 @@
+"""The command line: parse, one library call, print. A command's module is imported when the command is used."""
+
+from __future__ import annotations
+
+import importlib
+
+import click
+
+from wavebatch import __version__
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "run": ("wavebatch.cli.run:run", "Strips in, enriched point clouds out: the main job."),
+    "info": ("wavebatch.cli.inspect:info", "What a strip holds: points, packets, descriptors, samples."),
+    "check": ("wavebatch.cli.inspect:check", "Problems of strips and chain files, one line each."),
+    "stages": ("wavebatch.cli.stages:stages", "The algorithms: all of them, or one with its parameters."),
+    "simulate": ("wavebatch.cli.simulate:simulate", "A strip with known echoes."),
+    "compare": ("wavebatch.cli.compare:compare", "Two results on one strip, or a result with the truth."),
+}
+"""Per command: where it is, `module:function`, and the line that the list of commands shows for it."""
+
+
+class LazyGroup(click.Group):
+    """A group that lists its commands from COMMANDS and imports only the one that is called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of COMMANDS."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command, imported now; None for an unknown name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, function = COMMANDS[cmd_name][0].partition(":")
+        return getattr(importlib.import_module(module), function)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does it, with the nearest known command where there is none of that name."""
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in COMMANDS:
+            from wavebatch.words import nearest
+
+            ctx.fail(f"no command {name!r}; {nearest(name, COMMANDS)}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands, without importing any of them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+
+@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="wavebatch", message="%(prog)s %(version)s")
+def main() -> None:
+    """Decomposes full-waveform lidar strips: LAS/LAZ wave packets in, enriched point clouds out.
+
+    `wavebatch COMMAND --help` explains a command.
+    """

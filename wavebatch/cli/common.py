@@ -1,0 +1,72 @@
+"""What the commands share: talk on stderr, errors as one line and an exit code, JSON on stdout."""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from wavebatch.errors import ConfigError, InputError, StageError
+
+EXIT_USAGE = 2
+"""Wrong usage or chain file; nothing was started."""
+EXIT_INTERRUPTED = 130
+"""Ctrl-C or SIGTERM."""
+
+
+def talk(message: str) -> None:
+    """One line on stderr."""
+    click.echo(message, err=True)
+
+
+def print_json(value: Any) -> None:
+    """`value` as JSON with sorted keys on stdout."""
+    click.echo(json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False))
+
+
+def one_line(error: BaseException) -> str:
+    """The error's message without line breaks; a bug shows its type too."""
+    text = " ".join(str(error).split())
+    if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
+        return text
+    return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
+
+
+def debug_option(command: Callable) -> Callable:
+    """`--debug`: tracebacks instead of lines."""
+    return click.option("--debug", is_flag=True, help="Show the traceback of an error.")(command)
+
+
+def report_errors(failure: int = 1) -> Callable:
+    """Decorator of a command function: wavebatch's errors become one line on stderr and an exit code.
+
+    failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE, an
+    interrupt EXIT_INTERRUPTED. Where the command has a parameter `debug`, it decides whether tracebacks are shown.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def guarded(*args: Any, **options: Any) -> Any:
+            try:
+                return function(*args, **options)
+            except (click.ClickException, click.exceptions.Exit, click.Abort):
+                raise
+            except KeyboardInterrupt:
+                talk("interrupted")
+                sys.exit(EXIT_INTERRUPTED)
+            except BrokenPipeError:
+                raise
+            except Exception as error:
+                if options.get("debug"):
+                    traceback.print_exc()
+                talk(f"error: {one_line(error)}")
+                sys.exit(EXIT_USAGE if isinstance(error, ConfigError) else failure)
+
+        return guarded
+
+    return decorate
