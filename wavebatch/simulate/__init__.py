@@ -4,6 +4,8 @@ from wavebatch.simulate.blocks import flag_truth, simulate_block, simulate_block
 from wavebatch.simulate.pulses import PULSES, PulseModel, find_pulse
 from wavebatch.simulate.render import Recording
 from wavebatch.simulate.scenes import SCENES, Scene, find_scene
+from wavebatch.simulate.strip import StripOptions, StripSummary, simulate_strip
+from wavebatch.simulate.truth import TruthReader
 
 __all__ = [
     "PULSES",
@@ -11,9 +13,13 @@ __all__ = [
     "PulseModel",
     "Recording",
     "Scene",
+    "StripOptions",
+    "StripSummary",
+    "TruthReader",
     "find_pulse",
     "find_scene",
     "flag_truth",
     "simulate_block",
     "simulate_blocks",
+    "simulate_strip",
 ]

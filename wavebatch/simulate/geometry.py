@@ -31,7 +31,9 @@ class Flight:
     line_rate: float = 50.0
     """Scan lines per second, all swept from north to south."""
     half_angle: float = 25.0
-    """Largest angle off nadir [deg]."""
+    """Largest angle off nadir across the flight [deg]."""
+    look_ahead: float = 4.0
+    """Angle off nadir along the flight [deg]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +62,7 @@ def trace_rays(flight: Flight, terrain: str, pulse: np.ndarray) -> Rays:
     sensor_y = NORTH + 2.0 * np.sin(0.21 * seconds)
     sensor_z = GROUND + flight.height + 3.0 * np.sin(0.13 * seconds)
     angle = np.radians(flight.half_angle) * (1.0 - 2.0 * phase)
-    x = sensor_x
+    x = sensor_x + flight.height * np.tan(np.radians(flight.look_ahead))
     y = sensor_y + flight.height * np.tan(angle)
     height, slope_x, slope_y = TERRAINS[terrain](x, y)
     z = GROUND + height
