@@ -1,0 +1,120 @@
+"""Chain files: what is taken, what is refused and with which words."""
+
+import pytest
+
+from wavebatch.chain import STAGES, Chain
+from wavebatch.config import effective, list_profiles, load_chain, load_profile, parse_chain
+from wavebatch.errors import ConfigError
+
+GOOD = """
+[[chain]]
+stage = "noise.pooled"
+[[chain]]
+stage = "detect.maximum"
+threshold = 5
+[[chain]]
+stage = "decompose.closed_form"
+steps = 3
+[[chain]]
+stage = "attribute.position"
+"""
+
+
+def test_values_are_kept_and_integers_become_numbers():
+    chain = parse_chain(GOOD, "here")
+    assert [step.stage.name for step in chain.steps] == [
+        "noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position"
+    ]  # fmt: skip
+    threshold = chain.steps[1].parameters["threshold"]
+    assert threshold == 5.0 and isinstance(threshold, float)
+    assert chain.steps[2].parameters == {"steps": 3}
+
+
+def test_effective_text_names_every_parameter_and_reads_back_the_same():
+    chain = parse_chain(GOOD, "here")
+    text = effective(chain)
+    again = parse_chain(text, "there")
+    assert [step.effective() for step in again.steps] == [step.effective() for step in chain.steps]
+    assert effective(again) == text
+    for step in chain.steps:
+        for name in step.stage.parameters:
+            assert f"\n{name} = " in text
+
+
+@pytest.mark.parametrize("name", list_profiles())
+def test_shipped_profiles_load_and_read_back(name):
+    chain = load_profile(name)
+    assert isinstance(chain, Chain)
+    assert effective(parse_chain(effective(chain), name)) == effective(chain)
+
+
+def test_the_three_promised_profiles_are_shipped():
+    assert {"fast", "balanced", "accurate"} <= set(list_profiles())
+
+
+def _wrong(old, new):
+    assert old in GOOD
+    return GOOD.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (_wrong("detect.maximum", "detect.maximun"), ["[[chain]] 2", "detect.maximun", "'detect.maximum'?"]),
+        (_wrong("threshold", "treshold"), ["[[chain]] 2 (detect.maximum)", "'treshold'", "'threshold'?"]),
+        (_wrong("= 5", '= "5"'), ["threshold must be a number", "'5'"]),
+        (_wrong("= 5", "= true"), ["threshold must be a number", "True"]),
+        (_wrong("= 5", "= inf"), ["threshold must be a finite number"]),
+        (_wrong("= 3", "= 3.0"), ["steps must be an integer", "3.0"]),
+        (_wrong('stage = "noise.pooled"', "guard = 3.0"), ["[[chain]] 1", "stage is missing"]),
+        (_wrong('"noise.pooled"', "7"), ["[[chain]] 1", "stage must be a string"]),
+        (_wrong("= 5", "= "), ["not valid TOML", "line 6"]),
+        ("[chain]\nstage = 'noise.pooled'", ["[[chain]]"]),
+        ("[[chian]]\nstage = 'noise.pooled'", ["'chian'", "'chain'?"]),
+        ("jobs = 3\n" + GOOD, ["'jobs'"]),
+        ("", ["needs one noise"]),
+        (_wrong("noise.pooled", "detect.maximum"), ["needs one noise", "detect, detect, decompose"]),
+    ],
+)
+def test_wrong_chains_are_refused_in_one_line_that_says_where(tmp_path, text, words):
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_chain(path)
+    message = str(caught.value)
+    assert "\n" not in message and "wrong.toml" in message
+    for word in words:
+        assert word in message
+
+
+def test_unreadable_chain_files_are_config_errors(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.toml: chain file cannot be read"):
+        load_chain(tmp_path / "none.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="UTF-8"):
+        load_chain(tmp_path / "bytes.toml")
+
+
+def test_unknown_profile_names_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'balanced'"):
+        load_profile("balance")
+
+
+def test_choices_are_checked(monkeypatch):
+    from typing import Literal
+
+    import wavebatch.chain as chain_module
+    from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+
+    monkeypatch.setattr(chain_module, "STAGES", STAGES.copy())
+
+    def pick(block: WaveformBlock, system: SystemPulse, *, kind: Literal["a", "b"] = "a") -> Noise:
+        """Noise.
+
+        kind: which.
+        """
+
+    chain_module.stage("noise")(pick)
+    monkeypatch.setattr("wavebatch.config.STAGES", chain_module.STAGES)
+    with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
+        parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")
