@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import BinaryIO, Protocol
 
 import lazrs
 import numpy as np
 
 from wavebatch.errors import InputError
-from wavebatch.io.header import STANDARD_DTYPES, LasHeader, Vlr, read_header_of
+from wavebatch.io.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
 
 try:
     import laszip
@@ -85,12 +86,14 @@ class _LazrsEncoder:
 
 
 class _LaszipEncoder:
+    """LASzip 3.5 codes LAS 1.5 in a way that lazrs cannot read: it is shown a header of LAS 1.4 of the same size."""
+
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
-        header.compressed = False
-        plain = header.encode()
-        header.compressed = True
+        version = min(header.version, (1, 4))
+        longer = HEADER_SIZES[header.version] - HEADER_SIZES[version]
+        shown = replace(header, compressed=False, version=version, user_bytes=bytes(longer) + header.user_bytes)
         self._file, self._header = file, header
-        self._zipper = laszip.LasZipper(file, plain)
+        self._zipper = laszip.LasZipper(file, shown.encode())
 
     def write(self, rows: np.ndarray) -> None:
         self._zipper.compress(rows.view(np.uint8))

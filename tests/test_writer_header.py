@@ -1,0 +1,139 @@
+"""Headers and records are the bytes they were; damaged ones give one line."""
+
+import dataclasses
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from writer_tools import data_file, write_source, write_strip
+
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.io.header import HEADER_SIZES, LasHeader, Vlr, encode_evlr_header, find_evlrs, read_header
+from wavebatch.io.layout import plan_output
+
+REAL = [
+    "riegl-q680i/100429_152240_2535pt_UTM.las",
+    "leica-als/simple1_3_full_internal.las",
+    "no-packets/fullwave.laz",
+    "no-packets/pdrf9-1.5.laz",
+]
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_headers_come_back_byte_for_byte(name):
+    path = data_file(name)
+    header = read_header(path)
+    assert header.encode() == path.read_bytes()[: header.offset_to_points]
+
+
+@pytest.mark.parametrize("version", [v for v in HEADER_SIZES if v >= (1, 2)])
+def test_laspy_reads_every_field(tmp_path, version):
+    point_format = 6 if version == (1, 5) else 1
+    header = LasHeader(
+        version, point_format, 30 if point_format == 6 else 28, (0.1, 0.2, 0.3), (1.0, 2.0, 3.0),
+        file_source_id=7, global_encoding=17, project_id=bytes(range(16)), system_identifier=b"SYSTEM",
+        generating_software=b"SOFT", creation=(60, 2024), point_count=0, maxs=(3.0, 4.0, 5.0), mins=(1.0, 2.0, 3.0),
+        user_bytes=b"user", padding=b"\xdd\xcc", vlrs=[Vlr(b"me", 5, b"abc", b"what", 0xAABB)],
+    )  # fmt: skip
+    path = tmp_path / "a.las"
+    path.write_bytes(header.encode())
+    with laspy.open(path) as reader:
+        seen = reader.header
+    assert str(seen.version) == f"{version[0]}.{version[1]}" and seen.point_format.id == point_format
+    assert (seen.file_source_id, seen.global_encoding.value, seen.uuid.bytes_le) == (7, 17, bytes(range(16)))
+    assert (seen.system_identifier, seen.generating_software) == ("SYSTEM", "SOFT")
+    assert (seen.creation_date.timetuple().tm_yday, seen.creation_date.year) == (60, 2024)
+    assert list(seen.scales) == [0.1, 0.2, 0.3] and list(seen.offsets) == [1, 2, 3]
+    assert list(seen.maxs) == [3, 4, 5] and list(seen.mins) == [1, 2, 3]
+    assert (seen.extra_header_bytes, seen.extra_vlr_bytes) == (b"user", b"\xdd\xcc")
+    assert (seen.vlrs[0].user_id, seen.vlrs[0].record_id, seen.vlrs[0].record_data) == ("me", 5, b"abc")
+    assert dataclasses.asdict(read_header(path))["vlrs"][0]["reserved"] == 0xAABB
+
+
+def test_counts_of_old_formats_stay_readable_for_old_readers(tmp_path):
+    write_source(tmp_path / "a.las", 1, (1, 4), n=10)
+    write_source(tmp_path / "b.las", 6, (1, 4), n=10)
+    legacy = [np.frombuffer((tmp_path / name).read_bytes(), "<u4", 1, 107)[0] for name in ("a.las", "b.las")]
+    assert legacy == [10, 0] and read_header(tmp_path / "a.las").point_count == 10
+
+
+def test_legacy_count_is_read_where_the_long_one_is_empty(tmp_path):
+    write_source(tmp_path / "a.las", 1, (1, 4), n=10)
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[247:255] = bytes(8)
+    (tmp_path / "a.las").write_bytes(data)
+    assert read_header(tmp_path / "a.las").point_count == 10
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "not a LAS or LAZ file"),
+        (b"LASF" + bytes(100), "not a LAS or LAZ file"),
+        (b"PK" + bytes(400), "not a LAS or LAZ file"),
+        (b"LASF" + bytes(20) + b"\x01\x09" + bytes(400), "LAS version 1.9 is not known"),
+        (b"LASF" + bytes(20) + b"\x01\x04" + bytes(400), "contradicts itself"),
+    ],
+)
+def test_what_is_no_las_file_is_one_line(tmp_path, data, message):
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match=message) as caught:
+        read_header(tmp_path / "a.las")
+    assert str(caught.value).startswith(str(tmp_path / "a.las")) and "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path):
+    with pytest.raises(InputError, match="a.las: cannot be read: No such file"):
+        read_header(tmp_path / "a.las")
+
+
+@pytest.mark.parametrize("at", [100, 102])  # number of VLRs; a VLR's length
+def test_vlrs_that_run_into_the_points(tmp_path, at):
+    write_source(tmp_path / "a.las", 1, (1, 3), vlrs=[Vlr(b"me", 1, b"abc")])
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    place = 100 if at == 100 else 235 + 20
+    data[place : place + 2] = b"\xff\xff"
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match="runs into the points"):
+        read_header(tmp_path / "a.las")
+
+
+def test_evlrs_end_where_the_file_does(tmp_path):
+    path = tmp_path / "a.las"
+    write_source(path, 6, (1, 4), evlrs=[(b"one", 1, b"1" * 10), (b"two", 2, b"")])
+    found, missing = find_evlrs(path, read_header(path))
+    assert [(evlr.user, evlr.record_id, evlr.length) for evlr in found] == [("one", 1, 10), ("two", 2, 0)]
+    assert missing == 0
+    with open(path, "ab") as file:
+        file.write(encode_evlr_header(b"three", 3, 2**63, b""))
+    header = read_header(path)
+    header.evlr_count = 2**32 - 1
+    found, missing = find_evlrs(path, header)
+    assert len(found) == 2 and missing == 2**32 - 3
+    header.evlr_start = header.offset_to_points + 1
+    assert find_evlrs(path, header) == ([], 2**32 - 1)
+    assert find_evlrs(path, dataclasses.replace(header, version=(1, 3), evlr_count=0)) == ([], 0)
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("strip") / "a.las"
+    write_strip(path, wkt="PROJCRS[...]")
+    return path
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), min_size=1, max_size=6))
+def test_any_damage_of_the_header_is_one_line_or_a_plan(strip, tmp_path, changes):
+    data = bytearray(strip.read_bytes())
+    for at, value in changes:
+        data[at] = value
+    path = tmp_path / "damaged.las"
+    path.write_bytes(data)
+    for keep in (False, True):
+        try:
+            plan_output(path, ["amplitude"], keep_packets=keep)
+        except (InputError, ConfigError) as error:
+            assert "\n" not in str(error)

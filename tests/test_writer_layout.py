@@ -1,0 +1,276 @@
+"""Output rows: the input's fields, our columns, and nothing else."""
+
+import pickle
+
+import laspy
+import numpy as np
+import pytest
+from numpy.lib.recfunctions import repack_fields
+from writer_tools import data_file, random_points, read_raw, write_source, write_strip
+
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.io.extra import ExtraRecord
+from wavebatch.io.header import STANDARD_DTYPES, Vlr
+from wavebatch.io.layout import plan_output
+
+RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
+VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
+GEOTIFF = Vlr(b"LASF_Projection", 34735, bytes(8))
+WKT = Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
+
+
+def fields_of(rows, point_format):
+    """Every field of the point format by laspy's own unpacking."""
+    record = laspy.PackedPointRecord(rows, laspy.PointFormat(point_format))
+    return {name: np.array(record[name]) for name in laspy.PointFormat(point_format).dimension_names}
+
+
+def plain(rows, point_format):
+    """The standard part of rows, as an array of the bare point format."""
+    return repack_fields(rows[list(STANDARD_DTYPES[point_format].names)])
+
+
+@pytest.mark.parametrize(("point_format", "family"), [(4, 1), (5, 3), (9, 6), (10, 8)])
+def test_the_family_is_kept_with_every_field(tmp_path, point_format, family):
+    points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format])
+    layout = plan_output(tmp_path / "a.las", [])
+    assert (layout.point_format, layout.version) == (family, VERSIONS[point_format])
+    rows = layout.rows(points)
+    before, after = fields_of(points, point_format), fields_of(rows, family)
+    assert not set(after) - set(before)
+    for name, values in after.items():
+        np.testing.assert_array_equal(values, before[name], name)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [(4, 3), (4, 6), (4, 7), (4, 8), (5, 7), (5, 8), (9, 7), (9, 8), (1, 6), (3, 8), (0, 6)]
+)
+def test_promotion_keeps_every_field(tmp_path, old, new):
+    points = write_source(tmp_path / "a.las", old, VERSIONS.get(old, (1, 3)), vlrs=[WKT])
+    points["bit_fields"] = np.arange(200)
+    layout = plan_output(tmp_path / "a.las", ["amplitude"], point_format=new)
+    assert layout.version == ((1, 4) if new >= 6 else (1, 3))
+    rows = plain(layout.rows(points), new)
+    before, after = fields_of(points, old), fields_of(rows, new)
+    for name in set(after) & set(before) - {"overlap"}:
+        np.testing.assert_array_equal(after[name], before[name], name)
+    for name in set(after) - set(before) - {"scan_angle", "overlap"}:
+        assert not after[name].any(), name
+    if old < 6 <= new:
+        np.testing.assert_array_equal(after["scan_angle"], np.rint(before["scan_angle_rank"] / 0.006))
+        np.testing.assert_array_equal(after["overlap"], before["classification"] == 12)
+
+
+def test_scan_angle_of_every_rank(tmp_path):
+    points = write_source(tmp_path / "a.las", 4, (1, 3), n=256)
+    points["scan_angle_rank"] = np.arange(-128, 128)
+    rows = plan_output(tmp_path / "a.las", [], point_format=6).rows(points)
+    assert np.all(np.abs(rows["scan_angle"] * 0.006 - points["scan_angle_rank"]) <= 0.003)
+    assert rows["scan_angle"][128 + 15] == 2500
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "keep"), [(5, 6, False), (10, 7, False), (9, 1, False), (4, 9, False), (4, 6, True)]
+)
+def test_ways_that_lose_something_are_refused(tmp_path, old, new, keep):
+    write_source(tmp_path / "a.las", old, VERSIONS[old])
+    with pytest.raises(ConfigError, match=f"point format {old} cannot be written as {new}.* possible are"):
+        plan_output(tmp_path / "a.las", [], point_format=new, keep_packets=keep)
+
+
+def test_keeping_packets_that_nobody_has(tmp_path):
+    write_source(tmp_path / "a.las", 6, (1, 4))
+    with pytest.raises(ConfigError, match="has no waveforms; leave --keep-packets out"):
+        plan_output(tmp_path / "a.las", [], keep_packets=True)
+    with pytest.raises(ConfigError, match="points 'all': must be echoes or returns"):
+        plan_output(tmp_path / "a.las", [], points="all")
+
+
+def test_geotiff_cannot_be_promoted_but_wkt_can(tmp_path):
+    for name, vlrs in (("geo", [GEOTIFF]), ("both", [GEOTIFF, WKT]), ("none", [])):
+        write_source(tmp_path / f"{name}.las", 4, (1, 3), vlrs=vlrs)
+    with pytest.raises(InputError, match="geo.las: its CRS is given by GeoTIFF keys only, point format 6 needs WKT"):
+        plan_output(tmp_path / "geo.las", [], point_format=6)
+    assert plan_output(tmp_path / "geo.las", []).point_format == 1
+    assert plan_output(tmp_path / "both.las", [], point_format=6).point_format == 6
+    assert plan_output(tmp_path / "none.las", [], point_format=6).point_format == 6
+
+
+def test_coordinates_are_rounded_kept_or_refused(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4), n=3)
+    layout = plan_output(tmp_path / "a.las", [])
+    assert np.array_equal(layout.rows(points)["X"], points["X"])
+    xyz = np.array([[1000.014, 2000.016, 30.0], [np.nan] * 3, [999.99, 1999.98, 29.97]])
+    rows = layout.rows(points, xyz=xyz)
+    assert rows["X"].tolist() == [1, points["X"][1], -1]
+    assert rows["Y"].tolist() == [2, points["Y"][1], -2]
+    assert rows["Z"].tolist() == [0, points["Z"][1], -3]
+    edge = np.array([[1000 + 0.01 * (2**31 - 1), 2000.0, 30.0]] * 3)
+    assert layout.rows(points, xyz=edge)["X"][0] == 2**31 - 1
+    for axis, value in ((0, 3e7), (1, -3e7), (2, np.inf), (2, np.nan)):
+        bad = edge.copy()
+        bad[2, axis] = value
+        with pytest.raises(InputError, match=rf"{'xyz'[axis]} = .* of output row 2 does not fit .* scale 0.01"):
+            layout.rows(points, xyz=bad)
+
+
+@pytest.mark.parametrize(("point_format", "limit"), [(4, 7), (9, 15)])
+def test_return_numbers_are_cut_to_what_the_format_holds(tmp_path, point_format, limit):
+    points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format], n=20)
+    layout = plan_output(tmp_path / "a.las", [])
+    assert layout.max_return == limit
+    rows = layout.rows(points, return_number=np.arange(1, 21), number_of_returns=np.full(20, 20))
+    after, before = (fields_of(r, f) for r, f in ((rows, layout.point_format), (points, point_format)))
+    np.testing.assert_array_equal(after["return_number"], np.minimum(np.arange(1, 21), limit))
+    np.testing.assert_array_equal(after["number_of_returns"], np.full(20, limit))
+    for name in ("scan_direction_flag", "edge_of_flight_line", "classification"):
+        np.testing.assert_array_equal(after[name], before[name])
+
+
+def test_columns_and_no_data(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4), n=3)
+    layout = plan_output(tmp_path / "a.las", ["amplitude", "x", "echo_width", "echo_flags"])
+    rows = layout.rows(points, columns={"amplitude": np.array([1.5, np.nan, 3]), "unknown": None})
+    assert layout.extra_fields == ("amplitude", "echo_width", "echo_flags")
+    assert rows["amplitude"].tolist() == [1.5, -9999.0, 3.0]
+    assert rows["echo_width"].tolist() == [-9999.0] * 3 and rows["echo_flags"].tolist() == [0] * 3
+
+
+SEVERAL = [
+    ExtraRecord.build("Amplitude", "u2", "dB", scale=0.01).with_range(np.array([0]), np.array([10000])),
+    ExtraRecord.build("real", "f8", ""),
+    ExtraRecord.build("declared", "i4", "", no_data=-5),
+    ExtraRecord.build("bare", "u1", ""),
+    ExtraRecord(bytes([0, 0, 29, 0]) + b"normal".ljust(188, b"\0")),  # three floats, a deprecated type
+    ExtraRecord.undocumented("ExtraBytes", 5),
+]
+
+
+def write_several(path):
+    points = write_source(path, 9, (1, 4), n=6, records=SEVERAL)
+    # what the file declares, not what it holds, is what plan_output has to go by
+    data = bytearray(path.read_bytes())
+    at = data.index(SEVERAL[0].data[:36])
+    data[at : at + 192] = SEVERAL[0].data
+    at = data.index(SEVERAL[3].data[4:36]) - 4
+    data[at : at + 192] = SEVERAL[3].data
+    path.write_bytes(data)
+    return points
+
+
+def test_returns_keep_all_extra_bytes_exactly(tmp_path):
+    points = write_several(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
+    assert layout.dropped == {} and layout.renamed == {"amplitude": "wb amplitude"}
+    assert layout.extra_fields == (*points.dtype.names[-6:], "wb amplitude")
+    rows = layout.rows(points, matched=np.zeros(6, bool))
+    for name in points.dtype.names[-6:]:
+        assert rows[name].tobytes() == points[name].tobytes(), name
+    assert [(r.name, r.code) for r in layout.extra_records[:-1]] == [(r.name, r.code) for r in SEVERAL]
+
+
+def test_echoes_carry_extra_bytes_to_matched_rows_only(tmp_path):
+    points = write_several(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", ["amplitude"])
+    assert set(layout.dropped) == {"bare", "ExtraBytes"}
+    assert all("no value is free" in reason for reason in layout.dropped.values())
+    assert layout.extra_fields == ("Amplitude", "real", "declared", "normal", "wb amplitude")
+    matched = np.array([True, False, True, True, False, True])
+    rows = layout.rows(points, matched=matched)
+    for name, record in zip(layout.extra_fields[:-1], layout.extra_records, strict=False):
+        assert rows[name][matched].tobytes() == points[name][matched].tobytes(), name
+        expected = np.broadcast_to(record.no_data.reshape(record.dtype.shape), rows[name][~matched].shape)
+        np.testing.assert_array_equal(rows[name][~matched], expected, name)
+    assert layout.rows(points)["real"].tobytes() == points["real"].tobytes()
+
+
+def test_measured_ranges_let_integers_be_carried(tmp_path):
+    points = write_several(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", [], ranges={"bare": (0, 200)})
+    rows = layout.rows(points, matched=np.zeros(6, bool))
+    assert set(layout.dropped) == {"ExtraBytes"} and set(rows["bare"]) == {228}
+
+
+def test_our_own_output_can_be_an_input(tmp_path):
+    write_source(tmp_path / "a.las", 6, (1, 4), records=[ExtraRecord.build("amplitude", "f4", "[DN]", no_data=-9999)])
+    layout = plan_output(tmp_path / "a.las", ["amplitude"])
+    assert layout.extra_fields == ("amplitude", "wb amplitude")
+
+
+def test_a_layout_survives_pickling_and_does_not_depend_on_blocks(tmp_path):
+    points = write_several(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", ["amplitude", "echo_flags"])
+    copy = pickle.loads(pickle.dumps(layout))
+    rng = np.random.default_rng(3)
+    columns, xyz = {"amplitude": rng.normal(size=6)}, rng.normal(1000, 5, (6, 3))
+    matched = rng.random(6) < 0.5
+    whole = layout.rows(points, xyz=xyz, columns=columns, matched=matched)
+    for size in (1, 2, 4):
+        parts = [
+            copy.rows(
+                points[at : at + size],
+                xyz=xyz[at : at + size],
+                columns={"amplitude": columns["amplitude"][at : at + size]},
+                matched=matched[at : at + size],
+            )
+            for at in range(0, 6, size)
+        ]
+        assert np.concatenate(parts).tobytes() == whole.tobytes()
+
+
+def test_input_records_are_never_written_to(tmp_path):
+    points = write_several(tmp_path / "a.las")
+    before = points.tobytes()
+    points.flags.writeable = False
+    layout = plan_output(tmp_path / "a.las", ["amplitude"])
+    layout.rows(points, xyz=np.full((6, 3), 1000.0), return_number=np.ones(6), matched=np.zeros(6, bool))
+    layout.rows(points[::2])
+    assert points.tobytes() == before
+    assert len(layout.rows(points[:0], xyz=np.empty((0, 3)))) == 0
+
+
+def test_kept_packets_keep_pointers_and_take_new_locations(tmp_path):
+    points = write_strip(tmp_path / "a.las", n=4)
+    layout = plan_output(tmp_path / "a.las", ["echo_time"], keep_packets=True)
+    xyz = np.full((4, 3), 0.5)
+    xyz[1] = np.nan
+    time = np.array([12.5, 13.0, np.nan, 14.0])
+    rows = layout.rows(points, xyz=xyz, columns={"echo_time": time})
+    location = points["return_point_wave_location"]
+    assert rows["return_point_wave_location"].tolist() == [12500.0, location[1], location[2], 14000.0]
+    for name in ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "x_t", "y_t", "z_t"):
+        np.testing.assert_array_equal(rows[name], points[name])
+    kept = layout.rows(points, columns={"echo_time": time})  # no new positions: locations stay too
+    np.testing.assert_array_equal(kept["return_point_wave_location"], location)
+    assert layout.rows(points, xyz=xyz, time=time)["return_point_wave_location"].tolist()[0] == 12500.0
+
+
+def test_real_vendor_file(tmp_path):
+    path = data_file(RIEGL)
+    points = read_raw(path)
+    layout = plan_output(path, ["amplitude", "echo_width"], names="riegl")
+    assert layout.renamed == {"amplitude": "wb amplitude", "echo_width": "wb Pulse width"}
+    assert layout.dropped == {} and layout.extra_fields[:2] == ("Amplitude", "Pulse width")
+    for record, name in zip(layout.extra_records, ("Amplitude", "Pulse width"), strict=False):
+        assert int(record.no_data[0]) not in points[name]
+    rows = layout.rows(points)
+    for name in rows.dtype.names[:-2]:
+        np.testing.assert_array_equal(rows[name], points[name])
+
+
+def test_records_that_leave_no_room_are_refused(tmp_path):
+    points = random_points(STANDARD_DTYPES[6], 1)
+    write_source(tmp_path / "a.las", 6, (1, 4), points=points)
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[105:107] = (65535).to_bytes(2, "little")
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match="leave no room for the columns"):
+        plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
+    data[105:107] = (29).to_bytes(2, "little")
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match="29-byte records are too short for point format 6"):
+        plan_output(tmp_path / "a.las", [])
+    data[104] = 11
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match="point format 11 is not known"):
+        plan_output(tmp_path / "a.las", [])

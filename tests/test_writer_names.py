@@ -1,0 +1,97 @@
+"""One table of names, one rule for collisions, values in the unit that the record says."""
+
+import numpy as np
+import pytest
+
+from wavebatch.blocks import COLUMNS
+from wavebatch.errors import ConfigError
+from wavebatch.io.names import STYLES, describe, name_columns, normalise
+
+ALL = tuple(COLUMNS)
+WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_every_style_writes_every_column_under_a_name_of_its_own(style):
+    columns = name_columns(ALL, style, ())
+    assert tuple(column.column for column in columns) == WRITTEN
+    names = [column.record.name for column in columns]
+    assert len({normalise(name) for name in names}) == len(names)
+    assert all(len(name.encode()) <= 32 for name in names)
+
+
+@pytest.mark.parametrize("column", COLUMNS.values(), ids=COLUMNS)
+def test_descriptions_fit_and_end_with_the_unit(column):
+    text = describe(column)
+    assert len(text.encode()) <= 32 and text.endswith(f"[{column.unit}]")
+    assert not text.split(" [")[0].endswith((" the", " of", " after", " over", " and", " per"))
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_styles_name_columns_that_exist(style):
+    assert set(STYLES[style]) <= set(COLUMNS)
+
+
+@pytest.mark.parametrize("taken", ["Amplitude", "AMPLITUDE", "amplitude"])
+def test_the_inputs_name_stays_and_ours_gets_a_prefix(taken):
+    (column,) = name_columns(["amplitude"], "wavebatch", [taken])
+    assert column.record.name == "wb amplitude"
+
+
+def test_collisions_with_prefixed_names_separators_and_standard_fields():
+    def named(columns, style, taken):
+        return [column.record.name for column in name_columns(columns, style, taken)]
+
+    assert named(["amplitude"], "wavebatch", ["Amplitude", "wb_amplitude"]) == ["wb2 amplitude"]
+    assert named(["echo_width"], "wavebatch", ["Echo Width"]) == ["wb echo_width"]
+    assert named(["echo_width"], "asprs", ["Pulse width"]) == ["wb pulse width"]
+    assert named(["echo_width"], "pdal", ["echo_width"]) == ["wb EchoWidth"]
+    assert named(["amplitude", "amplitude"], "opals", []) == ["Amplitude"]
+    assert named(["x", "y", "z", "range"], "wavebatch", ["X"]) == ["range"]
+    assert named(["range"], "pdal", []) == ["EchoRange"]
+
+
+def test_unknown_names_are_one_line():
+    with pytest.raises(ConfigError, match="column 'amplitud' does not exist; did you mean 'amplitude'"):
+        name_columns(["amplitud"], "wavebatch", ())
+    with pytest.raises(ConfigError, match="column 'qqq' does not exist; known are amplitude, "):
+        name_columns(["qqq"], "wavebatch", ())
+    with pytest.raises(ConfigError, match="names 'x': must be one of wavebatch, asprs"):
+        name_columns([], "x", ())
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_stored_values_times_scale_are_the_values(style):
+    values = np.array([0.4, 4.449, 62.3, 99.99])
+    for column in name_columns(WRITTEN[:-1], style, ()):
+        stored = column.encode(values.astype(COLUMNS[column.column].dtype)).astype(float)
+        scale = column.naming.scale or 1.0
+        expected = 10 * np.log10(values) if column.naming.decibel else values
+        np.testing.assert_allclose(stored * scale, expected, atol=scale / 2 if column.naming.scale else 2e-5)
+
+
+@pytest.mark.parametrize("style", STYLES)
+@pytest.mark.parametrize("name", WRITTEN[:-1])
+def test_what_is_no_number_becomes_the_declared_no_data(style, name):
+    (column,) = name_columns([name], style, ())
+    empty = column.record.no_data
+    assert empty is not None
+    stored = column.encode(np.array([np.nan, np.inf, -np.inf, 5.0]))
+    assert list(stored[:3]) == [empty[0]] * 3 and stored[3] != empty[0]
+
+
+def test_values_beyond_the_stored_type_become_its_nearest_value_never_no_data():
+    (width,) = name_columns(["echo_width"], "asprs", ())
+    assert list(width.encode(np.array([0.0, 0.01, 1e9, np.nan]))) == [1, 1, 65535, 0]
+    (reflectance,) = name_columns(["reflectance"], "riegl", ())
+    assert list(reflectance.encode(np.array([1.0, 0.1, 1e-300, 1e300, 0.0, -1.0]))) == [
+        0, -1000, -32767, 32767, -32768, -32768,
+    ]  # fmt: skip
+    (amplitude,) = name_columns(["amplitude"], "wavebatch", ())
+    assert list(amplitude.encode(np.array([1e300, 1.0]))) == [-9999.0, 1.0]
+
+
+def test_flags_keep_their_bits():
+    (flags,) = name_columns(["echo_flags"], "wavebatch", ())
+    assert flags.record.no_data is None
+    assert list(flags.encode(np.array([0, 1, 65535], np.uint16))) == [0, 1, 65535]

@@ -1,0 +1,92 @@
+"""Small LAS and LAZ files with whatever a test needs in them, and readers of the results."""
+
+import io
+import os
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from wavebatch.blocks import Digitizer
+from wavebatch.io.extra import build_dtype
+from wavebatch.io.fullwave import FullwaveWriter
+from wavebatch.io.header import LasHeader, Vlr, encode_evlr_header
+from wavebatch.io.pointfile import PointFile
+from wavebatch.io.publish import publish_together
+
+BACKENDS = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
+
+
+def data_file(name: str) -> Path:
+    """A real file of the shared data, or a skip that says where it was looked for."""
+    folder = Path(os.environ.get("WAVEBATCH_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    if not (folder / name).exists():
+        pytest.skip(f"{folder / name} is not here; set WAVEBATCH_DATA")
+    return folder / name
+
+
+def read_raw(path: Path, backend: laspy.LazBackend = laspy.LazBackend.Lazrs) -> np.ndarray:
+    """Raw records of a file; laspy never sees its extended records."""
+    with laspy.open(path, laz_backend=backend, read_evlrs=False) as reader:
+        return np.array(reader.read_points(-1).array)
+
+
+def random_points(dtype: np.dtype, n: int, seed: int = 0) -> np.ndarray:
+    """Points whose every byte is random, apart from what must be a legal number."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 256, (n, dtype.itemsize), dtype=np.uint8).view(dtype).reshape(n)
+    points["X"], points["Y"], points["Z"] = rng.integers(-(10**6), 10**6, (3, n))
+    for name in dtype.names:
+        if dtype[name].base.kind == "f":
+            points[name] = rng.normal(100, 10, points[name].shape)
+    bits = 0xF if "classification_flags" in dtype.names else 0b111
+    points["bit_fields"] = (points["bit_fields"] & (0xFF ^ bits)) | (np.arange(n) % 3 + 1).astype(np.uint8)
+    if "classification_flags" in dtype.names:
+        points["classification_flags"] &= 0b11001111
+    return points
+
+
+def write_source(
+    path: Path,
+    point_format: int,
+    version: tuple[int, int],
+    *,
+    n: int = 200,
+    records=(),
+    vlrs: list[Vlr] | None = None,
+    evlrs: list[tuple[bytes, int, bytes]] | None = None,
+    points: np.ndarray | None = None,
+    **header,
+) -> np.ndarray:
+    """An input with these extra-byte records, VLRs and EVLRs; the packets its points claim are not there."""
+    dtype = build_dtype(point_format, records)
+    points = random_points(dtype, n) if points is None else points
+    filled = LasHeader(version, point_format, dtype.itemsize, (0.01,) * 3, (1000.0, 2000.0, 30.0), **header)
+    filled.vlrs = list(vlrs or [])
+    file = PointFile(path, filled, dtype, list(records), overwrite=True)
+    file.write(points)
+    file.finish_points()
+    for user_id, record_id, payload in evlrs or []:
+        head = encode_evlr_header(user_id, record_id, len(payload), b"of a test")
+        file.append_record(head, io.BytesIO(payload), 0, len(payload))
+    file.finish()
+    publish_together([file.draft])
+    return points
+
+
+def write_strip(path: Path, *, point_format: int = 9, version: str = "1.4", n: int = 100, **options) -> np.ndarray:
+    """A small full-waveform strip with two digitizers; returns its points."""
+    digitizers = (Digitizer(1, 8, 40, 1.0, 0.5, 0.1), Digitizer(2, 16, 60, 2.0))
+    options = {"internal": True, "digitizers": digitizers, **options}
+    with FullwaveWriter(path, version=version, point_format=point_format, **options) as writer:
+        points = random_points(writer.dtype, n)
+        rng = np.random.default_rng(1)
+        half = n // 2
+        points["wavepacket_index"] = np.where(np.arange(n) < half, 1, 2)
+        points["wavepacket_size"] = np.where(np.arange(n) < half, 40, 120)
+        points["wavepacket_offset"][:half] = writer.write_packets(rng.integers(0, 256, (half, 40), np.uint8), 1)
+        points["wavepacket_offset"][half:] = writer.write_packets(rng.integers(0, 65536, (n - half, 60), np.uint16), 2)
+        writer.write_points(points)
+        writer.commit()
+    return points
