@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import BinaryIO, Protocol
 
@@ -15,6 +17,8 @@ try:
     import laszip
 except ImportError:  # optional: only waveform formats 9 and 10 with several scanner channels need it
     laszip = None
+
+_ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError] if laszip else []))
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
 _ITEMS_AT = 34
@@ -41,6 +45,29 @@ def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
     return _LazrsEncoder(file, header)
 
 
+class _WatchedFile:
+    """What the compressors write to: keeps the reason of a failure, of which they only tell that there was one."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._error: OSError | None = None
+        self.seek, self.tell, self.read, self.flush = file.seek, file.tell, file.read, file.flush
+
+    def write(self, data: bytes) -> int:
+        try:
+            return self._file.write(data)
+        except OSError as error:
+            self._error = self._error or error
+            raise
+
+    @contextlib.contextmanager
+    def explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except _ERRORS as error:
+            raise self._error or InputError(f"the points cannot be compressed: {error}") from error
+
+
 class _PlainEncoder:
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
         self._file = file
@@ -64,12 +91,14 @@ class _LazrsEncoder:
         file.write(header.encode())
         self._guarded = header.point_format in (9, 10)
         self._channel: int | None = None
-        self._compressor = lazrs.LasZipCompressor(file, lazrs.LazVlr(payload))
+        self._watched = _WatchedFile(file)
+        self._compressor = lazrs.LasZipCompressor(self._watched, lazrs.LazVlr(payload))
 
     def write(self, rows: np.ndarray) -> None:
         if self._guarded:
             self._check_channel(rows)
-        self._compressor.compress_many(rows.view(np.uint8))
+        with self._watched.explaining():
+            self._compressor.compress_many(rows.view(np.uint8))
 
     def _check_channel(self, rows: np.ndarray) -> None:
         channels = (rows["classification_flags"] >> 4) & 0b11
@@ -82,7 +111,8 @@ class _LazrsEncoder:
             )
 
     def finish(self) -> None:
-        self._compressor.done()
+        with self._watched.explaining():
+            self._compressor.done()
 
 
 class _LaszipEncoder:
@@ -93,13 +123,17 @@ class _LaszipEncoder:
         longer = HEADER_SIZES[header.version] - HEADER_SIZES[version]
         shown = replace(header, compressed=False, version=version, user_bytes=bytes(longer) + header.user_bytes)
         self._file, self._header = file, header
-        self._zipper = laszip.LasZipper(file, shown.encode())
+        self._watched = _WatchedFile(file)
+        with self._watched.explaining():
+            self._zipper = laszip.LasZipper(self._watched, shown.encode())
 
     def write(self, rows: np.ndarray) -> None:
-        self._zipper.compress(rows.view(np.uint8))
+        with self._watched.explaining():
+            self._zipper.compress(rows.view(np.uint8))
 
     def finish(self) -> None:
-        self._zipper.done()
+        with self._watched.explaining():
+            self._zipper.done()
         self._file.flush()
         written = read_header_of(self._file)
         self._header.vlrs.append(written.vlrs[-1])

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-import lazrs
 import numpy as np
 
 from wavebatch.errors import ConfigError, InputError
@@ -116,7 +115,7 @@ class PointFile:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """One InputError line that names the target, whatever the compressor or the disk says."""
+        """One InputError line that names the target, whatever compressor or disk say."""
         try:
             with reporting(self.target):
                 yield
@@ -124,10 +123,6 @@ class PointFile:
             if str(error).startswith(str(self.target)):
                 raise
             raise InputError(f"{self.target}: {error}") from error
-        except (lazrs.LazrsError, RuntimeError) as error:
-            raise InputError(
-                f"{self.target}: cannot be written: {error}; free space or choose another output folder"
-            ) from error
 
 
 class Statistics:
