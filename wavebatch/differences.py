@@ -1,0 +1,120 @@
+"""Differences of matched echoes: medians and spreads of time, amplitude and width, errors in units of the bound."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag
+from wavebatch.evaluate import ErrorStats
+from wavebatch.kernels.bounds import crlb
+from wavebatch.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
+
+SPEED = 0.9997 * HALF_C
+"""Metres along the ray per ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Differences a minus b of one quantity over the echoes that both have."""
+
+    number: int
+    median: float
+    mean: float
+    rms: float
+    nmad: float
+
+
+class Differences:
+    """Collects matched pairs (records of io.cloud.CLOUD_DTYPE): sums of all, an even sample of them for medians."""
+
+    LIMIT = 4_000_000
+    """Most pairs that are kept; then every second one is dropped."""
+
+    def __init__(self) -> None:
+        self.step, self.seen = 1, 0
+        self.parts: list[dict[str, np.ndarray]] = []
+        self.sums = {name: np.zeros(3) for name in ("time", "amplitude", "echo_width")}
+
+    def add(self, a: np.ndarray, b: np.ndarray) -> None:
+        """Takes in pairs: a[i] with b[i]."""
+        part = {
+            "time": measure_lag(a, b) / SPEED,
+            "amplitude": (a["amplitude"] - b["amplitude"]).astype(np.float64),
+            "echo_width": (a["echo_width"] - b["echo_width"]).astype(np.float64),
+        }
+        for name, values in part.items():
+            good = values[~np.isnan(values)]
+            self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
+        for name in ("amplitude_err", "echo_width_err", "range_err"):
+            part[name] = a[name].astype(np.float64)
+        for name in ("amplitude", "echo_width", "flags"):
+            part[f"true_{name}"] = b[name]
+        part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
+        start = -self.seen % self.step
+        self.seen += len(a)
+        self.parts.append({name: values[start :: self.step] for name, values in part.items()})
+        if sum(len(part["time"]) for part in self.parts) > self.LIMIT:
+            whole = self._join()
+            self.parts = [{name: values[::2] for name, values in whole.items()}]
+            self.step *= 2
+
+    def _join(self) -> dict[str, np.ndarray]:
+        return {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+
+    def spreads(self) -> dict[str, Spread]:
+        """Per quantity that both sides have: median, mean, rms and NMAD of a minus b."""
+        result = {}
+        for name, (number, total, squares) in self.sums.items():
+            if not number:
+                continue
+            values = self._join()[name]
+            values = values[~np.isnan(values)]
+            median = np.median(values)
+            nmad = MAD_TO_STD * np.median(np.abs(values - median))
+            result[name] = Spread(
+                int(number), float(median), float(total / number), float(np.sqrt(squares / number)), float(nmad)
+            )
+        return result
+
+    def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
+        """Errors of time [ns], amplitude [DN] and sigma [ns] in units of the bound and of what was reported."""
+        if not self.parts:
+            return {}
+        data = self._join()
+        sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
+        bounds = crlb(data["true_amplitude"], sigma, meta["noise_std"], meta["spacing"])
+        columns = {
+            "time": (data["time"], bounds[0], data["range_err"] / SPEED),
+            "amplitude": (data["amplitude"], bounds[1], data["amplitude_err"]),
+            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], data["echo_width_err"] / FWHM_PER_SIGMA),
+        }
+        classes = {
+            "all": np.ones(len(sigma), bool),
+            "isolated": data["isolated"],
+            "overlapped": (data["true_flags"] & np.uint16(EchoFlag.OVERLAPPED)) != 0,
+        }
+        return {
+            kind: {name: _measure(rows, *values) for name, values in columns.items()} for kind, rows in classes.items()
+        }
+
+
+def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """How much further along the ray a lies than b [m], f8 (k,), positive away from the sensor.
+
+    Along the packet vector of b or a where one is stored, else by distance, with the lower point as the further one.
+    """
+    step = a["xyz"] - b["xyz"]
+    ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)
+    length = np.linalg.norm(ray, axis=1)
+    known = length > 0
+    down = -np.sign(ray[:, 2]) / np.where(known, length, 1.0)
+    along = np.einsum("ij,ij->i", step, ray) * down
+    by_height = np.linalg.norm(step, axis=1) * -np.sign(step[:, 2])
+    return np.where(known & (down != 0), along, by_height)
+
+
+def _measure(rows: np.ndarray, error: np.ndarray, bound: np.ndarray, reported: np.ndarray) -> ErrorStats:
+    rows = rows & ~np.isnan(error)
+    return ErrorStats.compute(error[rows], bound[rows], reported[rows])
