@@ -9,7 +9,6 @@ import numpy as np
 from wavebatch.kernels.fit import OUTSIDE, Windows
 from wavebatch.kernels.signal import SMOOTH_GAIN
 
-
 RUN_LEVEL = 2.0
 """Noise standard deviations of the smoothed signal above which echoes are one run."""
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from wavebatch.kernels.cluster import Candidates, Clusters, cut_windows
 from wavebatch.kernels.fit import (
-    BATCH,
+    Fit,
     Limits,
     WidthPrior,
     Windows,
-    evaluate_model,
+    batch_size,
     fit_windows,
     parameter_errors,
 )
@@ -51,14 +51,12 @@ class Solution(NamedTuple):
     """(c, 3, k)."""
     misfit: np.ndarray
     """Root mean square residual in noise standard deviations (c,)."""
-    chi2: np.ndarray
-    """(c,)."""
+    cost: np.ndarray
+    """chi2 and prior (c,)."""
     converged: np.ndarray
     """(c,)."""
     at_bound: np.ndarray
     """(c, k)."""
-    clipped: np.ndarray
-    """Clipped samples in the window (c,)."""
 
     def take(self, rows: np.ndarray) -> Solution:
         """The clusters at `rows`."""
@@ -147,7 +145,7 @@ def _join(parts: list) -> tuple:
 LENGTHS = np.array([8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 65536])
 """Window lengths: few, so that batches are large."""
 
-PATIENCE = 6
+PATIENCE = 5
 """Iterations of the first attempt; what has not converged then goes on together with others of any length."""
 
 
@@ -158,15 +156,17 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
     """
     longest = work.samples.shape[1]
     rows = np.arange(len(problem.cluster))
-    for lengths, iterations in ((LENGTHS, PATIENCE), (LENGTHS[5::2], work.settings.max_iterations)):
-        last = iterations == work.settings.max_iterations
+    most = work.settings.max_iterations
+    for lengths, iterations in ((LENGTHS, min(PATIENCE, most)), (LENGTHS[5::2], most - PATIENCE)):
+        last = iterations == most or lengths is not LENGTHS
         needed = work.clusters.high[problem.cluster] - work.clusters.low[problem.cluster]
         length = np.minimum(lengths[np.searchsorted(lengths, needed)], longest)
         order = np.argsort(length, kind="stable")
         unfinished: list[tuple[Problem, np.ndarray]] = []
         for group in np.split(order, np.flatnonzero(np.diff(length[order])) + 1):
-            for begin in range(0, len(group), BATCH):
-                part = group[begin : begin + BATCH]
+            size = batch_size(problem.start.shape[2], int(length[group[0]])) if len(group) else 1
+            for begin in range(0, len(group), size):
+                part = group[begin : begin + size]
                 step = _solve_batch(work, problem.take(part), rows[part], int(length[part[0]]), iterations, last)
                 unfinished.append((step.unfinished, step.unfinished_rows))
                 yield step
@@ -210,33 +210,34 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
     done = np.flatnonzero(finished & ~fit.hopeless)
     refused = [rows[finished & fit.hopeless]]
 
-    windows, begin = windows.take(done), begin[done]
-    model = evaluate_model(windows, fit.parameters[done], settings.shape)
-    chi2 = np.einsum("ml,ml->m", model[:, -1], model[:, -1]) / windows.std**2
-    cost = chi2 if prior is None else chi2 + prior.cost(fit.parameters[done], windows.std) / windows.std**2
-    errors = parameter_errors(windows, fit.parameters[done], model)
+    solution = _solution(cluster[done], windows, fit, done, begin)
     target = problem.target[done]
-    accepted = ~np.isfinite(target) | ((cost < target) & _is_resolved(fit.parameters[done], errors))
-    refused.append(rows[done[~accepted]])
-    used = np.maximum((windows.x >= 0).sum(axis=1), 1)
-    clipped = np.zeros(len(done), np.int64) if windows.clipped is None else windows.clipped.sum(axis=1)
-    solution = Solution(
-        cluster[done],
-        parameters[done],
-        errors,
-        np.sqrt(chi2 / used),
-        chi2,
-        fit.converged[done],
-        fit.at_bound[done],
-        clipped,
-    )
+    accepted = ~np.isfinite(target) | ((solution.cost < target) & _is_resolved(solution))
     good = np.flatnonzero(accepted)
-    solution = solution.take(good)
-    proposal, parents = _propose(
-        settings, windows.take(good), solution, model[good], begin[good],
-        Limits(*(edge[done[good]] for edge in limits)),
-    )  # fmt: skip
-    return _Step(solution, np.concatenate(refused), proposal, parents, unfinished, rows[left])
+    refused.append(rows[done[~accepted]])
+    proposal, parents = _propose(settings, windows, fit, done[good], begin, limits)
+    if proposal is not None:
+        proposal = proposal._replace(cluster=cluster[done[good]][parents])
+    return _Step(solution.take(good), np.concatenate(refused), proposal, parents, unfinished, rows[left])
+
+
+def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, places: np.ndarray, begin: np.ndarray) -> Solution:
+    """What the fits at `places` found, in samples of the waveform."""
+    std, rows = windows.std[places], fit.rows[places]
+    parameters = fit.parameters[places]
+    errors = parameter_errors(parameters, std, rows, fit.gram[places])
+    parameters[:, 1] += begin[places][:, None]
+    used = np.maximum(np.count_nonzero(windows.x[places] >= 0, axis=1), 1)
+    residual = rows[:, -1]
+    return Solution(
+        cluster,
+        parameters,
+        errors,
+        np.sqrt(np.einsum("ml,ml->m", residual, residual) / used) / std,
+        fit.cost[places],
+        fit.converged[places],
+        fit.at_bound[places],
+    )
 
 
 def _limits(work: _Work, cluster: np.ndarray, begin: np.ndarray) -> Limits:
@@ -251,34 +252,40 @@ def _limits(work: _Work, cluster: np.ndarray, begin: np.ndarray) -> Limits:
     return Limits(low, high)
 
 
-def _is_resolved(parameters: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """True (m,) where every two neighbouring echoes lie further apart than twice the error of their distance (H1)."""
-    order = np.argsort(parameters[:, 1], axis=1)
-    time = np.take_along_axis(parameters[:, 1], order, axis=1)
-    error = np.take_along_axis(errors[:, 1], order, axis=1)
+def _is_resolved(solution: Solution) -> np.ndarray:
+    """True (m,) where every two neighbouring echoes lie further apart than the error of their distance (H1)."""
+    order = np.argsort(solution.parameters[:, 1], axis=1)
+    time = np.take_along_axis(solution.parameters[:, 1], order, axis=1)
+    error = np.take_along_axis(solution.errors[:, 1], order, axis=1)
     gap = np.diff(time, axis=1)
-    return (gap > np.hypot(error[:, 1:], error[:, :-1])).all(axis=1) & (parameters[:, 0] > 0).all(axis=1)
+    return (gap > np.hypot(error[:, 1:], error[:, :-1])).all(axis=1) & (solution.parameters[:, 0] > 0).all(axis=1)
 
 
 def _propose(
-    settings: Settings, windows: Windows, solution: Solution, model: np.ndarray, begin: np.ndarray, limits: Limits
+    settings: Settings, windows: Windows, fit: Fit, places: np.ndarray, begin: np.ndarray, limits: Limits
 ) -> tuple[Problem | None, np.ndarray]:
-    """Trials with one echo more for the solutions that leave something unexplained, and their rows."""
+    """Trials with one echo more for the fits at `places` that leave something unexplained, and their rows of those."""
     none = np.empty(0, np.int64)
-    if not settings.grow or solution.parameters.shape[2] >= settings.max_echoes or not len(solution.cluster):
+    if not settings.grow or fit.parameters.shape[2] >= settings.max_echoes or not len(places):
         return None, none
-    parameters = solution.parameters.copy()
-    parameters[:, 1] -= begin[:, None]
-    misfit = find_misfits(windows, parameters, model, settings.gate_residual, settings.gate_hermite)
-    rows = np.flatnonzero(misfit)
-    if not len(rows):
+    misfit = find_misfits(
+        windows.take(places), fit.parameters[places], fit.rows[places], settings.gate_residual, settings.gate_hermite
+    )
+    parents = np.flatnonzero(misfit)
+    if not len(parents):
         return None, none
+    at = places[parents]
     start, gain = propose_echo(
-        windows.take(rows), parameters[rows], model[rows], Limits(*(edge[rows] for edge in limits)), settings.width_ref
+        windows.take(at),
+        fit.parameters[at],
+        fit.rows[at],
+        fit.gram[at],
+        Limits(limits.low[at], limits.high[at]),
+        settings.width_ref,
     )
     hopeful = gain > 0.5 * settings.acceptance
-    rows, start = rows[hopeful], start[hopeful]
-    if not len(rows):
+    parents, at, start = parents[hopeful], at[hopeful], start[hopeful]
+    if not len(parents):
         return None, none
-    start[:, 1] += begin[rows][:, None]
-    return Problem(solution.cluster[rows], start, solution.chi2[rows] - settings.acceptance), rows
+    start[:, 1] += begin[at][:, None]
+    return Problem(at, start, fit.cost[at] - settings.acceptance), parents

@@ -14,14 +14,24 @@ import numpy as np
 
 from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
 
-BATCH = 2048
-"""Problems per batch: large enough for NumPy, small enough for the cache."""
+BATCH_VALUES = 500_000
+"""Numbers in the rows of one batch: large enough for NumPy, small enough for the cache."""
+
+
+def batch_size(k: int, length: int) -> int:
+    """Problems per batch of k echoes in windows of the given length."""
+    return int(np.clip(BATCH_VALUES // ((3 * k + 1) * length), 256, 16384))
+
 
 OUTSIDE = np.float32(-1e4)
 """Position of a sample that takes no part: every pulse is zero there."""
 
 RIDGE = 1e-9
 """Added to the diagonal of the scaled normal equations: an echo outside its window must not make them singular."""
+
+
+STEEP = 1e3
+"""Variance inflation by overlap from which normal equations are taken in float64."""
 
 
 class Windows(NamedTuple):
@@ -57,20 +67,17 @@ class WidthPrior(NamedTuple):
     spread: float
     """Standard deviation allowed below it [samples]."""
 
-    def cost(self, parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """What the prior adds to the sum of squared residuals (m,)."""
-        lack = np.maximum(self.width - parameters[:, 2], 0.0) / self.spread
-        return np.einsum("mk,mk->m", lack, lack) * std**2
-
-    def add(self, parameters: np.ndarray, std: np.ndarray, gram: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Adds the prior to normal equations in place; its cost (m,)."""
+    def add(self, parameters: np.ndarray, std: np.ndarray, gram: np.ndarray) -> np.ndarray:
+        """Adds the prior to the products (m, 3 k + 1, 3 k + 1) of rows and residual in place; its cost (m,)."""
         k = parameters.shape[2]
         lack = np.maximum(self.width - parameters[:, 2], 0.0)
+        if not lack.any():
+            return np.zeros(len(lack))
         unit = parameter_units(parameters, std)[:, 2]
         weight = (std[:, None] / self.spread) ** 2
-        gradient[:, 2 * k :] += weight * lack * unit
-        np.einsum("mpp->mp", gram)[:, 2 * k :] += weight * unit * unit * (lack > 0)
-        return self.cost(parameters, std)
+        gram[:, 2 * k : 3 * k, -1] += weight * lack * unit
+        np.einsum("mpp->mp", gram)[:, 2 * k : 3 * k] += weight * unit * unit * (lack > 0)
+        return np.sum(weight * lack * lack, axis=1)
 
 
 class Fit(NamedTuple):
@@ -78,10 +85,16 @@ class Fit(NamedTuple):
 
     parameters: np.ndarray
     """Amplitude, time, width: float64 (m, 3, k)."""
+    rows: np.ndarray
+    """Model rows where the last step was taken (see `evaluate_model`), float32 (m, 3 k + 1, L)."""
+    gram: np.ndarray
+    """Their inner products, with the prior, float64 (m, 3 k + 1, 3 k + 1)."""
+    cost: np.ndarray
+    """chi2 and prior that the last step promises (m,)."""
     converged: np.ndarray
     """bool (m,)."""
     hopeless: np.ndarray
-    """Given up because it cannot reach what was asked for, bool (m,)."""
+    """Given up because it cannot reach what was asked for: no rows, no products, bool (m,)."""
     at_bound: np.ndarray
     """bool (m, k): a parameter of the echo ended on its bound."""
 
@@ -97,7 +110,10 @@ def evaluate_model(windows: Windows, parameters: np.ndarray, shape: PulseShape) 
     residual = windows.y - amplitude[:, 0] * basis[0][:, 0]
     for j in range(1, k):
         residual -= amplitude[:, j] * basis[0][:, j]
-    rows = np.concatenate([*basis, residual[:, None]], axis=1)
+    rows = np.empty((len(parameters), 3 * k + 1, windows.y.shape[1]), np.float32)
+    for i, functions in enumerate(basis):
+        rows[:, i * k : (i + 1) * k] = functions
+    rows[:, -1] = residual
     if windows.clipped is not None:
         rows *= ~(windows.clipped & (residual <= 0))[:, None, :]
     return rows
@@ -110,17 +126,64 @@ def gram_matrix(rows: np.ndarray) -> np.ndarray:
 
 def parameter_units(parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
     """What one unit of each row's coefficient is worth: 1 for amplitude, s/A for time and width (m, 3, k)."""
-    unit = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
-    return np.stack([np.ones_like(unit), unit, unit], axis=1)
+    units = np.ones(parameters.shape)
+    units[:, 1] = units[:, 2] = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
+    return units
 
 
-def parameter_errors(windows: Windows, parameters: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """One standard deviation of each parameter from the normal equations in float64 (m, 3, k)."""
-    functions = rows[:, :-1].astype(np.float64)
-    gram = functions @ functions.transpose(0, 2, 1)
-    variance = np.diagonal(np.linalg.inv(add_ridge(gram)), axis1=1, axis2=2)
+def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray) -> np.ndarray:
+    """One standard deviation of each parameter from the normal equations (m, 3, k).
+
+    Where echoes overlap so much that float32 products would not do, the products are taken in float64 (H2).
+    """
+    functions = gram[:, :-1, :-1]
+    variance = invert_diagonal(add_ridge(functions.copy()))
+    if parameters.shape[2] > 1:
+        inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
+        steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
+        if len(steep):
+            exact = rows[steep, :-1].astype(np.float64)
+            variance[steep] = invert_diagonal(add_ridge(exact @ exact.transpose(0, 2, 1)))
     error = np.sqrt(np.maximum(variance, 0)).reshape(parameters.shape)
-    return error * parameter_units(parameters, windows.std) * windows.std[:, None, None]
+    return error * parameter_units(parameters, std) * std[:, None, None]
+
+
+def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions (m, p) of symmetric systems (m, p, p); by cofactors for p = 3, where problems are many and tame."""
+    if matrix.shape[1] != 3:
+        return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+    cofactors, determinant = _cofactors(matrix)
+    xx, xy, xz, yy, yz, zz = cofactors
+    a, b, c = right.T
+    solution = np.empty_like(right)
+    solution[:, 0] = xx * a + xy * b + xz * c
+    solution[:, 1] = xy * a + yy * b + yz * c
+    solution[:, 2] = xz * a + yz * b + zz * c
+    solution /= determinant[:, None]
+    return solution
+
+
+def invert_diagonal(matrix: np.ndarray) -> np.ndarray:
+    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p)."""
+    if matrix.shape[1] != 3:
+        return np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2).copy()
+    (xx, _, _, yy, _, zz), determinant = _cofactors(matrix)
+    return np.stack([xx, yy, zz], axis=1) / determinant[:, None]
+
+
+def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Cofactors xx, xy, xz, yy, yz, zz and determinants of symmetric matrices (m, 3, 3)."""
+    xx, xy, xz, yy, yz, zz = np.ascontiguousarray(matrix.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]])
+    cofactors = (
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    )
+    determinant = xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2]
+    return cofactors, np.where(np.abs(determinant) > 1e-300, determinant, 1e-300)
 
 
 def add_ridge(gram: np.ndarray) -> np.ndarray:
@@ -144,7 +207,7 @@ def _steps(
     diagonal = np.einsum("mpp->mp", matrix)
     diagonal *= 1 + damping[:, None]
     diagonal += RIDGE
-    step = np.linalg.solve(matrix, gradient[:, :, None])[:, :, 0]
+    step = solve_symmetric(matrix, gradient)
     return step, np.einsum("mp,mp->m", step, gradient)
 
 
@@ -166,12 +229,18 @@ def fit_windows(
     a problem must be able to fall below; it is given up, not converged, when its progress cannot reach that.
     prior: added to the cost.
     """
-    m = len(start)
+    m, _, k = start.shape
     low, high = (np.broadcast_to(edge, start.shape) for edge in limits)
-    best = np.clip(start, low, high)
-    state = _State(windows, best.copy(), low, high, prior)
-    converged = np.zeros(m, bool)
-    hopeless = np.zeros(m, bool)
+    state = _State(windows, np.clip(start, low, high), low, high, prior)
+    fit = Fit(
+        parameters=np.empty(start.shape),
+        rows=np.empty((m, 3 * k + 1, windows.y.shape[1]), np.float32),
+        gram=np.empty((m, 3 * k + 1, 3 * k + 1)),
+        cost=np.full(m, np.inf),
+        converged=np.zeros(m, bool),
+        hopeless=np.zeros(m, bool),
+        at_bound=np.zeros((m, k), bool),
+    )
     index = np.arange(m)
     for iteration in range(max_iterations):
         before = state.cost
@@ -183,65 +252,87 @@ def fit_windows(
         over = done | (state.damping > 1e6) | (iteration == max_iterations - 1)
         if hopeless_above is not None and iteration >= 2:
             lost = state.cost - 4 * decrement > hopeless_above[index] * variance
-            hopeless[index[lost]] = True
+            fit.hopeless[index[lost]] = True
             over |= lost
         if over.any():
-            place = index[over]
-            best[place] = np.where(done[over][:, None, None], state.trial[over], state.kept[over])
-            converged[place] = done[over]
-            if over.all():
+            out = np.flatnonzero(over)
+            _store(fit, state, index[out], out, done[out], (decrement / variance)[out])
+            if len(out) == len(index):
                 break
-            state = state.take(np.flatnonzero(~over))
-            index = index[~over]
-    at_bound = ((best <= low) | (best >= high)).any(axis=1)
-    return Fit(best, converged, hopeless, at_bound)
+            stay = np.flatnonzero(~over)
+            state, index = state.take(stay), index[stay]
+    _refresh(fit, windows, shape)
+    fit.at_bound[:] = ((fit.parameters <= low) | (fit.parameters >= high)).any(axis=1)
+    return fit
+
+
+def _store(
+    fit: Fit, state: _State, place: np.ndarray, out: np.ndarray, finished: np.ndarray, promised: np.ndarray
+) -> None:
+    """Writes what the problems that are over have reached; a converged one takes its last step unchecked."""
+    fit.parameters[place] = np.where(finished[:, None, None], state.trial[out], state.kept[out])
+    fit.cost[place] = state.cost[out] / state.windows.std[out] ** 2 - np.where(finished, promised, 0.0)
+    fit.converged[place] = finished
+    fit.rows[place] = state.rows[out]
+    fit.gram[place] = state.gram[out]
+
+
+def _refresh(fit: Fit, windows: Windows, shape: PulseShape) -> None:
+    """Evaluates the few problems that stopped short again where they stand: their last trial may have been refused."""
+    short = np.flatnonzero(~(fit.converged | fit.hopeless))
+    if len(short):
+        fit.rows[short] = evaluate_model(windows.take(short), fit.parameters[short], shape)
+        fit.gram[short] = gram_matrix(fit.rows[short])
 
 
 class _State:
     """The problems still running: last accepted point with its equations, the trial point, the damping."""
 
-    __slots__ = ("accepted", "cost", "damping", "gram", "gradient", "high", "kept", "low", "prior", "trial", "windows")
+    __slots__ = ("accepted", "cost", "damping", "gram", "high", "kept", "low", "prior", "rows", "trial", "windows")
 
     def __init__(
         self, windows: Windows, start: np.ndarray, low: np.ndarray, high: np.ndarray, prior: WidthPrior | None
     ):
-        m, _, k = start.shape
+        m = len(start)
         self.windows, self.low, self.high, self.prior = windows, low, high, prior
         self.trial = self.kept = start
         self.cost = np.full(m, np.inf)
-        self.gram = np.zeros((m, 3 * k, 3 * k))
-        self.gradient = np.zeros((m, 3 * k))
         self.damping = np.full(m, 1e-3)
         self.accepted = np.zeros(m, bool)
+        self.gram = self.rows = np.empty((m, 0, 0))
 
-    def take(self, rows: np.ndarray) -> _State:
+    def take(self, places: np.ndarray) -> _State:
         """The same state for some of the problems."""
         part = object.__new__(_State)
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if name != "prior":
-                value = value.take(rows) if name == "windows" else value[rows]
-            setattr(part, name, value)
+        part.prior, part.rows = self.prior, self.rows
+        part.windows = self.windows.take(places)
+        for name in ("accepted", "cost", "damping", "gram", "high", "kept", "low", "trial"):
+            setattr(part, name, getattr(self, name)[places])
         return part
 
     def advance(self, shape: PulseShape) -> np.ndarray:
         """Evaluate the trial, accept or refuse it, set the next trial; the promised fall of the cost (m,)."""
-        products = gram_matrix(evaluate_model(self.windows, self.trial, shape))
-        gram, gradient, cost = products[:, :-1, :-1], products[:, :-1, -1], products[:, -1, -1]
+        std = self.windows.std
+        self.rows = evaluate_model(self.windows, self.trial, shape)
+        gram = gram_matrix(self.rows)
+        cost = gram[:, -1, -1]
         if self.prior is not None:
-            cost = cost + self.prior.add(self.trial, self.windows.std, gram, gradient)
+            cost = cost + self.prior.add(self.trial, std, gram)
         self.accepted = cost <= self.cost * (1 + 1e-6)
         if self.accepted.all():
-            self.kept, self.cost, self.gram, self.gradient = self.trial, cost, gram, gradient
+            self.kept, self.cost, self.gram = self.trial, cost, gram
+            self.damping = np.maximum(self.damping * 0.1, 1e-7)
         else:
             self.kept = np.where(self.accepted[:, None, None], self.trial, self.kept)
             self.cost = np.where(self.accepted, cost, self.cost)
             self.gram = np.where(self.accepted[:, None, None], gram, self.gram)
-            self.gradient = np.where(self.accepted[:, None], gradient, self.gradient)
-        self.damping = np.where(self.accepted, np.maximum(self.damping * 0.1, 1e-7), self.damping * 10)
-        gradient = self.gradient.reshape(self.kept.shape)
-        frozen = ((self.kept <= self.low) & (gradient < 0)) | ((self.kept >= self.high) & (gradient > 0))
-        step, decrement = _steps(self.gram, self.gradient, self.damping, frozen.reshape(self.gradient.shape))
-        step = step.reshape(self.kept.shape) * parameter_units(self.kept, self.windows.std)
-        self.trial = np.clip(self.kept + step, self.low, self.high)
+            self.damping = np.where(self.accepted, np.maximum(self.damping * 0.1, 1e-7), self.damping * 10)
+        gradient = self.gram[:, :-1, -1]
+        slope = gradient.reshape(self.kept.shape)
+        frozen = ((self.kept <= self.low) & (slope < 0)) | ((self.kept >= self.high) & (slope > 0))
+        step, decrement = _steps(self.gram[:, :-1, :-1], gradient, self.damping, frozen.reshape(gradient.shape))
+        step = step.reshape(self.kept.shape)
+        step *= parameter_units(self.kept, std)
+        step += self.kept
+        self.trial = np.minimum(np.maximum(step, self.low), self.high)
         return decrement

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit import Limits, Windows, add_ridge, gram_matrix, parameter_units
+from wavebatch.kernels.fit import Limits, Windows, add_ridge, parameter_units
 
 LEAST_NEW = 0.03
 """Share of a new echo's energy that the present echoes must not be able to explain."""
@@ -24,14 +24,14 @@ def _correlate(rows: np.ndarray, taps: np.ndarray) -> np.ndarray:
 
 
 def propose_echo(
-    windows: Windows, parameters: np.ndarray, rows: np.ndarray, limits: Limits, width: float
+    windows: Windows, parameters: np.ndarray, rows: np.ndarray, gram: np.ndarray, limits: Limits, width: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Start parameters (m, 3, k + 1) with the best new echo of the given width, and the fall of chi2 it promises (m,).
 
     For every sample position the new echo's pulse is projected out of the span of the present echoes' derivatives;
     what remains, correlated with the residual, gives the linearised fall of chi2, the new amplitude and the
     correction of the present parameters (one Gauss-Newton step in which the new amplitude starts at zero).
-    rows: of `evaluate_model` at the parameters.
+    rows, gram: of the fit, at or near its minimum.
     """
     m, _, k = parameters.shape
     taps = np.exp(-0.5 * (np.arange(int(np.ceil(3 * width)) + 1) / width) ** 2)
@@ -39,10 +39,12 @@ def propose_echo(
     spread = _correlate(rows, taps).astype(np.float64)
     energy = _correlate(inside, taps**2).astype(np.float64)
     cross = spread[:, :-1]
-    explained = np.linalg.solve(add_ridge(gram_matrix(rows[:, :-1])), cross)
+    matrix = add_ridge(gram[:, :-1, :-1].copy())
+    explained = np.linalg.solve(matrix, cross)
+    onto = spread[:, -1] - np.einsum("mpl,mp->ml", explained, gram[:, :-1, -1])
     left = energy - np.einsum("mpl,mpl->ml", cross, explained)
     usable = (left > LEAST_NEW * energy.max(axis=1, keepdims=True)) & (inside > 0)
-    amplitude = np.where(usable, np.maximum(spread[:, -1], 0) / np.where(usable, left, 1.0), 0.0)
+    amplitude = np.where(usable, np.maximum(onto, 0) / np.where(usable, left, 1.0), 0.0)
     score = amplitude**2 * left
     place = np.argmax(score, axis=1)
     problem = np.arange(m)
