@@ -528,6 +528,17 @@ def test_rows_of_another_layout_are_refused(tmp_path):
         cloud.write(points)
 
 
+def test_nothing_waits_in_a_buffer_that_a_forked_worker_would_write_again(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
+        sizes = []
+        for _ in range(3):
+            cloud.write(layout.rows(points))
+            sizes.extend(path.stat().st_size for path in tmp_path.glob(".wavebatch-*"))
+    assert np.diff(sizes).tolist() == [200 * layout.dtype.itemsize] * 2
+
+
 def test_more_points_than_an_old_header_counts(tmp_path):
     points = write_source(tmp_path / "a.las", 4, (1, 3))
     layout = plan_output(tmp_path / "a.las", [])

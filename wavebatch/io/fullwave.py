@@ -110,6 +110,7 @@ class FullwaveWriter:
         size = stored.shape[1] * stored.itemsize
         with reporting(self.target):
             self._packets.file.write(stored.view(np.uint8).data)
+            self._packets.file.flush()
         offsets = np.uint64(self._end) + np.arange(len(stored), dtype=np.uint64) * np.uint64(size)
         self._end += stored.nbytes
         return offsets

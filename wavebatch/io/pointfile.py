@@ -67,6 +67,7 @@ class PointFile:
                              "4294967295 points; promote with --point-format 6")  # fmt: skip
         with self._guarded():
             self._encoder.write(rows)
+            self.draft.file.flush()  # a worker forked now must not inherit bytes that it would write once more
 
     def finish_points(self) -> None:
         """Ends the points; extended records may follow."""
