@@ -3,7 +3,7 @@
 from wavebatch.simulate.blocks import flag_truth, simulate_block, simulate_blocks
 from wavebatch.simulate.pulses import PULSES, PulseModel, find_pulse
 from wavebatch.simulate.render import Recording
-from wavebatch.simulate.scenes import SCENES, Scene, find_scene
+from wavebatch.simulate.scenes import SCENES, Scene, find_scene, shape_pulse
 from wavebatch.simulate.strip import StripOptions, StripSummary, simulate_strip
 from wavebatch.simulate.truth import TruthReader
 
@@ -19,6 +19,7 @@ __all__ = [
     "find_pulse",
     "find_scene",
     "flag_truth",
+    "shape_pulse",
     "simulate_block",
     "simulate_blocks",
     "simulate_strip",

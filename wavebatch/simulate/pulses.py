@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.errors import ConfigError
+from wavebatch.words import nearest
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ PULSES: dict[str, PulseModel] = {
 def find_pulse(name: str) -> PulseModel:
     """The pulse called `name`; ConfigError when there is none."""
     if name not in PULSES:
-        raise ConfigError(f"pulse {name!r} is unknown; choose one of {', '.join(PULSES)}")
+        raise ConfigError(f"pulse {name!r} is unknown; {nearest(name, PULSES)}")
     return PULSES[name]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,8 +20,9 @@ from wavebatch.simulate.draws import (
     widen_on_slope,
 )
 from wavebatch.simulate.hazards import HAZARDS, draw_hazards
-from wavebatch.simulate.pulses import PulseModel
+from wavebatch.simulate.pulses import PulseModel, find_pulse
 from wavebatch.simulate.render import Recording
+from wavebatch.words import nearest
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +134,26 @@ def find_scene(name: str) -> Scene:
         doc = (HAZARDS[hazard].__doc__ or "").strip()
         return replace(SCENES["stiff"], name=name, meaning=doc, hazards=(hazard,))
     names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS)]
-    near = difflib.get_close_matches(name, names, 1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    raise ConfigError(f"scene {name!r} is unknown{hint} Choose one of {', '.join(SCENES)}")
+    raise ConfigError(f"scene {name!r} is unknown; {nearest(name, names)}")
+
+
+def shape_pulse(
+    old: PulseModel,
+    *,
+    pulse: str | None = None,
+    sigma: float | None = None,
+    kappa: float | None = None,
+    ringing: float = 0.0,
+) -> PulseModel:
+    """The system pulse `old` with what is given in its place.
+
+    pulse: name of a shape in PULSES; those of a real sensor bring their own sigma. sigma [ns]: of the main lobe.
+    kappa: skew of the main lobe. ringing: share of the amplitude in lobes 4 and 8 sigma behind the peak.
+    Raises ConfigError for an unknown name or a value that no pulse has.
+    """
+    shape = old if pulse is None else find_pulse(pulse)
+    width = sigma or (shape.sigma if shape.lobes else old.sigma)
+    skew = shape.kappa if kappa is None else kappa
+    if not (0 < width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
+        raise ConfigError(f"pulse: sigma {width} ns must be above 0, kappa {skew} and ringing {ringing} within +-0.5")
+    return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)

@@ -1,0 +1,98 @@
+"""`wavebatch simulate`: a strip with known echoes."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import click
+from tqdm import tqdm
+
+from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.simulate import PULSES, SCENES, Scene, StripOptions, find_scene, shape_pulse, simulate_strip
+
+_STORAGE = ("point_format", "internal", "scale", "without_waveform", "keep_empty", "toward")
+_RECORDING = {
+    "bits": "bits",
+    "samples": "n_samples",
+    "spacing": "spacing",
+    "noise": "noise_std",
+    "baseline": "baseline",
+    "rho": "rho",
+    "noise_gain": "noise_gain",
+    "saturation": "saturation",
+}
+_SCENE_LINES = "\n\n".join(f"{name}: {scene.meaning}." for name, scene in SCENES.items())
+
+
+@click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
+@click.argument("scene")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The strip: .las or .laz.")
+@click.option("--seed", default=0, show_default=True, help="Pulse k of a scene and seed is always the same.")
+@click.option("--pulses", default=100_000, show_default=True, help="Pulses to fire.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Write the true echoes to this .npz.")
+@click.option("--bits", type=click.Choice(["8", "16", "32"]), help="Bits per sample.  [default: 8]")
+@click.option("--samples", type=int, help="Samples per waveform.  [default: the scene's, 80 or 96]")
+@click.option("--spacing", type=float, help="Time between samples [ns].  [default: 1]")
+@click.option("--noise", type=float, help="Noise before rounding [DN].  [default: the scene's, 1 or 1.2]")
+@click.option(
+    "--rho", type=float, help="Correlation of the noise of neighbours: 0, .5, .667, .75, .8.  [default: 0]"
+)
+@click.option("--noise-gain", type=float, help="Variance that the signal adds, per DN.  [default: 0]")
+@click.option("--baseline", type=float, help="Level without signal [DN].  [default: 12]")
+@click.option("--saturation", type=int, help="Count at which the receiver clips.  [default: the digitizer's largest]")
+@click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
+@click.option("--sigma", type=float, help="Standard deviation of the pulse's main lobe [ns].  [default: the scene's]")
+@click.option("--kappa", type=float, help="Skew of the main lobe.  [default: 0]")
+@click.option("--ringing", default=0.0, help="Share of the amplitude in lobes 4 and 8 sigma behind the peak.")
+@click.option("--point-format", type=click.Choice(["4", "5", "9", "10"]), default="4", show_default=True)
+@click.option("--las-version", "version", type=click.Choice(["1.3", "1.4"]), help="[default: 1.3 for formats 4 and 5]")
+@click.option("--internal/--external", default=True, help="Packets in the file or in a .wdp.  [default: internal]")
+@click.option("--scale", default=0.001, show_default=True, help="Unit of the stored coordinates [m].")
+@click.option("--without-waveform", default=0.01, show_default=True, help="Share of the pulses without a packet.")
+@click.option("--keep-empty/--drop-empty", default=True, help="Keep or leave out pulses without echo.  [default: keep]")
+@click.option("--toward/--away", default=True, help="Where the stored vectors point.  [default: toward the sensor]")
+@click.option("--overwrite", is_flag=True, help="Replace what exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@debug_option
+@report_errors()
+def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options) -> None:
+    """Make a full-waveform strip of a SCENE, with known echoes.
+
+    The points are what a vendor would deliver: a return per distinguishable echo, sharing packets, placed rightly but
+    with a return location that is up to half a sample off. --truth keeps every true echo for `wavebatch compare`.
+    """
+    shaped = _shape_scene(find_scene(scene), options)
+    storage = {name: options[name] for name in _STORAGE} | {"point_format": int(options["point_format"])}
+    bar = tqdm(total=pulses, unit=" pulses", disable=options["quiet"] or not sys.stderr.isatty(), leave=False)
+    with bar:
+        summary = simulate_strip(
+            shaped,
+            output,
+            pulses=pulses,
+            seed=seed,
+            options=StripOptions(version=options["version"], **storage),
+            truth=truth,
+            overwrite=options["overwrite"],
+            progress=bar.update,
+        )
+    if options["as_json"]:
+        print_json(asdict(summary))
+    elif not options["quiet"]:
+        talk(
+            f"{output}: {summary.points} points of {summary.pulses} pulses, {summary.packets} packets with "
+            f"{summary.echoes} echoes"
+        )
+
+
+def _shape_scene(scene: Scene, options: dict) -> Scene:
+    """The scene with the recording that the options ask for."""
+    given = {field: options[name] for name, field in _RECORDING.items() if options[name] is not None}
+    if "bits" in given:
+        given["bits"] = int(given["bits"])
+    shape = {name: options[name] for name in ("pulse", "sigma", "kappa", "ringing")}
+    return replace(
+        scene, recording=replace(scene.recording, pulse=shape_pulse(scene.recording.pulse, **shape), **given)
+    )
