@@ -1,0 +1,71 @@
+"""Which strips an argument list means: files, globs, directories and lists."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from wavebatch.errors import ConfigError
+
+SUFFIXES = (".las", ".laz")
+
+
+def find_strips(arguments: Iterable[str]) -> list[Path]:
+    """The strips that arguments mean, each once, in the order of the arguments; folders and globs by name.
+
+    A folder means its LAS and LAZ files, not those of folders in it. `@list.txt` means one such argument per line;
+    relative ones are taken from the list's folder, empty lines and lines that start with # are left out. A named file
+    that does not exist is kept: it fails when its turn comes, and the others do not suffer.
+    Raises ConfigError where an argument means nothing, or two strips would have outputs of the same name.
+    """
+    strips: dict[Path, Path] = {}
+    for argument in arguments:
+        for path in _expand(argument, Path()):
+            strips.setdefault(path.resolve(), path)
+    if not strips:
+        raise ConfigError("no strip given")
+    stems: dict[str, Path] = {}
+    for path in strips.values():
+        other = stems.setdefault(os.path.normcase(path.stem), path)
+        if other is not path:
+            raise ConfigError(f"{other} and {path}: both would be written as {path.stem}; run them into two folders")
+    return list(strips.values())
+
+
+def _expand(argument: str, folder: Path) -> Iterator[Path]:
+    if argument.startswith("@"):
+        yield from _read_list(folder / argument[1:])
+        return
+    path = folder / argument
+    if path.is_dir():
+        found = sorted(entry for entry in path.iterdir() if _is_strip(entry))
+        if not found:
+            raise ConfigError(f"{path}: folder holds no .las or .laz file")
+        yield from found
+    elif path.exists() or not glob.has_magic(argument):
+        yield path
+    else:
+        found = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
+        strips = [entry for entry in found if _is_strip(entry)]
+        if not strips:
+            raise ConfigError(f"{argument}: matches no .las or .laz file")
+        yield from strips
+
+
+def _is_strip(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+
+
+def _read_list(path: Path) -> Iterator[Path]:
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: list of strips cannot be read: {error}") from error
+    for number, line in enumerate(lines, 1):
+        entry = line.strip()
+        if entry and not entry.startswith("#"):
+            if entry.startswith("@"):
+                raise ConfigError(f"{path}: line {number}: a list cannot name another list")
+            yield from _expand(entry, path.parent)

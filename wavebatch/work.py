@@ -1,0 +1,217 @@
+"""What one process does: prepare a strip, and take one of its units from packets to output rows."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch import survey
+from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.blocks import COLUMNS, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.chain import STAGES, Chain
+from wavebatch.errors import ConfigError
+from wavebatch.io.layout import OutputLayout, plan_output
+from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
+from wavebatch.report import RunReport
+from wavebatch.words import nearest
+
+BLOCK_SAMPLES = 1 << 20
+"""Samples of a block, unless told otherwise: 8,192 waveforms of 128."""
+
+SURVEY_SAMPLES = 1 << 21
+"""Samples that the survey looks at, at most."""
+
+_ALWAYS = ("echo_time", "echo_flags")
+"""Columns that need no attribute stage."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """Options of a run that change what is written."""
+
+    direction: str = "auto"
+    headerless: bool = False
+    points: str = "echoes"
+    format: str = "laz"
+    point_format: int | None = None
+    names: str = "wavebatch"
+    columns: tuple[str, ...] = ()
+    """Columns to write, in order; see `choose_columns`."""
+    keep_packets: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StripJob:
+    """A strip to process and how; picklable."""
+
+    path: Path
+    chain: Chain
+    options: RunOptions
+
+    def open(self) -> StripReader:
+        """A reader of the strip; raises InputError where it is not one."""
+        return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """All that the units of a strip share; picklable."""
+
+    job: StripJob
+    facts: StripFacts
+    scan: StripScan
+    units: int
+    system: SystemPulse
+    layout: OutputLayout
+    report: RunReport
+    """Timing of the preparation."""
+
+
+def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
+    """Columns to write: what the chain computes and the flags; `a,b` chooses among them, `+a,+b` adds.
+
+    Raises ConfigError for a column that does not exist or that the chain does not compute, and for a chain without
+    positions.
+    """
+    missing = [name for name in NEEDED if name not in chain.makes]
+    if missing:
+        raise ConfigError(
+            f"chain {chain.name}: computes no {', '.join(missing)}, without which echoes are no points; add a "
+            "[[chain]] table with stage = \"attribute.position\""
+        )  # fmt: skip
+    computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
+    default = [*computed, "echo_flags"]
+    entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+    added = [entry[1:] for entry in entries if entry.startswith("+")]
+    chosen = [entry for entry in entries if not entry.startswith("+")]
+    for name in [*chosen, *added]:
+        _check_column(name, (*computed, *_ALWAYS))
+    return tuple(dict.fromkeys([*(chosen or default), *added]))
+
+
+def _check_column(name: str, available: tuple[str, ...]) -> None:
+    known = [column.name for column in COLUMNS.values() if column.extra_bytes]
+    if name not in known:
+        raise ConfigError(f"--columns: column {name!r} does not exist; {nearest(name, known)}")
+    if name not in available:
+        makers = [stage.name for stage in STAGES.values() if name in stage.makes]
+        remedy = f"add stage {' or '.join(makers)} to it" if makers else "no stage of this version does"
+        raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
+
+
+def prepare_strip(job: StripJob) -> Prepared:
+    """Scan and survey of a strip, and the layout of its output; raises InputError where it cannot be processed."""
+    start = time.perf_counter()
+    with job.open() as reader:
+        facts = reader.facts
+        options = job.options
+        layout = plan_output(
+            facts,
+            options.columns,
+            point_format=options.point_format,
+            keep_packets=options.keep_packets,
+            names=options.names,
+            points=options.points,
+        )
+        scan = reader.scan()
+        try:
+            scanned = time.perf_counter()
+            longest = max((digitizer.n_samples for digitizer in facts.digitizers.values()), default=0)
+            number = int(np.clip(SURVEY_SAMPLES // max(longest, 1), 256, survey.SAMPLE))
+            system = survey.measure(reader.sample_blocks(scan, number))
+            units = reader.unit_count()
+        except BaseException:
+            scan.close()
+            raise
+    timing = {"scan": scanned - start, "survey": time.perf_counter() - scanned}
+    return Prepared(job, facts, scan, units, system, layout, RunReport(timing=timing))
+
+
+def process_unit(prepared: Prepared, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
+    """Output rows of one unit, and their account.
+
+    block_size: waveforms that go through the chain at a time; the rows do not depend on it.
+    """
+    start = time.perf_counter()
+    stages: dict[str, float] = {}
+    echoes_mode = prepared.job.options.points == "echoes"
+    with prepared.job.open() as reader:
+        unit = reader.read_unit(number, prepared.scan)
+        opened = time.perf_counter()
+        size = block_size or _block_size(unit)
+        blocks = _Stopwatch(reader.read_blocks(unit, size, owned_only=echoes_mode))
+        echoes = gather_echoes(unit, _run_blocks(prepared, blocks, stages))
+    gathered = time.perf_counter()
+    assemble = assemble_echoes if echoes_mode else assemble_returns
+    rows, report = assemble(unit, echoes, prepared.layout)
+    timing = {
+        **stages,
+        "read points": opened - start,
+        "read packets": blocks.seconds,
+        "assemble": time.perf_counter() - gathered,
+    }
+    return rows, replace(report, timing=timing)
+
+
+@functools.lru_cache(maxsize=4)
+def _unpack(blob: bytes) -> Prepared:
+    return pickle.loads(blob)
+
+
+def process_packed_unit(blob: bytes, number: int, block_size: int | None) -> tuple[np.ndarray, RunReport]:
+    """`process_unit` of a pickled Prepared, which is unpickled once per process and strip."""
+    return process_unit(_unpack(blob), number, block_size)
+
+
+def _block_size(unit: Unit) -> int:
+    longest = int(unit.packets.n_samples.max(initial=1))
+    return int(np.clip(BLOCK_SAMPLES // longest, 64, 8192))
+
+
+def _run_blocks(
+    prepared: Prepared, blocks: Iterator[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
+) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
+    for block, index in blocks:
+        table = prepared.job.chain.run(block, prepared.system, timing)
+        yield replace(block, samples=block.samples[:0]), index, table
+
+
+class _Stopwatch:
+    """Iterates over something else and keeps the seconds that it took."""
+
+    def __init__(self, items: Iterator) -> None:
+        self._items = iter(items)
+        self.seconds = 0.0
+
+    def __iter__(self) -> _Stopwatch:
+        return self
+
+    def __next__(self) -> object:
+        start = time.perf_counter()
+        try:
+            return next(self._items)
+        finally:
+            self.seconds += time.perf_counter() - start
+
+
+def describe_system(system: SystemPulse) -> Mapping[str, object]:
+    """The system pulse for the report and the cloud's provenance."""
+    return {
+        "sigma_ref_ns": system.sigma_ref,
+        "baseline_dn": system.baseline,
+        "baseline_spread_dn": system.baseline_spread,
+        "noise_std_dn": system.noise_std,
+        "noise_by_kind_dn": dict(system.noise_by_kind),
+        "noise_gain": system.noise_gain,
+        "kappa": system.kappa,
+        "components": [list(component) for component in system.components],
+        "ringing": system.ringing,
+        "saturation_dn": system.saturation,
+        "acceptance": system.acceptance,
+    }
