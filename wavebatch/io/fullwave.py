@@ -62,19 +62,8 @@ class FullwaveWriter:
         self._digitizers = {digitizer.index: digitizer for digitizer in _check_digitizers(self.target, digitizers)}
         self.dtype = build_dtype(point_format, extra_bytes)
         self._internal, self._toward = internal, toward
-        encoding = 1 | (WAVES_INTERNAL if internal else WAVES_EXTERNAL)
-        header = LasHeader(
-            version=numbers,
-            point_format=point_format,
-            point_length=self.dtype.itemsize,
-            scales=tuple(map(float, scales)),
-            offsets=tuple(map(float, offsets)),
-            vlrs=_build_vlrs(digitizers, wkt),
-            global_encoding=encoding | (WKT_BIT if point_format >= 6 or (wkt and numbers >= (1, 4)) else 0),
-            system_identifier=b"OTHER",
-            generating_software=f"wavebatch {__version__}".encode(),
-            creation=_CREATION,
-        )
+        header = _build_header(numbers, point_format, internal, digitizers, wkt)
+        header.scales, header.offsets = tuple(map(float, scales)), tuple(map(float, offsets))
         self._file = PointFile(self.target, header, self.dtype, extra_bytes, overwrite=overwrite)
         beside = self.target.with_suffix(".wdp")
         try:
@@ -171,6 +160,24 @@ def _check_digitizers(target: Path, digitizers: Sequence[Digitizer]) -> Sequence
         if digitizer.bits not in (8, 16, 32):
             raise ConfigError(f"{target}: digitizer {digitizer.index} has {digitizer.bits} bits, not 8, 16 or 32")
     return digitizers
+
+
+def _build_header(
+    version: tuple[int, int], point_format: int, internal: bool, digitizers: Sequence[Digitizer], wkt: str | None
+) -> LasHeader:
+    encoding = 1 | (WAVES_INTERNAL if internal else WAVES_EXTERNAL)
+    return LasHeader(
+        version=version,
+        point_format=point_format,
+        point_length=0,
+        scales=(0.001,) * 3,
+        offsets=(0.0,) * 3,
+        vlrs=_build_vlrs(digitizers, wkt),
+        global_encoding=encoding | (WKT_BIT if point_format >= 6 or (wkt and version >= (1, 4)) else 0),
+        system_identifier=b"OTHER",
+        generating_software=f"wavebatch {__version__}".encode(),
+        creation=_CREATION,
+    )
 
 
 def _build_vlrs(digitizers: Sequence[Digitizer], wkt: str | None) -> list[Vlr]:

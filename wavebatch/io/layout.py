@@ -154,12 +154,11 @@ def plan_output(
 ) -> OutputLayout:
     """How the output of a strip looks; only the strip's header is read.
 
-    path_or_facts: path of the strip, or what the reader says of it (StripFacts).
+    path_or_facts: path of the strip, or the reader's StripFacts of it.
     columns: names in COLUMNS, in the order in which they are written.
     point_format: None keeps the input's family without waveforms (with them, under keep_packets).
     points: "echoes" carries the input's extra bytes on matched rows only, "returns" on all of them.
-    ranges: true least and largest stored value of input extra bytes by name, where somebody has measured them: integers
-    that declare no no-data value get one outside; without them one outside the range that their record declares.
+    ranges: true least and largest stored value of input extra bytes by name, where measured; see `choose_no_data`.
     Raises InputError for a strip that cannot be written this way, ConfigError for wrong options.
     """
     if points not in ("echoes", "returns"):
@@ -167,13 +166,12 @@ def plan_output(
     path = Path(getattr(path_or_facts, "path", path_or_facts))
     header = read_header(path)
     target = choose_format(path, header, point_format, keep_packets)
-    version = header.version if target < 6 else max(header.version, (1, 4))
     _check_crs(path, header, target)
     carried, dropped = plan_carried(path, header, points == "returns", ranges or {})
     written = name_columns(columns, names, [entry.record.name for entry in carried])
     return OutputLayout(
         source=path,
-        version=version,
+        version=header.version if target < 6 else max(header.version, (1, 4)),
         point_format=target,
         source_format=header.point_format,
         scales=header.scales,
