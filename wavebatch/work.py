@@ -105,20 +105,25 @@ def _check_column(name: str, available: tuple[str, ...]) -> None:
         raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
 
 
+def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
+    """How the points of the strip's output look; raises InputError or ConfigError where that cannot be had."""
+    options = job.options
+    return plan_output(
+        facts,
+        options.columns,
+        point_format=options.point_format,
+        keep_packets=options.keep_packets,
+        names=options.names,
+        points=options.points,
+    )
+
+
 def prepare_strip(job: StripJob) -> Prepared:
     """Scan and survey of a strip, and the layout of its output; raises InputError where it cannot be processed."""
     start = time.perf_counter()
     with job.open() as reader:
         facts = reader.facts
-        options = job.options
-        layout = plan_output(
-            facts,
-            options.columns,
-            point_format=options.point_format,
-            keep_packets=options.keep_packets,
-            names=options.names,
-            points=options.points,
-        )
+        layout = plan_layout(job, facts)
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
@@ -178,8 +183,7 @@ def _run_blocks(
     prepared: Prepared, blocks: Iterator[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
 ) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
     for block, index in blocks:
-        table = prepared.job.chain.run(block, prepared.system, timing)
-        yield replace(block, samples=block.samples[:0]), index, table
+        yield block, index, prepared.job.chain.run(block, prepared.system, timing)
 
 
 class _Stopwatch:

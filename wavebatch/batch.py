@@ -1,0 +1,202 @@
+"""Strips x units through a chain: order, bounded memory, failures that stop one strip only, resume."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from wavebatch import __version__
+from wavebatch.errors import InputError
+from wavebatch.io.publish import remove_stale, reporting
+from wavebatch.plan import check_outputs
+from wavebatch.record import BATCH_SCHEMA, build_timing
+from wavebatch.report import RunReport
+from wavebatch.task import BatchOptions, StripTask
+from wavebatch.work import StripJob
+from wavebatch.workers import Workers
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a strip ended."""
+
+    job: StripJob
+    status: str
+    """written, skipped (resume found it done) or failed."""
+    report: RunReport = field(default_factory=RunReport)
+    error: BaseException | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BatchResult:
+    """How a batch ended: the outcome of every strip, in the order given."""
+
+    outcomes: tuple[Outcome, ...]
+    seconds: float
+
+    @property
+    def exit_code(self) -> int:
+        """0 every strip is there, 3 some are not, 4 none is."""
+        failed = sum(outcome.status == "failed" for outcome in self.outcomes)
+        if not failed:
+            return 0
+        return 4 if failed == len(self.outcomes) else 3
+
+    @property
+    def report(self) -> RunReport:
+        """The strips' reports added up."""
+        return sum((outcome.report for outcome in self.outcomes), RunReport())
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary of the batch; all but `timing` is the same for every run."""
+        report = self.report
+        strips = [
+            {
+                "strip": str(outcome.job.path),
+                "status": outcome.status,
+                "error": None if outcome.error is None else " ".join(str(outcome.error).split()),
+                "counts": outcome.report.to_json()["counts"],
+            }
+            for outcome in self.outcomes
+        ]
+        timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
+        return {
+            "schema": BATCH_SCHEMA,
+            "version": __version__,
+            "strips": strips,
+            **report.to_json(),
+            "timing": timing,
+        }
+
+
+def run_batch(
+    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None = None
+) -> BatchResult:
+    """Writes cloud and report of every strip into the folder; a strip that fails does not stop the others.
+
+    on_event: told what happens, as dictionaries with a key `event`: start, unit, written, skipped, failed.
+    Raises ConfigError before anything is started, KeyboardInterrupt after cleaning up; failures are in the result.
+    """
+    start = time.perf_counter()
+    check_outputs(jobs, options)
+    with reporting(options.folder):
+        options.folder.mkdir(parents=True, exist_ok=True)
+    remove_stale(options.folder)
+    with Workers(options.jobs) as workers, contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
+        batch.run()
+        outcomes = tuple(batch.outcomes[job.path] for job in jobs)
+    return BatchResult(outcomes, time.perf_counter() - start)
+
+
+class _Batch:
+    """The loop: keeps the workers busy, takes results in order, lets no more than a few of them wait."""
+
+    def __init__(
+        self,
+        jobs: Sequence[StripJob],
+        options: BatchOptions,
+        workers: Workers,
+        on_event: Callable[[dict[str, Any]], None] | None,
+    ) -> None:
+        self.outcomes: dict[Path, Outcome] = {}
+        self._waiting = deque(jobs)
+        self._again: deque[StripJob] = deque()
+        self._active: list[StripTask] = []
+        self._options = options
+        self._workers = workers
+        self._limit = 1 if options.jobs == 1 else 2 * options.jobs
+        self._tell = on_event or (lambda event: None)
+
+    def run(self) -> None:
+        """Until every strip has an outcome."""
+        while self._submit() or self._active:
+            heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
+            done, _ = wait(heads, return_when=FIRST_COMPLETED)
+            for future in done:
+                self._take(heads[future])
+
+    def close(self) -> None:
+        """Removes whatever unfinished strips have left."""
+        for strip in self._active:
+            strip.drop()
+        self._active.clear()
+
+    def _submit(self) -> bool:
+        """Gives the workers as much as may wait for being written; whether anything is under way."""
+        while sum(len(strip.pending) for strip in self._active) < self._limit:
+            strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
+            if strip is None:
+                break
+            with self._failing(strip):
+                strip.submit(self._workers)
+        return any(strip.pending for strip in self._active)
+
+    def _start_next(self) -> StripTask | None:
+        while not (self._active and (self._again or not self._waiting or self._active[0].alone)):
+            alone = bool(self._again)
+            queue = self._again or self._waiting
+            if not queue:
+                return None
+            strip = StripTask(queue.popleft(), self._options, alone)
+            self._active.append(strip)
+            with self._failing(strip):
+                report = strip.start()
+                self._tell({"event": "start", "strip": str(strip.job.path)})
+                if report is None:
+                    return strip
+                self._end(strip, Outcome(strip.job, "skipped", report))
+        return None
+
+    def _take(self, strip: StripTask) -> None:
+        if strip not in self._active:
+            return
+        with self._failing(strip):
+            strip.take()
+            done, units = strip.written, strip.prepared.units
+            if done:
+                self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
+            if strip.is_complete:
+                self._end(strip, Outcome(strip.job, "written", strip.finish()))
+
+    @contextlib.contextmanager
+    def _failing(self, strip: StripTask) -> Iterator[None]:
+        """What goes wrong inside is the end of this strip only."""
+        try:
+            yield
+        except BrokenProcessPool:
+            self._restart()
+        except Exception as error:
+            strip.drop()
+            self._end(strip, Outcome(strip.job, "failed", error=error))
+
+    def _restart(self) -> None:
+        """A process has died: a strip that was alone is given up, several are tried again one by one."""
+        self._workers.restart()
+        strips, self._active = self._active, []
+        for strip in strips:
+            strip.drop()
+        if len(strips) > 1:
+            self._again.extend(strip.job for strip in strips)
+            return
+        error = InputError(
+            f"{strips[0].job.path}: a worker process died while it worked on this strip (killed, or out of memory); "
+            "run again with --resume and fewer --jobs or less --memory"
+        )
+        self._end(strips[0], Outcome(strips[0].job, "failed", error=error))
+
+    def _end(self, strip: StripTask, outcome: Outcome) -> None:
+        if strip in self._active:
+            self._active.remove(strip)
+        self.outcomes[outcome.job.path] = outcome
+        event = {"event": outcome.status, "strip": str(outcome.job.path)}
+        if outcome.error is not None:
+            self._tell({**event, "error": outcome.error})
+        else:
+            self._tell({**event, "counts": outcome.report.to_json()["counts"]})

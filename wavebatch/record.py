@@ -1,0 +1,124 @@
+"""The report file beside a cloud: what it says, and whether the cloud beside it is still the one asked for."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from wavebatch import __version__
+from wavebatch.config import effective
+from wavebatch.io.publish import Draft, reporting
+from wavebatch.report import RunReport
+from wavebatch.work import Prepared, StripJob, describe_system
+
+STRIP_SCHEMA = "wavebatch.strip-report/1"
+BATCH_SCHEMA = "wavebatch.batch-report/1"
+
+
+def cloud_path(job: StripJob, folder: Path) -> Path:
+    """Where the cloud of a strip goes."""
+    return folder / f"{job.path.stem}.{job.options.format}"
+
+
+def report_path(job: StripJob, folder: Path) -> Path:
+    """Where its report goes; that it is there says that the cloud is complete."""
+    return folder / f"{job.path.stem}.report.json"
+
+
+def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
+    """All that decides what is written: two runs for which this is equal write the same cloud."""
+    return {
+        "version": __version__,
+        "input": {"file": job.path.name, **fingerprint},
+        "options": asdict(job.options),
+        "chain": effective(job.chain),
+    }
+
+
+def describe_strip(prepared: Prepared) -> dict[str, Any]:
+    """What scan and survey say of the strip."""
+    scan = prepared.scan
+    return {
+        "direction": {
+            "sign": scan.direction,
+            "evidence": scan.direction_evidence,
+            "vector_ratio": _finite(scan.vector_ratio),
+        },
+        "system": describe_system(prepared.system),
+    }
+
+
+def build_document(
+    prepared: Prepared, described: Mapping[str, Any], report: RunReport, cloud: Path, dropped: Mapping[str, str]
+) -> dict[str, Any]:
+    """The report of a strip whose cloud is written; everything but `timing` is the same for every run.
+
+    described: from `describe_job`. dropped: records of the input that the cloud does not have, and why.
+    """
+    facts, layout = prepared.facts, prepared.layout
+    lost = {**layout.dropped, **dropped}
+    return {
+        "schema": STRIP_SCHEMA,
+        **described,
+        "strip": {
+            "las_version": facts.version,
+            "point_format": facts.point_format,
+            "points": facts.point_count,
+            "packets": {
+                "file": facts.packet_file.name if facts.packet_file else None,
+                "internal": facts.internal,
+                "bytes": facts.packet_end - facts.packet_start,
+            },
+            **describe_strip(prepared),
+        },
+        "output": {
+            "file": cloud.name,
+            "size": cloud.stat().st_size,
+            "point_format": layout.point_format,
+            "columns": {written.column: written.record.name for written in layout.written},
+        },
+        **report.to_json(),
+        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "timing": build_timing(report),
+    }
+
+
+def build_timing(report: RunReport) -> dict[str, Any]:
+    """Seconds by what they were spent on, and waveforms per second of all of them together."""
+    total = sum(report.timing.values())
+    seconds = {name: round(value, 6) for name, value in report.timing.items()}
+    rate = round(report.count("waveforms") / total) if total > 0 else None
+    return {"seconds": seconds, "process_seconds": round(total, 6), "waveforms_per_process_second": rate}
+
+
+def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
+    """The document as a file that appears whole or not at all."""
+    text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
+    draft = Draft(path, overwrite=overwrite)
+    try:
+        with reporting(path):
+            draft.file.write(text.encode())
+        draft.publish()
+    finally:
+        draft.discard()
+
+
+def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:
+    """The report of a cloud in `folder` that is complete and just what this run would write; None otherwise."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        document = json.loads(report_path(job, folder).read_text("utf-8"))
+        cloud = cloud_path(job, folder)
+        same = document["schema"] == STRIP_SCHEMA and all(
+            document[key] == json.loads(json.dumps(value)) for key, value in described.items()
+        )
+        if same and document["output"]["file"] == cloud.name and document["output"]["size"] == cloud.stat().st_size:
+            return RunReport.from_json(document)
+    return None
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or value != value or abs(value) == float("inf") else float(value)

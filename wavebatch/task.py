@@ -1,0 +1,160 @@
+"""One strip on its way through a batch: prepared, its units processed anywhere and written here in order, published."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import time
+from collections import deque
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wavebatch.errors import InputError
+from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.io.publish import refuse_existing
+from wavebatch.io.writer import CloudWriter
+from wavebatch.record import (
+    build_document,
+    cloud_path,
+    describe_job,
+    describe_strip,
+    read_current,
+    report_path,
+    write_json,
+)
+from wavebatch.report import RunReport
+from wavebatch.work import Prepared, StripJob, prepare_strip, process_packed_unit
+from wavebatch.workers import Workers
+
+
+@dataclass(frozen=True, slots=True)
+class BatchOptions:
+    """Options of a run that change how it goes, never what it writes."""
+
+    folder: Path
+    jobs: int = 1
+    block_size: int | None = None
+    """Waveforms that go through a chain at a time; None chooses by their length."""
+    overwrite: bool = False
+    resume: bool = False
+
+
+class StripTask:
+    """A strip on its way: prepared, its units submitted and written in order, then published."""
+
+    def __init__(self, job: StripJob, options: BatchOptions, alone: bool) -> None:
+        self.job = job
+        self.alone = alone
+        self.pending: deque[Future] = deque()
+        self.prepared: Prepared | None = None
+        self.written = 0
+        self._options = options
+        self._submitted = 0
+        self._blob = b""
+        self._writer: CloudWriter | None = None
+        self._report = RunReport()
+        self._described: dict[str, Any] = {}
+        self._files: list[Path] = []
+        self._state: list[tuple[int, int]] = []
+
+    def start(self) -> RunReport | None:
+        """The report where the strip is done already; InputError where it cannot be read or may not be written."""
+        options, job = self._options, self.job
+        with job.open() as reader:
+            packet_file = reader.facts.packet_file
+        self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
+        self._state = self._stat()
+        self._described = describe_job(job, take_fingerprint(job.path, packet_file))
+        if options.resume:
+            return read_current(job, options.folder, self._described)
+        if not options.overwrite:
+            refuse_existing(cloud_path(job, options.folder))
+            refuse_existing(report_path(job, options.folder))
+        return None
+
+    @property
+    def has_more(self) -> bool:
+        """Whether something can be submitted now."""
+        if self.prepared is None:
+            return not self.pending
+        return self._submitted < self.prepared.units
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all units are written."""
+        return self.prepared is not None and self.written == self.prepared.units
+
+    def submit(self, workers: Workers) -> None:
+        """The next piece of work: the preparation, then unit by unit."""
+        if self.prepared is None:
+            self.pending.append(workers.submit(prepare_strip, self.job))
+            return
+        arguments = (self._blob, self._submitted, self._options.block_size)
+        self.pending.append(workers.submit(process_packed_unit, *arguments))
+        self._submitted += 1
+
+    def take(self) -> None:
+        """Takes the oldest result: opens the output, or writes rows to it."""
+        result = self.pending.popleft().result()
+        start = time.perf_counter()
+        if self.prepared is None:
+            self.prepared = result
+            self._report += result.report
+            self._open()
+            return
+        rows, report = result
+        self._writer.write(rows)
+        self.written += 1
+        self._report += report + RunReport(timing={"write": time.perf_counter() - start})
+
+    def _open(self) -> None:
+        options, prepared = self._options, self.prepared
+        self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
+        provenance = {**self._described, **describe_strip(prepared)}
+        self._writer = CloudWriter(
+            prepared.layout,
+            cloud_path(self.job, options.folder),
+            provenance=provenance,
+            overwrite=options.overwrite or options.resume,
+        )
+
+    def finish(self) -> RunReport:
+        """Publishes the cloud, then its report, which says that the cloud is complete."""
+        options, job = self._options, self.job
+        start = time.perf_counter()
+        self._report.check(job.options.points, str(job.path))
+        if self._stat() != self._state:
+            raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
+        cloud, beside = cloud_path(job, options.folder), report_path(job, options.folder)
+        replaces = options.overwrite or options.resume
+        if replaces:
+            beside.unlink(missing_ok=True)
+        self._writer.commit()
+        self._report += RunReport(timing={"publish": time.perf_counter() - start})
+        document = build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
+        write_json(beside, document, overwrite=replaces)
+        self.prepared.scan.close()
+        return self._report
+
+    def drop(self) -> None:
+        """Forgets the strip: nothing of it remains on disk or under way."""
+        for future in self.pending:
+            if not future.cancel() and self.prepared is None:
+                future.add_done_callback(_close_scan)
+        self.pending.clear()
+        if self._writer is not None:
+            self._writer.abort()
+        if self.prepared is not None:
+            self.prepared.scan.close()
+
+    def _stat(self) -> list[tuple[int, int]]:
+        stats = [os.stat(path) for path in self._files]
+        return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
+
+
+def _close_scan(future: Future) -> None:
+    with contextlib.suppress(Exception):
+        future.result().scan.close()
