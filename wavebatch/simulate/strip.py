@@ -154,8 +154,8 @@ def _write_block(
     block, n = simulated.block, len(simulated.block)
     most = 7 if options.point_format < 6 else 15
     returns = list_returns(simulated.truth, n, scene.recording, most, keep_empty=options.keep_empty)
-    jitter = rng.uniform(-0.5, 0.5, n) * scene.recording.spacing
-    stored = rng.random(n) >= options.without_waveform
+    jitter = rng.uniform(-0.5, 0.5, SEED_BLOCK)[:n] * scene.recording.spacing
+    stored = rng.random(SEED_BLOCK)[:n] >= options.without_waveform
     stored &= np.bincount(returns.pulse, minlength=n) > 0
     rows = np.flatnonzero(stored)
     offset = np.zeros(n, np.uint64)

@@ -107,13 +107,10 @@ class TruthReader:
         self.path = Path(path)
         try:
             self._archive = zipfile.ZipFile(self.path)
-            missing = {f"{name}.npy" for name in (*ECHO_COLUMNS, *PACKET_COLUMNS, _META)} - set(
-                self._archive.namelist()
-            )
-            if missing:
-                raise InputError(
-                    f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(sorted(missing))}"
-                )
+            known = set(self._archive.namelist())
+            lacking = [name for name in (*ECHO_COLUMNS, *PACKET_COLUMNS, _META) if f"{name}.npy" not in known]
+            if lacking:
+                raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
                 self.meta: dict[str, Any] = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
         except (zipfile.BadZipFile, ValueError, EOFError) as error:
