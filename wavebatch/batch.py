@@ -42,12 +42,9 @@ class BatchResult:
     seconds: float
 
     @property
-    def exit_code(self) -> int:
-        """0 every strip is there, 3 some are not, 4 none is."""
-        failed = sum(outcome.status == "failed" for outcome in self.outcomes)
-        if not failed:
-            return 0
-        return 4 if failed == len(self.outcomes) else 3
+    def failed(self) -> int:
+        """Strips that are not there."""
+        return sum(outcome.status == "failed" for outcome in self.outcomes)
 
     @property
     def report(self) -> RunReport:

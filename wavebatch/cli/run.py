@@ -1,0 +1,200 @@
+"""`wavebatch run`: the main job."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wavebatch.cli.common import EXIT_INTERRUPTED, debug_option, one_line, print_json, report_errors, talk
+from wavebatch.errors import ConfigError
+
+EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
+"""Some strips are not written; none is."""
+
+_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+
+
+class Size(click.ParamType):
+    """Bytes, as 800M, 2G or a plain number."""
+
+    name = "size"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """The number of bytes."""
+        if isinstance(value, int):
+            return value
+        text = str(value).strip().upper().removesuffix("IB").removesuffix("B")
+        number, unit = (text[:-1], text[-1]) if text and text[-1] in "KMGT" else (text, "")
+        try:
+            size = float(number) * _UNITS[unit]
+            if size > 0:
+                return int(size)
+        except (ValueError, OverflowError):
+            pass
+        return self.fail(f"{value!r} is not a size such as 800M or 2G", param, ctx)
+
+
+@click.command()
+@click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
+@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
+              help="Folder of the clouds and their reports; made if it is not there.")
+@click.option("-c", "--chain", "chain_file", type=click.Path(path_type=Path), metavar="FILE", help="Chain file (TOML).")
+@click.option("--profile", metavar="fast|balanced|accurate", help="A shipped chain.  [default: balanced]")
+@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
+              help="Where the packets' vectors point, seen from the target: to the sensor or away from it.")
+@click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
+@click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
+              help="A point per echo found, or the input's own points, enriched.")
+@click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
+              help="Of the clouds.")
+@click.option("--point-format", type=click.IntRange(0, 10), metavar="0-10",
+              help="Of the clouds.  [default: that of the strip without waveforms]")
+@click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
+              show_default=True, help="Names and units of the extra bytes.")
+@click.option("--columns", metavar="LIST", help="a,b writes these columns only; +a,+b adds them to the usual ones.")
+@click.option("--keep-packets", is_flag=True, help="Keep the waveforms: their point format and the packets themselves.")
+@click.option("--jobs", type=click.IntRange(0), default=1, show_default=True, metavar="N",
+              help="Processes; 0 means one per processor. The result is the same for any number.")
+@click.option("--memory", type=Size(), metavar="SIZE", help="Most memory for all processes together, e.g. 2G.")
+@click.option("--block-size", type=click.IntRange(1), metavar="N",
+              help="Waveforms processed at a time; the result is the same for any number.  [default: by their length]")
+@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@click.option("--resume", is_flag=True, help="Leave outputs that are complete and up to date, make all others anew.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done with each strip, and touch nothing.")
+@click.option("--report", type=click.Path(dir_okay=False, allow_dash=True), metavar="FILE",
+              help="Summary of all strips as JSON; - is stdout.")
+@click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
+              help="auto: a bar on a terminal only. json: one line per event on stdout.")
+@click.option("-q", "--quiet", is_flag=True, help="Errors only.")
+@click.option("-v", "--verbose", is_flag=True, help="Say more about each strip.")
+@debug_option
+@report_errors(failure=EXIT_NOTHING)
+def run(**options: Any) -> None:
+    """Strips in, enriched point clouds out.
+
+    STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each strip
+    becomes DIR/<stem>.laz and DIR/<stem>.report.json; the report is written last and says that the cloud is complete.
+
+    \b
+    Exit codes: 0 every strip is written
+                2 wrong usage or chain file, nothing was started
+                3 some strips failed, the others are written
+                4 no strip is written
+                130 interrupted; --resume goes on
+    """  # fmt: skip
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    _check_options(options)
+    jobs, batch_options = _plan(options)
+    if options["dry_run"]:
+        sys.exit(_dry_run(jobs, batch_options))
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        sys.exit(_run(jobs, batch_options, options))
+    except KeyboardInterrupt:
+        talk("interrupted: finished clouds are complete, nothing half-written remains; --resume goes on")
+        sys.exit(EXIT_INTERRUPTED)
+
+
+def _interrupt(number: int, frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    pairs = [("chain_file", "profile"), ("overwrite", "resume"), ("quiet", "verbose")]
+    for first, second in pairs:
+        if options[first] and options[second]:
+            names = [f"--{name.removesuffix('_file')}" for name in (first, second)]
+            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
+    report = options["report"]
+    if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
+        raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
+    if report == "-" and options["progress"] == "json":
+        raise ConfigError("--report - and --progress json would both write to stdout; give the report a file")
+
+
+def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
+    """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
+    from wavebatch.config import load_chain, load_profile
+    from wavebatch.inputs import find_strips
+    from wavebatch.plan import check_outputs, plan_memory
+    from wavebatch.task import BatchOptions
+    from wavebatch.work import RunOptions, StripJob, choose_columns
+
+    file = options["chain_file"]
+    chain = load_chain(file) if file else load_profile(options["profile"] or "balanced")
+    run_options = RunOptions(
+        direction=options["direction"],
+        headerless=options["headerless"],
+        points=options["points"],
+        format=options["file_format"],
+        point_format=options["point_format"],
+        names=options["names"],
+        columns=choose_columns(chain, options["columns"]),
+        keep_packets=options["keep_packets"],
+    )
+    strips = find_strips(options["strips"])
+    wanted = options["jobs"] or os.cpu_count() or 1
+    processes, block_size = plan_memory(wanted, options["memory"])
+    batch_options = BatchOptions(
+        folder=options["output"],
+        jobs=processes,
+        block_size=options["block_size"] or block_size,
+        overwrite=options["overwrite"],
+        resume=options["resume"],
+    )
+    jobs = [StripJob(path, chain, run_options) for path in strips]
+    check_outputs(jobs, batch_options)
+    return jobs, batch_options
+
+
+def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
+    from wavebatch.batch import run_batch
+    from wavebatch.cli.progress import Progress
+    from wavebatch.record import write_json
+
+    level = -1 if options["quiet"] else int(options["verbose"])
+    with Progress([job.path for job in jobs], options["progress"], level, options["debug"]) as progress:
+        result = run_batch(jobs, batch_options, progress.tell)
+    if level > 0:
+        timing = result.to_json()["timing"]
+        parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
+        talk(f"{timing['elapsed_seconds']:.1f} s elapsed; of the processes' time: {parts}")
+    if options["report"] == "-":
+        print_json(result.to_json())
+    elif options["report"]:
+        write_json(Path(options["report"]), result.to_json(), overwrite=True)
+    return exit_code(result.failed, len(jobs))
+
+
+def exit_code(failed: int, strips: int) -> int:
+    """0 every strip is there, EXIT_SOME_FAILED some are not, EXIT_NOTHING none is."""
+    if not failed:
+        return 0
+    return EXIT_NOTHING if failed == strips else EXIT_SOME_FAILED
+
+
+def _dry_run(jobs: list[Any], batch_options: Any) -> int:
+    from wavebatch.config import effective
+    from wavebatch.plan import plan_strip
+
+    failed = 0
+    for job in jobs:
+        try:
+            plan = plan_strip(job, batch_options)
+        except Exception as error:
+            failed += 1
+            talk(f"error: {one_line(error)}")
+            continue
+        click.echo(
+            f"{plan['strip']}: {plan['action']} {plan['output']}: {plan['points']} points, format "
+            f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
+            f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
+        )
+    click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
+    return exit_code(failed, len(jobs))

@@ -1,0 +1,91 @@
+"""`wavebatch stages`: every algorithm, with parameters, source and an example."""
+
+from __future__ import annotations
+
+import inspect
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from wavebatch.cli.common import debug_option, print_json, report_errors
+from wavebatch.errors import ConfigError
+from wavebatch.words import nearest
+
+if TYPE_CHECKING:
+    from wavebatch.chain import Parameter, Stage
+
+
+@click.command()
+@click.argument("name", required=False)
+@click.option("--json", "as_json", is_flag=True, help="For programs.")
+@debug_option
+@report_errors()
+def stages(name: str | None, as_json: bool, debug: bool) -> None:
+    """The algorithms that a chain is made of: all of them, or one with its parameters, source and a TOML example."""
+    from wavebatch import stages as _  # noqa: F401  (fills STAGES)
+    from wavebatch.chain import KINDS, STAGES
+
+    if name is not None and name not in STAGES:
+        raise ConfigError(f"no stage {name!r}; {nearest(name, STAGES)}")
+    order = list(KINDS)
+    chosen = [STAGES[name]] if name else sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
+    if as_json:
+        print_json([_describe(stage) for stage in chosen])
+    elif name:
+        click.echo(_explain(STAGES[name]))
+    else:
+        width = max(len(stage.name) for stage in chosen)
+        for stage in chosen:
+            click.echo(f"{stage.name:<{width}}  {stage.summary}")
+
+
+def _types(parameter: Parameter) -> str:
+    if parameter.choices:
+        return " or ".join(repr(choice) for choice in parameter.choices)
+    words = {int: "integer", float: "number", bool: "true or false", str: "string", type(None): "nothing"}
+    return " or ".join(words.get(kind, kind.__name__) for kind in parameter.types)
+
+
+def _describe(stage: Stage) -> dict[str, Any]:
+    from wavebatch.config import format_step
+
+    defaults = {name: parameter.default for name, parameter in stage.parameters.items()}
+    return {
+        "name": stage.name,
+        "kind": stage.kind,
+        "text": _prose(stage),
+        "makes": list(stage.makes),
+        "needs": list(stage.needs),
+        "parameters": {
+            name: {"type": _types(parameter), "default": parameter.default, "meaning": parameter.meaning}
+            for name, parameter in stage.parameters.items()
+        },
+        "example": format_step(stage.name, defaults),
+    }
+
+
+def _prose(stage: Stage) -> str:
+    """The docstring without the parameters."""
+    lines = (inspect.getdoc(stage.function) or "").splitlines()
+    heads = tuple(f"{name}:" for name in stage.parameters)
+    end = next((i for i, line in enumerate(lines) if heads and line.startswith(heads)), len(lines))
+    return "\n".join(lines[:end]).strip()
+
+
+def _explain(stage: Stage) -> str:
+    from wavebatch.blocks import COLUMNS
+
+    told = _describe(stage)
+    parts = [f"{stage.name}\n\n{told['text']}"]
+    if stage.makes:
+        known = [COLUMNS[name] for name in stage.makes if name in COLUMNS]
+        parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
+    if stage.needs:
+        parts.append(f"Needs: {', '.join(stage.needs)}")
+    if told["parameters"]:
+        lines = [
+            f"  {name} ({p['type']}, default {p['default']}): {p['meaning']}" for name, p in told["parameters"].items()
+        ]
+        parts.append("Parameters:\n" + "\n".join(lines))
+    parts.append("In a chain file:\n\n" + told["example"].rstrip())
+    return "\n\n".join(parts)
