@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from wavebatch.io.header import (
     find_evlrs,
 )
 from wavebatch.io.las import CheckedHeader
-from wavebatch.io.points import read_exactly
+from wavebatch.io.rawbytes import read_exactly
 from wavebatch.units import PS_PER_NS
 
 MAX_SAMPLES = 1 << 16
@@ -173,6 +172,14 @@ def _locate_external(checked: CheckedHeader, beside: Path, headerless: bool) -> 
     return PacketPlace(beside, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
 
 
+def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
+    """The place of packets in a .wdp without header: byte offsets below 60 show that they count from its first byte."""
+    offsets = points["wavepacket_offset"][(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
+    if len(offsets) and int(offsets.min()) < EVLR_HEADER_SIZE:
+        return replace(place, base=0)
+    return place
+
+
 class PacketFile:
     """Reads samples of many packets at once."""
 
@@ -254,8 +261,3 @@ def _pick(buffer: np.ndarray, place: np.ndarray, width: int) -> np.ndarray:
 def block_rows(size: int, n_samples: int, bits: int) -> int:
     """Waveforms per block: `size`, fewer where so many would not fit memory."""
     return max(1, min(size, BLOCK_BYTES // (n_samples * (bits // 8))))
-
-
-def has_file(place: PacketPlace) -> bool:
-    """Whether the file of the packets is there."""
-    return place.file is not None and os.path.isfile(place.file)

@@ -1,29 +1,17 @@
-"""One pass over the points of a strip: what its packets are, where units begin, which packets cross their borders."""
+"""What one pass over the points of a strip found, and the lines that say what is wrong with it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.errors import InputError
-from wavebatch.io.direction import DirectionTally, decide
 from wavebatch.io.facts import StripFacts
-from wavebatch.io.judge import REASON_TEXTS, Judge, Judged, Reason
-from wavebatch.io.points import PointSource
-from wavebatch.io.sharing import WINDOW, Groups, NearSharing, find_far, group_keys
+from wavebatch.io.judge import REASON_TEXTS, Reason
 from wavebatch.io.spool import Spool
-
-UNIT_POINTS = 50_000
-"""Points per unit of work, one LAZ chunk: fixed by the file, so that results depend on nothing else."""
-UNIT_BYTES = 1 << 26
-"""Points with very long records make smaller units."""
-LONGEST_RUN = 64
-"""Runs of points with one gps time that are shorter than this are not cut by a border."""
-_PAIRS = 4096
-_FAR_SAMPLES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +50,11 @@ class StripScan:
     """What keeps the strip from being processed; empty for scans that `StripReader.scan` returns."""
 
     @property
+    def is_hopeless(self) -> bool:
+        """Whether points have packets, but none that can be used."""
+        return self.broken > 0 and not self.with_waveform
+
+    @property
     def spool(self) -> Path | None:
         """Temporary file of shared packets, where there are many."""
         return self.context.path
@@ -77,257 +70,11 @@ class StripScan:
         self.close()
 
 
-def count_unit_points(facts: StripFacts) -> int:
-    """Points per unit before borders are moved."""
-    return max(1, min(UNIT_POINTS, UNIT_BYTES // facts.point_length))
-
-
-def scan_strip(facts: StripFacts, source: PointSource) -> StripScan:
-    """Scans all points of the strip; never looks at samples.
-
-    Raises InputError where points cannot be read; what keeps the strip from being processed is in `problems`.
-    """
-    return _Scanner(facts, source).run()
-
-
-@dataclass(slots=True)
-class _Tally:
-    reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(Reason), np.int64))
-    first: np.ndarray = field(default_factory=lambda: np.full(len(Reason), -1, np.int64))
-    by_descriptor: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
-    short: int = 0
-
-    def add(self, points: np.ndarray, start: int, judged: Judged) -> None:
-        self.reasons += np.bincount(judged.reason, minlength=len(Reason))
-        for reason in np.flatnonzero((self.reasons > 0) & (self.first < 0)).tolist():
-            self.first[reason] = start + int(np.argmax(judged.reason == reason))
-        has = judged.reason != Reason.NO_WAVEFORM
-        self.by_descriptor += np.bincount(points["wavepacket_index"][has], minlength=256)
-        self.short += int(judged.short.sum())
-
-    def describe(self) -> dict[Reason, tuple[int, int]]:
-        return {r: (int(self.reasons[r]), int(self.first[r])) for r in Reason if r in REASON_TEXTS and self.reasons[r]}
-
-
-class _Scanner:
-    def __init__(self, facts: StripFacts, source: PointSource) -> None:
-        self._facts, self._source = facts, source
-        self._judge = Judge(facts)
-        self._tally, self._votes = _Tally(), DirectionTally()
-        self._borders = [0]
-        units = -(-facts.point_count // count_unit_points(facts))
-        self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
-        low = facts.packet_start - facts.packet_base
-        self._near = NearSharing(low, max(low, facts.packet_end - facts.packet_base), self._context)
-        self._window: list[_Part] = []
-
-    def run(self) -> StripScan:
-        try:
-            for start, points in self._cut_units():
-                self._add_unit(start, points)
-            suspects = self._near.suspects()
-            packets, reach = self._near.count_packets(suspects), self._near.reach
-            overfull = [np.empty(0, np.uint64), *self._near.overfull]
-            if suspects.any():
-                more, far_reach, far_overfull = self._go_far(suspects)
-                packets, reach = packets + more, max(reach, far_reach)
-                overfull.append(far_overfull)
-            self._context.seal()
-            overfull = np.unique(np.concatenate(overfull))
-            if suspects.any():
-                self._vote_far()
-            if len(overfull):
-                self._count_overfull(overfull)
-        except BaseException:
-            self._context.close()
-            raise
-        return self._finish(packets - len(overfull), reach, overfull)
-
-    def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Every unit's first index and points; borders are noted on the way."""
-        step, count = count_unit_points(self._facts), self._facts.point_count
-        held = np.empty(0, self._facts.dtype)
-        for begin in range(0, count, step):
-            part = self._source.read(begin, min(begin + step, count))
-            if begin:
-                cut = _find_cut(held["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN])
-                start = self._borders[-1]
-                self._borders.append(begin + cut)
-                yield start, np.concatenate([held, part[:cut]]) if cut else held
-                held = part[cut:]
-            else:
-                held = part
-        if count:
-            self._borders.append(count)
-            yield self._borders[-2], held
-
-    def _add_unit(self, start: int, points: np.ndarray) -> None:
-        judged = self._judge.judge(points)
-        self._tally.add(points, start, judged)
-        rows = np.flatnonzero(judged.usable)
-        part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points[rows])
-        self._window = [old for old in (old.tail(start - WINDOW) for old in self._window) if len(old.keys)]
-        parts = _Parts([*self._window, part])
-        own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
-        groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
-        if len(rows):
-            self._votes.add_points(part.points)
-            self._vote(groups, parts, own)
-        self._window.append(part)
-
-    def _entries(self, parts: _Parts, rows: np.ndarray) -> np.ndarray:
-        entries = np.empty(len(rows), self._context.dtype)
-        entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
-        return entries
-
-    def _vote(self, groups: Groups, parts: _Parts, own: np.ndarray) -> None:
-        follows = np.ones(len(groups.order), bool)
-        follows[groups.starts] = False
-        place = np.flatnonzero(follows)
-        place = place[own[groups.order[place]]]
-        place = place[:: max(1, len(place) // _PAIRS)]
-        first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
-        self._votes.add_pairs(np.stack([locate(first, self._facts), locate(second, self._facts)]), first, second)
-
-    def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
-        """Finds sharing among the packets of suspect parts wherever their points are, and adds it to the context."""
-        borders = np.array(self._borders)
-        count = int(self._tally.reasons[Reason.USABLE])
-        far = find_far(self._suspect_keys(suspects), count, borders)
-        try:
-            for unit in range(len(borders) - 1):
-                wants = far.wants.read(unit)
-                if len(wants):
-                    self._give(int(borders[unit]), int(borders[unit + 1]), wants)
-        finally:
-            far.wants.close()
-        return far.packets, far.reach, far.overfull
-
-    def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            judged = self._judge.judge(self._source.read(start, stop))
-            rows = np.flatnonzero(judged.usable)
-            rows = rows[self._near.is_suspect(judged.keys[rows], suspects)]
-            yield judged.keys[rows], start + rows
-
-    def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
-        points = self._source.read(start, stop)
-        entries = np.empty(len(wants), self._context.dtype)
-        entries["index"], entries["record"] = wants["index"], points[wants["index"] - start]
-        self._context.append(wants["unit"], entries)
-
-    def _vote_far(self) -> None:
-        """In a shuffled strip the returns of a packet meet only through the context: some units are asked again."""
-        units = len(self._borders) - 1
-        for unit in range(0, units, max(1, units // _FAR_SAMPLES)):
-            start, stop = self._borders[unit], self._borders[unit + 1]
-            context = unique_entries(self._context.read(unit))
-            points = np.concatenate([self._source.read(start, stop), context["record"]])
-            index = np.concatenate([np.arange(start, stop), context["index"]])
-            judged = self._judge.judge(points)
-            rows = np.flatnonzero(judged.usable)
-            rows = rows[np.argsort(index[rows], kind="stable")]
-            parts = _Parts([_Part(judged.keys[rows], index[rows], unit, points[rows])])
-            self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
-
-    def _count_overfull(self, overfull: np.ndarray) -> None:
-        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            reason = self._judge.judge(self._source.read(start, stop), overfull).reason
-            many = int((reason == Reason.OVERFULL).sum())
-            if many and self._tally.first[Reason.OVERFULL] < 0:
-                self._tally.first[Reason.OVERFULL] = start + int(np.argmax(reason == Reason.OVERFULL))
-            self._tally.reasons[Reason.OVERFULL] += many
-            self._tally.reasons[Reason.USABLE] -= many
-
-    def _finish(self, packets: int, reach: int, overfull: np.ndarray) -> StripScan:
-        tally, facts = self._tally, self._facts
-        usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
-        decision = decide(self._votes, facts.direction_option)
-        reasons = tally.describe()
-        problems = list(decision.problems)
-        if not usable and missing < facts.point_count:
-            problems.insert(0, _describe_hopeless(facts, reasons))
-        return StripScan(
-            points=facts.point_count,
-            with_waveform=usable,
-            without_waveform=missing,
-            broken=facts.point_count - usable - missing,
-            packets=packets,
-            short=tally.short,
-            reasons=reasons,
-            by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
-            reach=reach,
-            direction=decision.direction,
-            direction_evidence=decision.evidence,
-            vector_form=decision.form,
-            vector_ratio=decision.ratio,
-            borders=np.array(self._borders),
-            overfull=overfull,
-            context=self._context,
-            warnings=(*_describe_oddities(facts, tally, reasons), *decision.warnings),
-            problems=tuple(problems),
-        )
-
-
-class _Part:
-    """Usable points of one unit, as far as they matter to the next ones."""
-
-    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> None:
-        self.keys, self.index, self.unit, self.points = keys, index, unit, points
-
-    def tail(self, least: int) -> _Part:
-        """The part from file index `least` on; copied where that frees memory."""
-        at = int(np.searchsorted(self.index, least))
-        if not at:
-            return self
-        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, self.points[at:].copy())
-
-
-class _Parts:
-    """Several parts one after the other."""
-
-    def __init__(self, parts: list[_Part]) -> None:
-        self.keys = np.concatenate([part.keys for part in parts])
-        self.index = np.concatenate([part.index for part in parts])
-        self.unit = np.concatenate([np.full(len(part.keys), part.unit) for part in parts])
-        self._starts = np.cumsum([0, *(len(part.keys) for part in parts)])
-        self._parts = parts
-
-    def take(self, rows: np.ndarray) -> np.ndarray:
-        """Records at `rows` of all parts."""
-        records = np.empty(len(rows), self._parts[0].points.dtype)
-        for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
-            here = np.flatnonzero((rows >= start) & (rows < stop))
-            records[here] = part.points[rows[here] - start]
-        return records
-
-
-def _find_cut(before: np.ndarray, after: np.ndarray) -> int:
-    """How many points behind a border belong to the unit before it, because they are of the pulse that it would cut."""
-    time = before[-1]
-    head = np.flatnonzero(after != time)
-    tail = np.flatnonzero(before[::-1] != time)
-    behind = int(head[0]) if len(head) else len(after)
-    ahead = int(tail[0]) if len(tail) else len(before)
-    return behind if behind + ahead < LONGEST_RUN else 0
-
-
-def locate(points: np.ndarray, facts: StripFacts) -> np.ndarray:
-    """Coordinates of records (n,), f8 (n, 3) [m]."""
-    axes = zip("XYZ", facts.scales, facts.offsets, strict=True)
-    return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
-
-
-def unique_entries(entries: np.ndarray) -> np.ndarray:
-    """Context entries by file index, each once: what crosses a border nearby may be found twice."""
-    _, first = np.unique(entries["index"], return_index=True)
-    return entries[first]
-
-
-def _describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
+def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
+    """The line on a strip none of whose packets can be used."""
     if facts.packet_file is None:
         beside = facts.path.with_suffix(".wdp").name
-        return f"its {facts.point_count} points refer to packets, which are neither in it nor in {beside} beside it"
+        return f"points refer to packets, which are neither in the file nor beside it: put {beside} beside the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
     return (
@@ -336,15 +83,12 @@ def _describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]
     )
 
 
-def _describe_oddities(facts: StripFacts, tally: _Tally, reasons: dict[Reason, tuple[int, int]]) -> Iterator[str]:
+def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Iterator[str]:
+    """Lines on what is odd about a strip that can be processed nevertheless."""
     for reason, (count, first) in reasons.items():
         yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are passed through"
-    if tally.short:
-        yield f"{tally.short} points have packets shorter than their descriptor says; what is there is used"
-    for index in np.flatnonzero(tally.by_descriptor).tolist():
-        digitizer = facts.digitizers.get(index)
-        if digitizer and digitizer.gain == 0:
-            yield f"descriptor {index} has gain 0; counts are used as they are"
+    if short:
+        yield f"{short} points have packets shorter than their descriptor says; what is there is used"
 
 
 def raise_problem(facts: StripFacts, scan: StripScan) -> None:

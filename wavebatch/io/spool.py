@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.errors import InputError
-from wavebatch.io.points import read_exactly
+from wavebatch.io.rawbytes import read_exactly
 
 MEMORY = 1 << 25
 """Bytes of entries that are held before they go to disk."""
+KEPT = 1 << 20
+"""Bytes of entries that stay in memory after all: a sealed spool travels to other processes."""
 
 
 class Spool:
@@ -51,7 +53,7 @@ class Spool:
 
     def seal(self) -> Spool:
         """Ends the writing."""
-        if self._segments:
+        if self._segments or self._held > KEPT:
             self._flush()
         else:
             self._memory = self._take_pending()

@@ -13,15 +13,21 @@ from wavebatch.io.direction import check_option, read_toward
 from wavebatch.io.facts import StripFacts, collect_facts
 from wavebatch.io.judge import Judge
 from wavebatch.io.las import read_checked_header
-from wavebatch.io.packets import PacketFile, block_rows, locate_packets, read_descriptors
+from wavebatch.io.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
 from wavebatch.io.points import open_points
-from wavebatch.io.scan import StripScan, count_unit_points, locate, raise_problem, scan_strip, unique_entries
+from wavebatch.io.scan import StripScan, raise_problem
+from wavebatch.io.scanner import locate, scan_strip, unique_entries
 from wavebatch.io.sharing import expand, group_keys
 from wavebatch.units import PS_PER_NS
 
-__all__ = ["PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
+__all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
 
+UNIT_POINTS = 50_000
+"""Points per unit of work, one LAZ chunk: fixed by the file, so that results depend on nothing else."""
+UNIT_BYTES = 1 << 26
+"""Points with very long records make smaller units."""
 _SAMPLED_UNITS = 16
+_FIRST_POINTS = 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,10 +90,13 @@ class StripReader:
         checked = read_checked_header(Path(path))
         found = read_descriptors(checked.header)
         place = locate_packets(checked, found.compression, headerless)
-        self.facts = collect_facts(checked, found, place, direction)
-        self._judge = Judge(self.facts)
         self._points = open_points(checked)
         try:
+            if place.base < 0:
+                some = self._points.read(0, min(checked.header.point_count, _FIRST_POINTS))
+                place = settle_headerless(place, some)
+            self.facts = collect_facts(checked, found, place, direction)
+            self._judge = Judge(self.facts)
             self._packets = PacketFile(place)
         except BaseException:
             self._points.close()
@@ -109,14 +118,21 @@ class StripReader:
 
         tolerant: leave what keeps the strip from being processed in `problems` instead of raising InputError.
         """
-        scan = scan_strip(self.facts, self._points)
+        scan = scan_strip(self.facts, self._points, self._unit_points())
         if not tolerant:
             raise_problem(self.facts, scan)
         return scan
 
     def unit_count(self) -> int:
         """Units of the strip."""
-        return -(-self.facts.point_count // count_unit_points(self.facts))
+        return -(-self.facts.point_count // self._unit_points())
+
+    def _unit_points(self) -> int:
+        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.point_length))
+
+    def read_points(self, start: int, stop: int) -> np.ndarray:
+        """Records [start, stop) of the file."""
+        return self._points.read(start, stop)
 
     def read_unit(self, number: int, scan: StripScan) -> Unit:
         """Unit `number` (0 to unit_count() - 1): its points and their packets; samples are read by `read_blocks`."""

@@ -1,0 +1,202 @@
+"""What a strip holds, and what is wrong with a strip or a chain file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.config import load_chain
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.io.audit import audit_header
+from wavebatch.io.strip import StripFacts, StripReader, StripScan
+
+_SAMPLED = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What `check` found in one file; `problems` and `notes` are lines without the file's name."""
+
+    file: str
+    problems: tuple[str, ...]
+    """What keeps the file from being processed, or part of it from being processed rightly."""
+    notes: tuple[str, ...]
+    """What is not as it should be, but does no harm here."""
+    summary: str = ""
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether there are no problems."""
+        return not self.problems
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        lists = {"problems": list(self.problems), "notes": list(self.notes)}
+        return {"file": self.file, "clean": self.is_clean, "summary": self.summary, **lists}
+
+
+@dataclass(slots=True)
+class _Samples:
+    """Extremes of some waveforms of a strip."""
+
+    waveforms: int = 0
+    least: int | None = None
+    largest: int | None = None
+    at_limit: int = 0
+    lengths: set[int] = field(default_factory=set)
+
+
+def describe_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
+    """Everything `info` shows of a strip, as plain values for JSON; floats that are not finite are None.
+
+    Raises InputError where the strip cannot be read; one that can be read but not processed says so in `problems`.
+    """
+    with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan(tolerant=True) as scan:
+        facts = reader.facts
+        samples = _sample(reader, scan)
+        return {
+            **_describe_file(facts),
+            **_describe_points(scan),
+            "packets": _describe_packets(facts, scan),
+            "samples": _describe_samples(samples),
+            "vectors": {
+                "direction": scan.direction,
+                "evidence": scan.direction_evidence,
+                "length_over_half_c": scan.vector_ratio if math.isfinite(scan.vector_ratio) else None,
+                "form": scan.vector_form,
+            },
+            "warnings": [*facts.warnings, *scan.warnings],
+            "problems": list(scan.problems),
+        }
+
+
+def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> Findings:
+    """What is wrong with a strip, or with a chain file (`.toml`). Errors become findings, they are not raised."""
+    path = Path(path)
+    if path.suffix.lower() == ".toml":
+        return _check_chain(path)
+    try:
+        with StripReader(path, direction=direction, headerless=headerless) as reader:
+            scan = reader.scan(tolerant=True)
+            with scan:
+                return _check_strip(path, reader, scan)
+    except InputError as error:
+        return Findings(str(path), (_without_name(path, error),), ())
+
+
+def _check_chain(path: Path) -> Findings:
+    try:
+        chain = load_chain(path)
+    except (ConfigError, InputError) as error:
+        return Findings(str(path), (_without_name(path, error),), ())
+    return Findings(str(path), (), (), f"{len(chain.steps)} stages")
+
+
+def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
+    if scan.is_hopeless:
+        return Findings(str(path), scan.problems[:1], ())
+    facts = reader.facts
+    problems = [*scan.problems, *scan.warnings, *facts.warnings]
+    try:
+        _sample(reader, scan)
+    except InputError as error:
+        problems.append(_without_name(path, error))
+    notes = [*_note_descriptors(facts, scan), *audit_header(reader, scan)]
+    return Findings(str(path), tuple(problems), tuple(notes), _summarise(scan))
+
+
+def _summarise(scan: StripScan) -> str:
+    return f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
+
+
+def _note_descriptors(facts: StripFacts, scan: StripScan) -> Iterator[str]:
+    for index in scan.by_descriptor:
+        digitizer = facts.digitizers.get(index)
+        if digitizer and digitizer.gain == 0:
+            yield f"descriptor {index} has gain 0; counts are used as they are"
+    if not scan.with_waveform + scan.broken:
+        yield "no point has a waveform; every point would be passed through"
+
+
+def _without_name(path: Path, error: Exception) -> str:
+    """The error's line without the file's name in front, which the caller shows."""
+    return " ".join(str(error).split()).removeprefix(f"{path}: ")
+
+
+def _sample(reader: StripReader, scan: StripScan) -> _Samples:
+    """Extremes of waveforms spread over the strip; nothing where no packet can be used."""
+    found = _Samples()
+    for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
+        least, largest = int(block.samples.min()), int(block.samples.max())
+        found.least = least if found.least is None else min(found.least, least)
+        found.largest = largest if found.largest is None else max(found.largest, largest)
+        found.waveforms += len(block)
+        found.lengths.add(block.samples.shape[1])
+        found.at_limit += int(np.count_nonzero((block.samples == block.digitizer.max_count).any(axis=1)))
+    return found
+
+
+def _describe_samples(samples: _Samples) -> dict[str, Any]:
+    return {
+        "waveforms_read": samples.waveforms,
+        "least": samples.least,
+        "largest": samples.largest,
+        "waveforms_at_limit": samples.at_limit,
+        "lengths": sorted(samples.lengths),
+    }
+
+
+def _describe_file(facts: StripFacts) -> dict[str, Any]:
+    return {
+        "file": str(facts.path),
+        "bytes": facts.size,
+        "las_version": facts.version,
+        "point_format": facts.point_format,
+        "compressed": facts.compressed,
+        "crs": facts.crs,
+        "scales": list(facts.scales),
+        "offsets": list(facts.offsets),
+        "extra_dimensions": list(facts.extra_dimensions),
+    }
+
+
+def _describe_points(scan: StripScan) -> dict[str, Any]:
+    return {
+        "points": scan.points,
+        "points_with_waveform": scan.with_waveform,
+        "points_without_waveform": scan.without_waveform,
+        "points_broken": scan.broken,
+        "share_with_waveform": scan.with_waveform / scan.points if scan.points else None,
+    }
+
+
+def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
+    used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
+    return {
+        "count": scan.packets,
+        "where": None if facts.packet_file is None else "internal" if facts.internal else "external",
+        "file": None if facts.packet_file is None else str(facts.packet_file),
+        "bytes": facts.packet_end - facts.packet_start,
+        "shorter_than_descriptor": scan.short,
+        "farthest_shared": scan.reach,
+        "descriptors": [_describe_descriptor(facts, index, count) for index, count in used.items()],
+        "descriptors_unused": len(facts.digitizers) - len(used),
+    }
+
+
+def _describe_descriptor(facts: StripFacts, index: int, points: int) -> dict[str, Any]:
+    digitizer = facts.digitizers[index]
+    return {
+        "index": index,
+        "points": points,
+        "bits": digitizer.bits,
+        "samples": digitizer.n_samples,
+        "spacing_ns": digitizer.spacing,
+        "gain": digitizer.gain if math.isfinite(digitizer.gain) else None,
+        "offset": digitizer.offset if math.isfinite(digitizer.offset) else None,
+    }
