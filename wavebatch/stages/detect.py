@@ -48,7 +48,21 @@ def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshol
     waveform, sample = find_peaks(twice, np.float32(threshold * TWICE_SMOOTHED_GAIN) * noise.std)
     ref = system.sigma_ref / block.spacing
     amplitude, time, width = estimate_starts(smoothed, waveform, sample, ref)
+    gap = _nearest_gap(waveform, sample)
+    crowded = np.flatnonzero(gap < 4.0 * ref)
+    time[crowded], amplitude[crowded] = refine_peaks(smoothed, waveform[crowded], sample[crowded])
+    width = np.minimum(width, 0.5 * gap)
     return _table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
+
+
+def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
+    """Samples to the nearest other maximum of the waveform (m,), infinite without one.
+
+    Echoes closer than two widths have one maximum (ALGORITHMS 2.2), so half of the gap bounds the width.
+    """
+    gap = np.full(len(sample) + 1, np.inf)
+    gap[1:-1] = np.where(np.diff(waveform) == 0, np.diff(sample), np.inf)
+    return np.minimum(gap[:-1], gap[1:])
 
 
 @stage("detect")
