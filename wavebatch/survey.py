@@ -1,17 +1,22 @@
-"""What sensor and scene are: noise, baseline, width of the system pulse, saturation, from a sample of the strip."""
+"""What sensor and scene are: noise, system pulse, saturation, and which parts of a chain this strip needs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.noise import PooledNoise, estimate_noise
-from wavebatch.kernels.signal import transpose_samples
-from wavebatch.stages.decompose import closed_form
-from wavebatch.stages.detect import maximum
-from wavebatch.units import QUANTISATION_STD
+from wavebatch.kernels.render import render_echoes
+from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples
+from wavebatch.stages.decompose import adaptive, closed_form
+from wavebatch.stages.detect import matched_filter, maximum
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.shapes import model_parameters, pulse_measures, pulse_shape, shape_limits
+from wavebatch.units import FWHM_PER_SIGMA, MAD_TO_STD, QUANTISATION_STD
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -19,47 +24,118 @@ SAMPLE = 8192
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
 
+ENOUGH_TO_LEARN = 50
+"""Isolated echoes from which a pulse can be learned (R2)."""
+
+MOST_STACKED = 3000
+"""Isolated echoes that a stack takes; more do not make it better."""
+
 FIRST_WIDTH = 2.0
 """First guess of the system pulse's width [samples]."""
 
+BEFORE, AFTER = 9.0, 25.0
+"""Samples before and behind an echo that its stack covers."""
 
-def measure(blocks: Iterable[WaveformBlock]) -> SystemPulse:
-    """The strip's system pulse from blocks sampled over it; the largest group of one spacing and length decides."""
+REACHED = 0.3
+"""Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
+
+ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
+"""Thresholds tried for one more echo, in chi2."""
+
+SPLIT_SHARE = 0.015
+"""Share of the strip's narrowest isolated echoes that may be split."""
+
+NEAR = 3.0
+"""Widths of the system pulse around an echo within which a second one is a split of it."""
+
+MIN_SNR = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """Whether the strip needs a part of the chain, and why."""
+
+    part: str
+    needed: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What a sample of a strip says of sensor and scene."""
+
+    system: SystemPulse
+    waveforms: int
+    figures: Mapping[str, float]
+    """Shares of the scene, isolated echoes, amplitudes, and the misfit of every pulse model tried."""
+    decisions: tuple[Decision, ...]
+
+
+def measure(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> SystemPulse:
+    """The strip's system pulse from blocks sampled over it (see `survey_blocks`)."""
+    return survey_blocks(blocks, learn=learn).system
+
+
+def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
+    """Survey of a strip from blocks sampled over it; the largest group of one spacing and length decides.
+
+    learn: also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
+    """
     groups: dict[tuple[float, int], list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
             groups.setdefault((block.spacing, block.samples.shape[1]), []).append(block)
     if not groups:
-        return SystemPulse(sigma_ref=FIRST_WIDTH)
+        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
     chosen = max(groups.values(), key=lambda group: (sum(block.samples.size for block in group), group[0].spacing))
     samples = np.concatenate([block.samples for block in chosen])
     block = WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
-    return measure_block(block)
+    return survey_block(block, learn=learn)
 
 
-def measure_block(block: WaveformBlock) -> SystemPulse:
-    """The system pulse from one block of waveforms: noise, then widths of isolated echoes, twice."""
+def measure_block(block: WaveformBlock, *, learn: bool = True) -> SystemPulse:
+    """The system pulse from one block of waveforms (see `survey_block`)."""
+    return survey_block(block, learn=learn).system
+
+
+def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
+    """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
+    system = _measure_gaussian(block)
+    figures: dict[str, float] = {}
+    if learn:
+        main = _isolated(block, system)
+        figures["isolated_echoes"] = len(main)
+        if len(main) >= ENOUGH_TO_LEARN:
+            system = _learn(block, system, main, figures)
+        system = _measure_residuals(block, system, _decompose(block, system))
+        system = _choose_acceptance(block, system, main)
+    echoes = _decompose(block, system)
+    figures.update(_describe(block, system, echoes))
+    return Survey(system, len(block), figures, _decide(system, block.spacing, figures))
+
+
+def _measure_gaussian(block: WaveformBlock) -> SystemPulse:
+    """Noise and the width of isolated echoes, each from the other, three times."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     width = FIRST_WIDTH
-    system = SystemPulse(sigma_ref=width * block.spacing)
+    signal = transpose_samples(block.samples)
     for _ in range(3):
-        pooled = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)))
-        system = _system(block, pooled, width, saturation)
+        noise = estimate_noise(signal, int(np.ceil(3 * width)))
+        system = _gaussian_system(block.spacing, noise, width, saturation)
         found = _isolated_widths(block, system)
         if len(found) < FEW:
             break
         width = float(np.clip(_mode_of_narrow(found), 0.5, 50.0))
-    return _system(block, pooled, width, saturation)
+    return replace(system, sigma_ref=width * block.spacing)
 
 
-def _system(block: WaveformBlock, pooled: PooledNoise, width: float, saturation: float | None) -> SystemPulse:
-    std = max(pooled.std, pooled.smoothed_std, QUANTISATION_STD)
+def _gaussian_system(spacing: float, noise: PooledNoise, width: float, saturation: float | None) -> SystemPulse:
     return SystemPulse(
-        sigma_ref=width * block.spacing,
-        baseline=pooled.level,
-        baseline_spread=pooled.spread,
-        noise_std=std,
-        noise_by_kind={"quiet": pooled.std, "quiet smoothed": pooled.smoothed_std},
+        sigma_ref=width * spacing,
+        baseline=noise.level,
+        baseline_spread=noise.spread,
+        noise_std=max(noise.std, noise.smoothed_std, QUANTISATION_STD),
+        noise_by_kind={"quiet": noise.std, "quiet_smoothed": noise.smoothed_std},
         saturation=saturation,
     )
 
@@ -68,11 +144,25 @@ def _isolated_widths(block: WaveformBlock, system: SystemPulse) -> np.ndarray:
     """Widths [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped."""
     n = len(block)
     noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
-    echoes: EchoTable = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
-    alone = echoes.count(n)[echoes.waveform] == 1
+    echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
+    strongest, second = _strongest(echoes, n)
+    echoes = echoes.take(strongest)
     bad = EchoFlag.NEAR_EDGE | EchoFlag.SATURATED | EchoFlag.AT_BOUND
-    good = alone & (echoes.amplitude > 20 * system.noise_std) & ((echoes.flags & int(bad)) == 0)
+    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good &= (echoes.flags & int(bad)) == 0
     return echoes.sigma[good] / block.spacing
+
+
+def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the strongest echo of each waveform that has any, and the amplitude of the second strongest there."""
+    order = np.lexsort((-echoes.amplitude, echoes.waveform))
+    waveform = echoes.waveform[order]
+    first = np.r_[True, waveform[1:] != waveform[:-1]] if len(order) else np.empty(0, bool)
+    second = np.zeros(n)
+    runner = np.flatnonzero(~first)
+    runner = runner[first[runner - 1]]
+    second[waveform[runner]] = echoes.amplitude[order[runner]]
+    return order[first], second[waveform[first]]
 
 
 def _mode_of_narrow(widths: np.ndarray) -> float:
@@ -99,3 +189,206 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
         return float(top)
     reached = at_top.any(axis=1).sum()
     return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
+
+
+def _isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, of the most common width (R2).
+
+    The half of them nearest to the mode of the widths: flat targets, whose echoes slopes do not widen.
+    """
+    n = len(block)
+    noise = pooled_noise(block, system)
+    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
+    strongest, second = _strongest(echoes, n)
+    echoes = echoes.take(strongest)
+    top = system.saturation or float(block.samples.max())
+    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
+    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    echoes = echoes.take(np.flatnonzero(good))
+    distance = np.abs(echoes.sigma - _mode_of_narrow(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
+    order = np.argsort(distance, kind="stable")[: max(len(echoes) // 2, ENOUGH_TO_LEARN)]
+    return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
+
+
+def _learn(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
+    """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
+    noise = pooled_noise(block, system)
+    width = system.sigma_ref / block.spacing
+    signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
+    before, after = BEFORE * max(width / 2, 1), AFTER * max(width / 2, 1)
+    stack = stack_pulse(signal, main.amplitude.astype(np.float64), main.time / block.spacing, before, after)
+    strongest = float(np.quantile(main.amplitude, 0.99))
+    goal = max(REACHED * system.noise_std / strongest, 1.5 * float(np.sqrt(np.mean(stack.error**2))))
+    sums = fit_gaussians(stack, width)
+    skewed = fit_skewed(stack, width)
+    figures["misfit_goal"] = goal
+    figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
+    for fit in sums:
+        figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
+    best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    return _with_pulse(system, best, stack, block.spacing)
+
+
+def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
+    """The first fit that reaches the goal, or the best of all."""
+    return next((fit for fit in fits if fit.rms <= goal), min(fits, key=lambda fit: fit.rms))
+
+
+def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
+    """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
+
+    A Gaussian keeps the width that the echoes themselves had: aligning them for the stack widens it a little.
+    """
+    width = system.sigma_ref / spacing
+    far = np.abs(stack.lag - fit.datum) > 4 * width
+    system = replace(system, ringing=float(np.abs(stack.value[far]).max(initial=0.0)), kappa=fit.kappa)
+    if len(fit.components) > 1:
+        components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
+        system = replace(system, components=components)
+        limits = shape_limits(system, spacing)
+        table = pulse_measures(pulse_shape(system, spacing), limits)
+        half_width = float(np.interp(limits.ref, table.width, table.half_width))
+        return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)
+    if fit.kappa:
+        return replace(system, sigma_ref=float(fit.components[0, 2]) * spacing)
+    return system
+
+
+def _decompose(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    noise = pooled_noise(block, system)
+    return adaptive(block, noise, system, matched_filter(block, noise, system))
+
+
+def _measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with noise from the residuals around isolated echoes (R3) and its growth with the signal (H12)."""
+    n, s = block.samples.shape
+    noise = pooled_noise(block, system)
+    alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
+    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
+    if len(alone) < ENOUGH_TO_LEARN:
+        return system
+    spacing = block.spacing
+    time, width = alone.time / spacing, alone.sigma / spacing
+    rows = np.arange(len(alone))
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    main = model_parameters(shape, limits, np.stack([alone.amplitude, time, width], axis=1).astype(np.float64))
+    model = render_echoes(shape, len(alone), s, rows, main[:, 1], main[:, 0], main[:, 2])
+    residual = block.samples[alone.waveform] - noise.baseline[alone.waveform][:, None] - model
+    lag = (np.arange(s) - time[:, None]) / width[:, None]
+    kinds = dict(system.noise_by_kind)
+    smoothed = 0.25 * (residual[:, :-2] + 2 * residual[:, 1:-1] + residual[:, 2:]) / SMOOTH_GAIN
+    for kind, where in (("core", np.abs(lag) < 2.5), ("tail", (lag > 3) & (lag < 12))):
+        kinds[kind] = _robust_std(residual[where])
+        kinds[f"{kind}_smoothed"] = _robust_std(smoothed[where[:, 1:-1]])
+    learned = bool(system.components) or system.kappa != 0
+    used = [value for kind, value in kinds.items() if not (learned and kind == "quiet_smoothed")]
+    std = max([QUANTISATION_STD, *used])
+    gain = _noise_gain(residual, model, lag, std)
+    return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+
+
+def _robust_std(values: np.ndarray) -> float:
+    """Standard deviation from the central two thirds of the values, which rounding to whole counts does not spoil."""
+    if len(values) < 100:
+        return 0.0
+    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    kept = values[np.abs(values - middle) < 4 * max(0.5 * (high - low), QUANTISATION_STD)]
+    return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
+
+
+def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, std: float) -> float:
+    """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
+    core = np.abs(lag) < 1.5
+    signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
+    if len(signal) < 2000:
+        return 0.0
+    edges = np.quantile(signal, np.linspace(0, 1, 11))
+    place = np.clip(np.searchsorted(edges, signal) - 1, 0, 9)
+    level = np.array([np.median(signal[place == i]) for i in range(10) if (place == i).any()])
+    variance = np.array([np.median(squared[place == i]) for i in range(10) if (place == i).any()]) * MAD_TO_STD**2
+    slope, constant = np.polyfit(level, variance, 1)
+    scatter = np.std(variance - (constant + slope * level)) / max(np.std(level) * np.sqrt(len(level)), 1e-9)
+    matters = slope * edges[-2] > 0.3 * std**2 and slope > 4 * scatter
+    return float(slope) if matters else 0.0
+
+
+def _choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTable) -> SystemPulse:
+    """The system with the least threshold at which its clearest single echoes stay whole (R3).
+
+    main: the echoes that the pulse was learned from. The threshold is raised until at most 1.5 % of them are split,
+    or until raising it further hardly changes their number: what is left then are two targets.
+    """
+    if len(main) < ENOUGH_TO_LEARN:
+        return system
+    part = block.rows(main.waveform)
+    noise = pooled_noise(part, system)
+    candidates = matched_filter(part, noise, system)
+    shares = []
+    for acceptance in ACCEPTANCES:
+        found = adaptive(part, noise, replace(system, acceptance=acceptance), candidates)
+        near = np.abs(found.time - main.time[found.waveform]) < NEAR * system.sigma_ref
+        shares.append(float((np.bincount(found.waveform[near], minlength=len(part)) > 1).mean()))
+        if shares[-1] <= SPLIT_SHARE:
+            return replace(system, acceptance=acceptance)
+    useful = [i for i in range(1, len(shares)) if shares[i] < 0.75 * shares[i - 1]]
+    return replace(system, acceptance=ACCEPTANCES[useful[-1] if useful else 0])
+
+
+def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> dict[str, float]:
+    """Shares and amplitudes of the scene."""
+    n = len(block)
+    number = echoes.count(n)
+    overlapped = np.zeros(n, bool)
+    overlapped[echoes.waveform[(echoes.flags & int(EchoFlag.OVERLAPPED)) != 0]] = True
+    saturated = 0.0
+    if system.saturation is not None:
+        saturated = float((block.samples >= system.saturation).any(axis=1).mean())
+    narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    deviation = (echoes.sigma - system.sigma_ref) / np.maximum(echoes.sigma_err, 1e-6)
+    return {
+        "empty_share": float((number == 0).mean()),
+        "single_share": float((number == 1).mean()),
+        "overlapped_share": float(overlapped.mean()),
+        "echoes_per_waveform": float(number.mean()),
+        "amplitude_99": float(np.quantile(echoes.amplitude, 0.99)) if len(echoes) else 0.0,
+        "saturated_share": saturated,
+        "system_width_share": float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,
+    }
+
+
+def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -> tuple[Decision, ...]:
+    """The table of ALGORITHMS 4.4: what this scene needs, and the reason for each part left out."""
+    width = system.sigma_ref / spacing
+    share = figures["overlapped_share"]
+    strongest = figures["amplitude_99"]
+    learned = len(system.components)
+    return (
+        Decision(
+            "learned pulse",
+            learned > 1,
+            f"{learned} Gaussians reach a misfit of {figures.get(f'misfit_{learned}_gaussians', 0):.4f}"
+            if learned > 1
+            else "a simpler pulse reaches the noise",
+        ),
+        Decision("skewed pulse", system.kappa != 0, f"kappa {system.kappa:.3f}"),
+        Decision("growth of fits", share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
+        Decision("width prior", share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (40 %)"),
+        Decision(
+            "censored fit",
+            system.saturation is not None and figures["saturated_share"] > 0,
+            f"{100 * figures['saturated_share']:.2f} % of the waveforms are saturated",
+        ),
+        Decision(
+            "signal-dependent weights",
+            system.noise_gain > 0,
+            f"variance grows by {system.noise_gain * strongest:.2f} DN2 up to {strongest:.0f} DN, "
+            f"against {system.noise_std**2:.2f} DN2 without signal",
+        ),
+        Decision("echo width", width >= 0.85, f"the system pulse is {width:.2f} samples wide (0.85)"),
+        Decision(
+            "incidence angle",
+            width >= 0.85 and figures["system_width_share"] < 0.95,
+            f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse",
+        ),
+    )

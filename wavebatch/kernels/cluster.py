@@ -52,41 +52,70 @@ def find_runs(smoothed: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def cluster_candidates(
-    candidates: Candidates, smoothed: np.ndarray, std: np.ndarray, *, margin: int, reach: int, most: int
+    candidates: Candidates,
+    smoothed: np.ndarray,
+    std: np.ndarray,
+    *,
+    margin: int,
+    reach: int,
+    most: int,
+    tail: np.ndarray | None = None,
 ) -> Clusters:
     """Candidates that stand on one run of signal above the noise; windows of neighbouring clusters do not overlap.
 
     smoothed: [1 2 1]/4-filtered signal (s, n); std: noise of a raw sample (n,). margin: samples added on both sides of
-    a run; reach: samples a window extends at least on both sides of its outer candidates; most: candidates per cluster.
+    a run; reach: samples a window extends at least on both sides of its outer candidates; most: candidates per cluster;
+    tail: samples behind each candidate that its after-pulses reach (m,).
     """
     s, _ = smoothed.shape
     waveform, sample = candidates.waveform, np.clip(np.rint(candidates.time), 0, s - 1).astype(np.int64)
-    starts, ends = find_runs(smoothed, (RUN_LEVEL * SMOOTH_GAIN) * std.astype(np.float32))
-    low, high = sample.copy(), sample + 1
-    if len(starts):
-        base = waveform * s
-        run = np.maximum(np.searchsorted(starts, base + sample, side="right") - 1, 0)
-        inside = (base + sample >= starts[run]) & (base + sample < ends[run])
-        low = np.where(inside, starts[run] - base, low)
-        high = np.where(inside, ends[run] - base, high)
-    joined = (waveform[1:] == waveform[:-1]) & (low[1:] < high[:-1])
-    joined = _limit_joins(joined, most)
-    first = np.flatnonzero(np.r_[True, ~joined]) if len(waveform) else np.empty(0, np.int64)
-    last = np.r_[first[1:], len(waveform)] - 1 if len(first) else first
+    if not len(waveform):
+        return Clusters(*(np.empty(0, np.int64) for _ in range(5)))
+    low, high = _find_extents(waveform, sample, smoothed, std)
+    if tail is not None:
+        high = np.maximum(high, sample + tail)
+    furthest = np.maximum.accumulate(high + waveform * (4 * s)) - waveform * (4 * s)
+    joined = _limit_joins((waveform[1:] == waveform[:-1]) & (low[1:] < furthest[:-1]), most)
+    first = np.flatnonzero(np.r_[True, ~joined])
+    last = np.r_[first[1:], len(waveform)] - 1
     outer_low = np.maximum(np.minimum(low[first] - margin, sample[first] - reach), 0)
-    outer_high = np.minimum(np.maximum(high[last] + margin, sample[last] + 1 + reach), s)
-    meet = waveform[first[1:]] == waveform[last[:-1]]
-    middle = (
-        np.where(
-            low[first[1:]] < high[last[:-1]], sample[first[1:]] + sample[last[:-1]], low[first[1:]] + high[last[:-1]]
-        )
-        // 2
-    )
-    outer_low[1:] = np.where(meet, np.maximum(outer_low[1:], np.minimum(middle, sample[first[1:]])), outer_low[1:])
-    outer_high[:-1] = np.where(
-        meet, np.minimum(outer_high[:-1], np.maximum(middle, sample[last[:-1]] + 1)), outer_high[:-1]
-    )
+    outer_high = np.minimum(np.maximum(furthest[last] + margin, sample[last] + 1 + reach), s)
+    _separate(outer_low, outer_high, waveform, sample, low, furthest, first, last)
     return Clusters(waveform[first], outer_low, outer_high, first, last - first + 1)
+
+
+def _find_extents(
+    waveform: np.ndarray, sample: np.ndarray, smoothed: np.ndarray, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """First sample and one behind the last of the run of signal that each candidate stands on (m,)."""
+    starts, ends = find_runs(smoothed, (RUN_LEVEL * SMOOTH_GAIN) * std.astype(np.float32))
+    if not len(starts):
+        return sample.copy(), sample + 1
+    base = waveform * len(smoothed)
+    run = np.maximum(np.searchsorted(starts, base + sample, side="right") - 1, 0)
+    inside = (base + sample >= starts[run]) & (base + sample < ends[run])
+    return np.where(inside, starts[run] - base, sample), np.where(inside, ends[run] - base, sample + 1)
+
+
+def _separate(
+    outer_low: np.ndarray,
+    outer_high: np.ndarray,
+    waveform: np.ndarray,
+    sample: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+) -> None:
+    """Cuts the windows of neighbouring clusters half-way between their signals, or their candidates, in place."""
+    here, there = last[:-1], first[1:]
+    meet = waveform[here] == waveform[there]
+    apart = low[there] >= high[here]
+    middle = np.where(apart, low[there] + high[here], sample[there] + sample[here] + 1) // 2
+    middle = np.clip(middle, sample[here] + 1, np.maximum(sample[there], sample[here] + 1))
+    outer_low[1:] = np.where(meet, np.maximum(outer_low[1:], middle), outer_low[1:])
+    outer_high[:-1] = np.where(meet, np.minimum(outer_high[:-1], middle), outer_high[:-1])
+    np.minimum(outer_low, sample[first], out=outer_low)
 
 
 def _limit_joins(joined: np.ndarray, most: int) -> np.ndarray:
@@ -107,11 +136,12 @@ def cut_windows(
     high: np.ndarray,
     length: int,
     clip: float | None = None,
+    noise_gain: float = 0.0,
 ) -> tuple[Windows, np.ndarray]:
     """Windows of `length` samples that hold [low, high) of their waveforms, and the sample each begins at (m,).
 
     samples: raw counts (n, s), contiguous. Samples outside [low, high) are put out of reach of every pulse.
-    clip: raw count from which a sample counts as clipped.
+    clip: raw count from which a sample counts as clipped; noise_gain: variance per count of signal (H12).
     """
     n, s = samples.shape
     length = min(length, s)
@@ -133,9 +163,17 @@ def cut_windows(
     outside |= position >= (high - begin).astype(np.float32)[:, None]
     x = np.where(outside, OUTSIDE, position)
     y[outside] = 0
+    weight = _weigh(y, std[waveform], noise_gain) if noise_gain > 0 else None
     if clipped is not None:
         clipped &= ~outside
-    return Windows(y, x, std[waveform].astype(np.float64), clipped), begin
+    return Windows(y, x, std[waveform].astype(np.float64), clipped, weight), begin
+
+
+def _weigh(y: np.ndarray, std: np.ndarray, noise_gain: float) -> np.ndarray:
+    """Noise without signal over noise at each sample, from the smoothed signal (m, L): var = std^2 + gain * signal."""
+    padded = np.pad(y, ((0, 0), (2, 2)), mode="edge")
+    smooth = (padded[:, :-4] + padded[:, 4:] + 4 * (padded[:, 1:-3] + padded[:, 3:-1]) + 6 * padded[:, 2:-2]) / 16
+    return 1 / np.sqrt(1 + np.float32(noise_gain) * np.maximum(smooth, 0) / (std * std).astype(np.float32)[:, None])
 
 
 def estimate_starts(

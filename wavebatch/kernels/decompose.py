@@ -30,6 +30,7 @@ class Settings(NamedTuple):
     width_high: float
     shape: PulseShape = GAUSSIAN
     clip: float | None = None
+    noise_gain: float = 0.0
     tolerance: float = 1e-2
     max_iterations: int = 40
     grow: bool = True
@@ -187,6 +188,7 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         clusters.high[cluster],
         length,
         settings.clip,
+        settings.noise_gain,
     )
     start = problem.start.copy()
     start[:, 1] -= begin[:, None]

@@ -46,10 +46,12 @@ class Windows(NamedTuple):
     clipped: np.ndarray | None = None
     """Samples at the digitizer's limit: they only say that the signal is at least y (H6), bool (m, L)."""
 
+    weight: np.ndarray | None = None
+    """Noise without signal over noise at each sample (H12), float32 (m, L)."""
+
     def take(self, rows: np.ndarray) -> Windows:
         """The problems at `rows`."""
-        clipped = None if self.clipped is None else self.clipped[rows]
-        return Windows(self.y[rows], self.x[rows], self.std[rows], clipped)
+        return Windows(*(None if field is None else field[rows] for field in self))
 
 
 class Limits(NamedTuple):
@@ -116,6 +118,8 @@ def evaluate_model(windows: Windows, parameters: np.ndarray, shape: PulseShape) 
     rows[:, -1] = residual
     if windows.clipped is not None:
         rows *= ~(windows.clipped & (residual <= 0))[:, None, :]
+    if windows.weight is not None:
+        rows *= windows.weight[:, None, :]
     return rows
 
 

@@ -88,3 +88,77 @@ def _evaluate_components(
         by_width += part * (1 - ratio * ratio)
         by_width += part_width * (np.float32(weight) * ratio * ratio * ratio)
     return pulse, by_time, by_width
+
+
+class PulseTail(NamedTuple):
+    """What a learned pulse does beside its main part, per unit of amplitude, by lag on a grid of TAIL_STEP."""
+
+    first: float
+    """Lag of the first value [samples]."""
+    value: np.ndarray
+
+
+TAIL_STEP = 0.25
+CORE = 2.5
+"""Widths of the main part within which its neighbours are one echo with it."""
+
+
+def pulse_tail(shape: PulseShape, width: float) -> PulseTail | None:
+    """After-pulses and ringing of a learned pulse of the given width; None for a pulse without further components."""
+    if not shape.components:
+        return None
+    reach = max(abs(delay) + 4 * np.sqrt(max(width**2 + extra, 0.0)) for _, delay, extra in shape.components)
+    lag = np.arange(-np.ceil(reach / TAIL_STEP), np.ceil(reach / TAIL_STEP) + 1) * TAIL_STEP
+    time, wide = np.zeros(1), np.full(1, width)
+    whole = evaluate_pulse(shape, lag[:, None], time, wide)[0][:, 0]
+    value = np.where(np.abs(lag) > CORE * width, whole - np.exp(-0.5 * (lag / width) ** 2), 0.0)
+    return PulseTail(float(lag[0]), value)
+
+
+def tail_at(tail: PulseTail, lag: np.ndarray) -> np.ndarray:
+    """The tail at given lags, 0 beyond its ends."""
+    place = np.rint((lag - tail.first) / TAIL_STEP).astype(np.int64)
+    inside = (place >= 0) & (place < len(tail.value))
+    return np.where(inside, tail.value[np.clip(place, 0, len(tail.value) - 1)], 0.0)
+
+
+def tail_reach(tail: PulseTail, ratio: np.ndarray) -> np.ndarray:
+    """Samples behind an echo over which its tail exceeds the noise; ratio: amplitude in noise standard deviations (m,)."""
+    after = np.abs(tail.value[int(round(-tail.first / TAIL_STEP)) :])
+    highest = np.maximum.accumulate(after[::-1])[::-1]
+    number = len(highest) - np.searchsorted(highest[::-1], 1.0 / np.maximum(ratio, 1e-9), side="right")
+    return np.ceil(number * TAIL_STEP).astype(np.int64)
+
+
+class PulseMeasures(NamedTuple):
+    """Peak and full width at half maximum of a pulse by its fitted width: tables over the allowed widths."""
+
+    width: np.ndarray
+    peak: np.ndarray
+    """Height of the peak over the amplitude of the main part."""
+    delay: np.ndarray
+    """Peak after the centre of the main part [samples]."""
+    half_width: np.ndarray
+    """Full width at half maximum of the main lobe [samples]."""
+
+
+def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
+    """Peak, its delay and full width at half maximum for widths from low to high."""
+    widths = np.linspace(low, high, 200)
+    step = low / 100
+    reach = max([6 * high, *(abs(delay) + high for _, delay, _ in shape.components)])
+    x = np.arange(-reach, reach, step)
+    table = np.array([_measure_one(evaluate_pulse(shape, x, np.zeros(1), np.full(1, s))[0], x) for s in widths])
+    return PulseMeasures(widths, *table.T)
+
+
+def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]:
+    top = int(np.argmax(pulse))
+    below = pulse < 0.5 * pulse[top]
+    right = top + int(np.argmax(below[top:]))
+    left = top - int(np.argmax(below[top::-1]))
+
+    def cross(a: int, b: int) -> float:
+        return x[a] + (x[b] - x[a]) * (0.5 * pulse[top] - pulse[a]) / (pulse[b] - pulse[a])
+
+    return float(pulse[top]), float(x[top]), cross(right - 1, right) - cross(left + 1, left)

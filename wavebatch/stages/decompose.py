@@ -9,11 +9,12 @@ import numpy as np
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.kernels.closed_form import fit_closed_form
-from wavebatch.kernels.cluster import Candidates, Clusters, cluster_candidates, cut_windows
+from wavebatch.kernels.cluster import Candidates, Clusters, cluster_candidates
 from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit import WidthPrior
-from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseShape
+from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal import smooth_121, transpose_samples
+from wavebatch.stages.shapes import ShapeLimits, describe_echoes, model_parameters, pulse_shape, shape_limits
 from wavebatch.units import SQRT_PI
 
 MARGIN = 1.6
@@ -107,45 +108,33 @@ def adaptive(
     max_echoes: echoes per cluster up to which a fit grows.
     gate_residual: largest smoothed residual of a complete fit, in standard deviations.
     gate_hermite: largest h3^2 + h4^2 of a complete fit.
-    width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths.
+    width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths;
+        0 for no prior.
     max_iterations: after which an echo is flagged as not converged.
     tolerance: fall of chi2 that another step may still promise when a fit is done.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
+    shape = pulse_shape(system, block.spacing)
+    ref = shape_limits(system, block.spacing).ref
     settings = _settings(
         block,
         system,
-        pulse_shape(system, block.spacing),
+        shape,
         tolerance=tolerance,
         max_iterations=max_iterations,
         grow=True,
         acceptance=acceptance or system.acceptance,
         max_echoes=max_echoes,
-        prior=WidthPrior(system.sigma_ref / block.spacing, width_prior * system.sigma_ref / block.spacing),
+        prior=WidthPrior(ref, width_prior * ref) if width_prior > 0 else None,
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
     return _decompose(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
 
 
-def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
-    """The strip's pulse in samples: learned, skewed or Gaussian, whichever the survey set."""
-    if len(system.components) > 1:
-        weight, delay, sigma = system.components[0]
-        rest = tuple(
-            (w * s / (weight * sigma), (d - delay) / spacing, (s * s - sigma * sigma) / spacing**2)
-            for w, d, s in system.components[1:]
-        )
-        return PulseShape(components=rest)
-    return PulseShape(kappa=system.kappa) if abs(system.kappa) >= NO_SKEW else GAUSSIAN
-
-
 def _settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
-    ref = system.sigma_ref / block.spacing
-    low = 0.7 * ref
-    narrowest = min((extra for _, _, extra in shape.components), default=0.0)
-    low = max(low, np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
-    return Settings(ref, low, 4.0 * ref, shape=shape, clip=system.saturation, **options)
+    limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
+    return Settings(*limits, shape=shape, clip=system.saturation, noise_gain=system.noise_gain, **options)
 
 
 def _decompose(
@@ -159,16 +148,16 @@ def _decompose(
     significance: float,
 ) -> EchoTable:
     """Candidates in ns -> clusters -> fits -> flagged table in ns."""
-    spacing = block.spacing
-    candidates = Candidates(
-        echoes.waveform.astype(np.int64),
-        echoes.time / spacing,
-        np.maximum(echoes.amplitude.astype(np.float64), 0.0),
-        np.clip(echoes.sigma.astype(np.float64) / spacing, settings.width_low, settings.width_high),
+    limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
+    start = np.stack(
+        [np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1
     )
+    amplitude, time, width = model_parameters(settings.shape, limits, start.astype(np.float64)).T
+    candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
+    ref = system.sigma_ref / block.spacing
+    candidates, tail = _explain_tails(candidates, noise, settings)
     signal = transpose_samples(block.samples)
     signal -= noise.baseline
-    ref = settings.width_ref
     clusters = cluster_candidates(
         candidates,
         smooth_121(signal),
@@ -176,10 +165,32 @@ def _decompose(
         margin=int(np.ceil(MARGIN * ref)),
         reach=int(np.ceil(REACH * ref)),
         most=most,
+        tail=tail,
     )
     del signal
     solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
-    return _table(block, noise, system, clusters, list(solutions), significance)
+    return _table(block, noise, system, clusters, list(solutions), settings, significance)
+
+
+def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
+    """Candidates that the after-pulses of stronger echoes before them do not explain, and how far tails reach (H7).
+
+    A candidate that is dropped here comes back by growth if the fit of the stronger echo leaves something there.
+    """
+    tail = pulse_tail(settings.shape, settings.width_ref)
+    if tail is None:
+        return candidates, None
+    waveform, time, amplitude, _ = candidates
+    expected = np.zeros(len(waveform))
+    for step in range(1, min(MOST_JOINED, len(waveform))):
+        same = waveform[step:] == waveform[:-step]
+        lag = time[step:] - time[:-step]
+        expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
+        expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)
+    std = noise.std[waveform]
+    keep = (expected <= 0) | (amplitude - expected > 2.2 * std + 0.25 * expected)
+    candidates = Candidates(*(field[keep] for field in candidates))
+    return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
 
 def _table(
@@ -188,12 +199,15 @@ def _table(
     system: SystemPulse,
     clusters: Clusters,
     solutions: list[Solution],
+    settings: Settings,
     significance: float,
 ) -> EchoTable:
     if not solutions:
         return EchoTable.empty()
     flat = [_flatten(clusters, solution) for solution in solutions]
     waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
+    limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
+    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1

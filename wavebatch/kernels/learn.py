@@ -1,0 +1,146 @@
+"""The system pulse learned from isolated echoes: aligned, stacked, fitted by a sum of Gaussians (ALGORITHMS R2)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+
+STEP = 0.2
+"""Grid of the stack [samples]."""
+
+MOST_COMPONENTS = 5
+
+GAIN = 0.10
+"""Share by which the residual must fall for one more component."""
+
+LEAST_BIN = 5
+"""Samples that a bin of the stack needs."""
+
+
+class Stack(NamedTuple):
+    """Median shape of isolated echoes of amplitude 1, by lag after their centre."""
+
+    lag: np.ndarray
+    """[samples], (b,)."""
+    value: np.ndarray
+    """(b,)."""
+    error: np.ndarray
+    """Standard error of each value (b,)."""
+
+
+def stack_pulse(signal: np.ndarray, amplitude: np.ndarray, time: np.ndarray, before: float, after: float) -> Stack:
+    """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it."""
+    lag = np.arange(signal.shape[1]) - time[:, None]
+    used = (lag >= -before) & (lag <= after)
+    values = (signal / amplitude[:, None])[used]
+    bins = np.floor((lag[used] + before) / STEP).astype(np.int64)
+    order = np.argsort(bins, kind="stable")
+    bins, values = bins[order], values[order]
+    starts = np.flatnonzero(np.r_[True, np.diff(bins) > 0])
+    stack = []
+    for begin, end in zip(starts, np.r_[starts[1:], len(bins)], strict=True):
+        part = values[begin:end]
+        if len(part) >= LEAST_BIN:
+            middle = np.median(part)
+            spread = 1.4826 * np.median(np.abs(part - middle))
+            centre = (bins[begin] + 0.5) * STEP - before
+            stack.append((centre, middle, 1.2533 * max(spread, 1e-6) / np.sqrt(len(part))))
+    return Stack(*np.array(stack).reshape(-1, 3).T)
+
+
+class PulseFit(NamedTuple):
+    """One model of a stack."""
+
+    components: np.ndarray
+    """Weight, delay, sigma per component, the strongest first; weight 1 and delay 0 for it (c, 3)."""
+    kappa: float
+    rms: float
+    """Root mean square misfit, in amplitudes."""
+    datum: float
+    """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
+
+
+def fit_gaussians(stack: Stack, width: float) -> list[PulseFit]:
+    """Sums of 1, 2, ... Gaussians fitted to the stack, one more as long as the misfit falls by a tenth or more."""
+    weight = _weights(stack)
+    parameters = np.array([1.0, 0.0, width])
+    fits: list[PulseFit] = []
+    while True:
+        parameters = _refine(stack, weight, parameters)
+        residual = stack.value - _sum(parameters, stack.lag)
+        fit = _as_fit(parameters, float(np.sqrt(np.mean(residual**2))))
+        if fits and fit.rms > (1 - GAIN) * fits[-1].rms:
+            return fits
+        fits.append(fit)
+        if len(fits) == MOST_COMPONENTS:
+            return fits
+        parameters = _add_component(stack, weight, parameters, residual)
+
+
+def fit_skewed(stack: Stack, width: float) -> PulseFit:
+    """The skewed pulse of section 0 fitted to the stack."""
+    weight = _weights(stack)
+
+    def misfit(p: np.ndarray) -> np.ndarray:
+        t, s = np.array([p[1]]), np.array([p[2]])
+        pulse = evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s)[0][:, 0]
+        return (p[0] * pulse - stack.value) * weight
+
+    low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
+    result = least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
+    amplitude, delay, sigma, kappa = result.x
+    rms = float(np.sqrt(np.mean((misfit(result.x) / weight) ** 2)))
+    return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
+
+
+def _weights(stack: Stack) -> np.ndarray:
+    """Inverse errors, none more than four times the typical one, mean 1."""
+    weight = 1 / np.maximum(stack.error, 0.25 * np.median(stack.error))
+    return weight / weight.mean()
+
+
+def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
+    weight, delay, sigma = parameters.reshape(-1, 3).T
+    return np.exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) @ weight
+
+
+def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray) -> np.ndarray:
+    width = abs(start[2])
+    low = np.tile([-1.0, stack.lag[0], 0.35 * width], len(start) // 3)
+    high = np.tile([2.0, stack.lag[-1], 12.0 * width], len(start) // 3)
+    result = least_squares(
+        lambda p: (_sum(p, stack.lag) - stack.value) * weight,
+        np.clip(start, low, high),
+        bounds=(low, high),
+        max_nfev=200,
+    )
+    return result.x
+
+
+def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """The best of several starts with one more Gaussian, refined."""
+    width = parameters[2]
+    best, best_cost = parameters, np.inf
+    smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
+    for place in {int(np.argmax(smooth)), int(np.argmin(smooth))}:
+        for factor in (0.7, 1.5, 4.0):
+            start = np.r_[parameters, smooth[place], stack.lag[place], factor * width]
+            tried = _refine(stack, weight, start)
+            cost = float(np.sum(((_sum(tried, stack.lag) - stack.value) * weight) ** 2))
+            if cost < best_cost:
+                best, best_cost = tried, cost
+    return best
+
+
+def _as_fit(parameters: np.ndarray, rms: float) -> PulseFit:
+    components = parameters.reshape(-1, 3)
+    main = int(np.argmax(components[:, 0] * (np.abs(components[:, 1]) < 3 * components[:, 2] + 3)))
+    order = np.r_[main, np.delete(np.arange(len(components)), main)]
+    components = components[order]
+    weight, delay, _ = components[0]
+    scaled = components / [weight, 1.0, 1.0] - [0.0, delay, 0.0]
+    return PulseFit(scaled, 0.0, rms / weight, float(delay))

@@ -1,0 +1,32 @@
+"""Waveforms from echoes: the sum of the fitted pulses, sample by sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+
+ROWS = 8192
+"""Echoes painted at a time."""
+
+
+def render_echoes(
+    shape: PulseShape,
+    n: int,
+    s: int,
+    waveform: np.ndarray,
+    time: np.ndarray,
+    amplitude: np.ndarray,
+    width: np.ndarray,
+) -> np.ndarray:
+    """Signal (n, s), float32, of echoes sorted by waveform; times and widths in samples (m,)."""
+    signal = np.zeros((n, s), np.float32)
+    x = np.arange(s, dtype=np.float32)
+    for begin in range(0, len(waveform), ROWS):
+        part = slice(begin, begin + ROWS)
+        t, w = (values[part].astype(np.float32)[:, None] for values in (time, width))
+        pulse = evaluate_pulse(shape, x, t, w)[0] * amplitude[part].astype(np.float32)[:, None]
+        owner = waveform[part]
+        starts = np.flatnonzero(np.r_[True, np.diff(owner) != 0]) if len(owner) else owner
+        signal[owner[starts]] += np.add.reduceat(pulse, starts, axis=0)
+    return signal

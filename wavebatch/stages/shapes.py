@@ -1,0 +1,77 @@
+"""The strip's pulse as the kernels want it: in samples, with tables of what a fitted width means."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.blocks import SystemPulse
+from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
+from wavebatch.units import FWHM_PER_SIGMA
+
+
+def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
+    """The strip's pulse in samples: learned, skewed or Gaussian, whichever the survey set."""
+    if len(system.components) > 1:
+        weight, delay, sigma = system.components[0]
+        rest = tuple(
+            (w * s / (weight * sigma), (d - delay) / spacing, (s * s - sigma * sigma) / spacing**2)
+            for w, d, s in system.components[1:]
+        )
+        return PulseShape(components=rest)
+    return PulseShape(kappa=system.kappa) if abs(system.kappa) >= NO_SKEW else GAUSSIAN
+
+
+class ShapeLimits(NamedTuple):
+    """Widths of a pulse model's main part [samples]."""
+
+    ref: float
+    """That of the system pulse."""
+    low: float
+    high: float
+
+
+def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
+    """Allowed widths: 0.7 to 4 of the system's (H3), and every component of a learned pulse with a width of its own."""
+    shape = pulse_shape(system, spacing)
+    ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
+    narrowest = min((extra for _, _, extra in shape.components), default=0.0)
+    return ShapeLimits(ref, max(0.7 * ref, float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))), 4.0 * ref)
+
+
+@lru_cache(maxsize=8)
+def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """Peak, delay and full width at half maximum by fitted width; kept, since a strip asks for every block."""
+    return measure_pulse(shape, limits.low, limits.high)
+
+
+def describe_echoes(
+    shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Amplitude, time and sigma (m, 3) of whole echoes, and their errors, from those of a learned pulse's main part.
+
+    The amplitude is the pulse's peak, the time that of the peak, sigma the full width at half maximum of the main lobe
+    over 2.354820, so that they mean the same for every model. Other pulses are returned as they are.
+    """
+    if not shape.components:
+        return parameters, errors
+    table = pulse_measures(shape, limits)
+    amplitude, time, width = parameters.T
+    peak = np.interp(width, table.width, table.peak)
+    sigma = table.half_width / FWHM_PER_SIGMA
+    steep = np.interp(width, table.width, np.gradient(sigma, table.width))
+    whole = [amplitude * peak, time + np.interp(width, table.width, table.delay), np.interp(width, table.width, sigma)]
+    return np.stack(whole, axis=1), errors * np.stack([peak, np.ones_like(peak), np.abs(steep)], axis=1)
+
+
+def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:
+    """Inverse of `describe_echoes`: amplitude, time and width (m, 3) of the main part."""
+    if not shape.components:
+        return echoes
+    table = pulse_measures(shape, limits)
+    amplitude, time, sigma = echoes.T
+    width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
+    delay = np.interp(width, table.width, table.delay)
+    return np.stack([amplitude / np.interp(width, table.width, table.peak), time - delay, width], axis=1)
