@@ -1,0 +1,74 @@
+"""What many tests need: a seeded generator, the real files, tiny strips."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wavebatch.simulate import simulate_strip
+
+
+@pytest.fixture
+def rng():
+    """The same random numbers in every run."""
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Folder of the real files; the test is skipped where they are not there."""
+    beside = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+    folder = Path(os.environ.get("WAVEBATCH_DATA", beside))
+    if not folder.is_dir():
+        pytest.skip(f"real files are not at {folder}; set WAVEBATCH_DATA to their folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def riegl(data) -> Path:
+    """RIEGL Q680i, point format 9, packets in a .wdp."""
+    return data / "riegl-q680i" / "100429_152240_2535pt_UTM.las"
+
+
+@pytest.fixture(scope="session")
+def leica(data) -> Path:
+    """Leica ALS, point format 4, packets in the file."""
+    return data / "leica-als" / "simple1_3_full_internal.las"
+
+
+@pytest.fixture(scope="session")
+def tiny_strip(tmp_path_factory) -> Path:
+    """400 pulses of an urban scene, some without a waveform."""
+    path = tmp_path_factory.mktemp("tiny") / "tiny.las"
+    simulate_strip("urban", path, pulses=400, seed=3)
+    return path
+
+
+@pytest.fixture(scope="session")
+def wide_strip(tmp_path_factory) -> Path:
+    """More points than fit in two work units."""
+    path = tmp_path_factory.mktemp("wide") / "wide.las"
+    simulate_strip("urban", path, pulses=104_000, seed=4)
+    return path
+
+
+@pytest.fixture(scope="session")
+def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], Path]:
+    """`edit_points(source, target, change)`: a copy of a LAS file whose records are those that `change` makes."""
+    from wavebatch.io.header import STANDARD_DTYPES, read_header
+
+    def edit(source: Path, target: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
+        header = read_header(source)
+        assert not header.compressed and header.point_length == STANDARD_DTYPES[header.point_format].itemsize
+        content = bytearray(source.read_bytes())
+        start, end = header.offset_to_points, header.offset_to_points + header.point_count * header.point_length
+        points = np.frombuffer(bytes(content[start:end]), STANDARD_DTYPES[header.point_format])
+        changed = change(points.copy())
+        assert changed.shape == points.shape and changed.dtype == points.dtype
+        content[start:end] = changed.tobytes()
+        target.write_bytes(content)
+        return target
+
+    return edit

@@ -1,0 +1,126 @@
+"""The layers hold: imports go down only, and only the places that may know click, laspy or executors do."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent / "wavebatch"
+MODULES = sorted(ROOT.rglob("*.py"))
+
+RANKS = [
+    {"errors", "units", "words"},
+    {"kernels", "blocks"},
+    {"chain", "io", "report", "inputs"},
+    {"stages", "assemble"},
+    {"config", "survey", "inspection", "simulate", "evaluate", "differences", "compare"},
+    {"work"},
+    {"record"},
+    {"task", "workers"},
+    {"plan"},
+    {"batch"},
+    {"cli"},
+    {"__main__"},
+]
+"""From the bottom up. Within a rank modules may import each other, but never in a circle."""
+
+RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
+
+
+def _part(path: Path) -> str:
+    """The top module or package that a file belongs to."""
+    relative = path.relative_to(ROOT)
+    return relative.parts[0].removesuffix(".py")
+
+
+def _imports(path: Path) -> set[str]:
+    """Full names of all modules that a file imports, anywhere in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+    return names
+
+
+def _used(path: Path) -> set[str]:
+    """Our own parts that a file imports; the bare package (for its version) is none."""
+    parts = {name.split(".")[1] for name in _imports(path) if name.startswith("wavebatch.")}
+    return {part for part in parts if (ROOT / part).is_dir() or (ROOT / f"{part}.py").exists()}
+
+
+def _outside(path: Path) -> set[str]:
+    return {name.split(".")[0] for name in _imports(path)}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_go_down_only(path):
+    part = _part(path)
+    if part == "__init__":
+        assert not _used(path)
+        return
+    assert part in RANK, f"{part} has no place in the layers; add it to RANKS"
+    for used in _used(path) - {part}:
+        assert RANK[used] <= RANK[part], f"{part} must not import {used}"
+
+
+def test_no_circle_of_imports():
+    graph: dict[str, set[str]] = {}
+    for path in MODULES:
+        name = ".".join(("wavebatch", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+        graph[name] = _imports(path)
+    done: set[str] = set()
+
+    def visit(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join((*trail, name))
+        if name in done:
+            return
+        for other in sorted(graph[name] & graph.keys() - {name}):
+            visit(other, (*trail, name))
+        done.add(name)
+
+    for name in graph:
+        visit(name, ())
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_kernels_know_arrays_only(path):
+    if _part(path) != "kernels":
+        return
+    assert _used(path) <= {"kernels", "units"}
+    assert _outside(path) <= {"numpy", "scipy", "wavebatch", "__future__", "dataclasses", "collections", "math",
+                              "functools", "itertools", "typing"}  # fmt: skip
+
+
+def test_only_io_knows_laspy():
+    for path in MODULES:
+        if _outside(path) & {"laspy", "lazrs", "laszip"}:
+            assert _part(path) == "io", path
+
+
+def test_only_batch_knows_executors():
+    for path in MODULES:
+        if _outside(path) & {"concurrent", "multiprocessing"}:
+            assert _part(path) in {"batch", "task", "workers"}, path
+
+
+def test_only_the_command_line_knows_click_prints_or_exits():
+    for path in MODULES:
+        if _part(path) in {"cli", "__main__"}:
+            continue
+        assert not _outside(path) & {"click", "tqdm"}, path
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in {"print", "exit", "quit"}, f"{path}:{node.lineno}"
+            if isinstance(node, ast.Attribute) and node.attr == "exit" and isinstance(node.value, ast.Name):
+                assert node.value.id != "sys", f"{path}:{node.lineno}"
+
+
+def test_no_other_dependency_at_run_time():
+    allowed = {"laspy", "lazrs", "laszip", "numpy", "scipy", "click", "tqdm", "wavebatch"}
+    import sys
+
+    for path in MODULES:
+        assert _outside(path) <= allowed | sys.stdlib_module_names, path
