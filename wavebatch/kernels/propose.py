@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.kernels.fit import Limits, Windows, add_ridge, parameter_units
+from wavebatch.kernels.gate import hermite_moments
 
 LEAST_NEW = 0.03
 """Share of a new echo's energy that the present echoes must not be able to explain."""
@@ -55,4 +56,31 @@ def propose_echo(
     start[:, 1, :k] = parameters[:, 1] + np.clip(change[:, 1], -width, width)
     start[:, 2, :k] = parameters[:, 2] + np.clip(change[:, 2], -0.4 * parameters[:, 2], 0.3 * parameters[:, 2])
     start[:, :, k] = np.stack([new, place.astype(np.float64), np.full(m, width)], axis=1)
-    return np.clip(start, limits.low, limits.high), score[problem, place] / windows.std**2
+    promise = score[problem, place] / windows.std**2
+    _split_flat(start, promise, windows, parameters, rows, width)
+    return np.clip(start, limits.low, limits.high), promise
+
+
+def _split_flat(
+    start: np.ndarray, promise: np.ndarray, windows: Windows, parameters: np.ndarray, rows: np.ndarray, width: float
+) -> None:
+    """Puts two echoes in the place of one where its residual says that its top is too flat, in place (section 2.3).
+
+    No single new echo can flatten a top: two close echoes of similar strength are invisible to the score test. They
+    leave h4 < 0, and h3^2 + h4^2 is the fall of chi2 that the split promises; it is taken where it promises more.
+    """
+    h3, h4 = hermite_moments(windows, parameters, rows)
+    gain = np.where(h4 < 0, h3 * h3 + h4 * h4, 0.0)
+    echo = np.argmax(gain, axis=1)
+    at = np.flatnonzero(gain[np.arange(len(gain)), echo] > promise)
+    if not len(at):
+        return
+    echo = echo[at]
+    amplitude, time, broad = parameters[at, :, echo].T
+    narrow = np.minimum(broad, 1.1 * width)
+    apart = np.maximum(np.sqrt(broad**2 - narrow**2), 0.5 * broad)
+    half = 0.5 * amplitude * broad / narrow
+    start[at, :, :-1] = parameters[at]
+    start[at, :, echo] = np.stack([half, time - apart, narrow], axis=1)
+    start[at, :, -1] = np.stack([half, time + apart, narrow], axis=1)
+    promise[at] = gain[at, echo]
