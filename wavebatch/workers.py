@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
+from wavebatch.allocator import keep_freed_memory
+
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
 
@@ -22,6 +24,7 @@ class Workers:
 
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
+        keep_freed_memory()
         self._before = set(multiprocessing.active_children())
         self._pool: ProcessPoolExecutor | None = None
 
@@ -88,6 +91,7 @@ def _single_threaded() -> Iterator[None]:
 def _start_worker() -> None:
     """In a new process: Ctrl-C is the parent's business, and without the parent there is nothing to do."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    keep_freed_memory()
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

@@ -123,7 +123,7 @@ def tail_at(tail: PulseTail, lag: np.ndarray) -> np.ndarray:
 
 
 def tail_reach(tail: PulseTail, ratio: np.ndarray) -> np.ndarray:
-    """Samples behind an echo over which its tail exceeds the noise; ratio: amplitude in noise standard deviations (m,)."""
+    """Samples behind an echo over which its tail exceeds the noise; ratio: amplitude over noise (m,)."""
     after = np.abs(tail.value[int(round(-tail.first / TAIL_STEP)) :])
     highest = np.maximum.accumulate(after[::-1])[::-1]
     number = len(highest) - np.searchsorted(highest[::-1], 1.0 / np.maximum(ratio, 1e-9), side="right")
