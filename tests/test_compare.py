@@ -148,7 +148,7 @@ def strip(tmp_path_factory):
     simulate_strip("mixed", folder / "s.laz", pulses=4000, seed=3, truth=folder / "t.npz", options=options)
     with TruthReader(folder / "t.npz") as reader:
         noise = reader.meta["noise_std"]
-        truth = reader.read("gps_time", "x", "y", "z", "amplitude", "sigma", "isolated", "overlapped")
+        truth = reader.read("gps_time", "time", "x", "y", "z", "amplitude", "sigma", "isolated", "overlapped")
     rng = np.random.default_rng(4)
     sigma = truth["sigma"].astype(float)
     bounds = crlb(truth["amplitude"], sigma, noise, 1.0)
@@ -159,6 +159,7 @@ def strip(tmp_path_factory):
         folder / "a.las",
         truth["gps_time"],
         xyz,
+        echo_time=(truth["time"] + error[0]).astype("f4"),
         amplitude=(truth["amplitude"] + error[1]).astype("f4"),
         echo_width=(2.3548 * (sigma + error[2])).astype("f4"),
         amplitude_err=bounds[1].astype("f4"),
@@ -176,7 +177,7 @@ def test_errors_against_truth_are_in_units_of_the_bound(strip):
     isolated = result.errors["isolated"]
     assert isolated["time"].number == truth["isolated"].sum()
     assert result.errors["overlapped"]["time"].number == pytest.approx(truth["overlapped"].sum(), abs=5)
-    for name in ("time", "amplitude", "sigma"):
+    for name in ("time", "echo_time", "amplitude", "sigma"):
         assert isolated[name].rms_per_bound == pytest.approx(1.0, abs=0.05)
         assert isolated[name].calibration == pytest.approx(1.0, abs=0.05)
         assert abs(isolated[name].bias) < 0.1 * isolated[name].rmse
@@ -189,6 +190,7 @@ def test_vendor_returns_against_truth_and_against_the_result(strip, monkeypatch)
     assert 0.8 < vendor.completeness < 0.95
     assert vendor.differences["time"].rms < 0.005
     assert set(vendor.differences) == {"time"}
+    assert vendor.errors["all"]["echo_time"].number == 0
     both = compare_clouds(folder / "a.las", folder / "s.laz")
     assert both.missed <= 3
     assert both.extra == pytest.approx(vendor.missed, abs=5)

@@ -20,8 +20,11 @@ from wavebatch.units import FWHM_PER_SIGMA
 PASSED_THROUGH = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
 """Points with one of these flags are not echoes that somebody found."""
 
-BUCKET_POINTS = 2_000_000
-"""Points of a cloud that are held at a time."""
+BUCKET_POINTS = 400_000
+"""Points of a cloud that are held at a time, as long as MOST_BUCKETS are enough."""
+
+MOST_BUCKETS = 72
+"""Every bucket is an open file for each side: systems allow 256 at least."""
 
 _MOST_PER_PULSE = 32
 """More points per GPS time than this, on average, and it does not tell pulses apart."""
@@ -58,9 +61,12 @@ class Comparison:
     """Pulses by number of echoes in a; those with none are known from b."""
     counts_b: dict[int, int]
     differences: dict[str, Spread]
-    """time [ns, later is positive], amplitude [DN], echo_width [ns] where both have it."""
+    """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
     errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
-    """Against truth only: per class (all, isolated, overlapped) and quantity, with error / bound and calibration."""
+    """Against truth only: per class (all, isolated, overlapped) and quantity, with error / bound and calibration.
+
+    `time` is the error of the position; `echo_time`, where the cloud has it, that of the fit alone.
+    Medians and errors of more than a million pairs are those of an even sample."""
 
     def to_dict(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
@@ -95,7 +101,7 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Compari
         )
         for rows in cloud.read_pieces():
             task.add(0, rows[(rows["flags"] & PASSED_THROUGH) == 0])
-        names = ("gps_time", "x", "y", "z", "amplitude", "sigma", "flags", "isolated")
+        names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
         for piece in reference.read_pieces(*names):
             task.add(1, _shape_truth(piece))
         for piece in reference.read_pieces("packet_gps_time"):
@@ -131,6 +137,7 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
         rows["xyz"][:, axis] = piece[name]
     for name in ("gps_time", "amplitude", "flags", "isolated"):
         rows[name] = piece[name]
+    rows["echo_time"] = piece["time"]
     rows["echo_width"] = piece["sigma"] * FWHM_PER_SIGMA
     return rows
 
@@ -141,7 +148,7 @@ class _Task:
     def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
         self.by_time, self.tolerance, self.tolerance_ns = by_time, tolerance_ns * SPEED, tolerance_ns
         self.meta = meta
-        self.number = -(-max(points, 1) // BUCKET_POINTS)
+        self.number = min(-(-max(points, 1) // BUCKET_POINTS), MOST_BUCKETS)
         dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, _PACKET_DTYPE)
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)

@@ -14,6 +14,9 @@ from wavebatch.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 SPEED = 0.9997 * HALF_C
 """Metres along the ray per ns."""
 
+_BOTH = ("echo_time", "amplitude", "echo_width")
+"""Columns whose values are compared where both sides have them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Spread:
@@ -29,21 +32,18 @@ class Spread:
 class Differences:
     """Collects matched pairs (records of io.cloud.CLOUD_DTYPE): sums of all, an even sample of them for medians."""
 
-    LIMIT = 4_000_000
+    LIMIT = 1_000_000
     """Most pairs that are kept; then every second one is dropped."""
 
     def __init__(self) -> None:
         self.step, self.seen = 1, 0
         self.parts: list[dict[str, np.ndarray]] = []
-        self.sums = {name: np.zeros(3) for name in ("time", "amplitude", "echo_width")}
+        self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
         """Takes in pairs: a[i] with b[i]."""
-        part = {
-            "time": measure_lag(a, b) / SPEED,
-            "amplitude": (a["amplitude"] - b["amplitude"]).astype(np.float64),
-            "echo_width": (a["echo_width"] - b["echo_width"]).astype(np.float64),
-        }
+        part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
+        part["time"] = measure_lag(a, b) / SPEED
         for name, values in part.items():
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
@@ -61,7 +61,10 @@ class Differences:
             self.step *= 2
 
     def _join(self) -> dict[str, np.ndarray]:
-        return {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        """All parts as one, which then is the only part."""
+        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        self.parts = [whole]
+        return whole
 
     def spreads(self) -> dict[str, Spread]:
         """Per quantity that both sides have: median, mean, rms and NMAD of a minus b."""
@@ -87,6 +90,7 @@ class Differences:
         bounds = crlb(data["true_amplitude"], sigma, meta["noise_std"], meta["spacing"])
         columns = {
             "time": (data["time"], bounds[0], data["range_err"] / SPEED),
+            "echo_time": (data["echo_time"], bounds[0], data["range_err"] / SPEED),
             "amplitude": (data["amplitude"], bounds[1], data["amplitude_err"]),
             "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], data["echo_width_err"] / FWHM_PER_SIGMA),
         }

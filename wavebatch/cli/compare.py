@@ -89,7 +89,7 @@ def _list_lines(result: Comparison) -> list[str]:
         lines += [f"exact count   {result.exact_count:>14.4f}   of {result.pulses} pulses", "", "echoes per pulse"]
         lines += [f"{n:>12}  A {result.counts_a.get(n, 0):>12}   B {result.counts_b.get(n, 0):>12}" for n in numbers]
     lines += ["", f"{'A - B':<13} {'number':>10} {'median':>10} {'mean':>10} {'rms':>10} {'nmad':>10}"]
-    units = {"time": "time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
+    units = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
     for name, spread in result.differences.items():
         values = (spread.median, spread.mean, spread.rms, spread.nmad)
         lines.append(f"{units[name]:<13} {spread.number:>10} " + " ".join(f"{value:>10.4f}" for value in values))
@@ -99,13 +99,14 @@ def _list_lines(result: Comparison) -> list[str]:
 def _list_errors(result: Comparison) -> list[str]:
     if not result.errors:
         return []
-    head = ("number", "bias", "rmse", "rms/bound", "nmad/bound", "rms/_err")
+    head = ("number", "bias", "rmse", "rms/bound", "nmad/bound", "rms/_err", "nmad/_err")
     lines = ["", f"{'against truth':<22} " + " ".join(f"{name:>10}" for name in head)]
     for kind, quantities in result.errors.items():
         for name, stats in quantities.items():
             if not stats.number:
                 continue
-            values = (stats.bias, stats.rmse, stats.rms_per_bound, stats.nmad_per_bound, stats.calibration)
+            scaled = (stats.rms_per_bound, stats.nmad_per_bound, stats.calibration, stats.calibration_nmad)
+            values = (stats.bias, stats.rmse, *scaled)
             figures = " ".join(f"{'-':>10}" if math.isnan(value) else f"{value:>10.4f}" for value in values)
             lines.append(f"{kind + ' ' + name:<22} {stats.number:>10} {figures}")
     return lines

@@ -14,7 +14,7 @@ from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, read_records
 from wavebatch.io.header import STANDARD_DTYPES, has_record, read_header
 from wavebatch.io.names import STYLES
 
-CLOUD_COLUMNS = ("amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
+CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read where the cloud has them."""
 
 CLOUD_DTYPE = np.dtype(
@@ -29,7 +29,7 @@ CLOUD_DTYPE = np.dtype(
 """One echo of a cloud: time [s], position [m], the stored packet vector (0 where there is none; it may point either
 way), EchoFlag bits, and columns (NaN: no data)."""
 
-_PIECE = 500_000
+_PIECE = 250_000
 _FAULTS = (ValueError, OSError, OverflowError, MemoryError, RuntimeError, laspy.errors.LaspyException)
 
 

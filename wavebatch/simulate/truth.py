@@ -39,7 +39,7 @@ PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time"
 """Per packet, in file order, those without an echo too."""
 
 _META = "meta"
-_PIECE = 1 << 20
+_PIECE = 1 << 18
 
 
 class TruthWriter:
