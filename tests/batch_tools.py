@@ -1,0 +1,31 @@
+"""Runs for tests: a strip through a profile in this process, and what came out."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+from wavebatch.batch import run_batch
+from wavebatch.config import load_profile
+from wavebatch.task import BatchOptions
+from wavebatch.work import RunOptions, StripJob, choose_columns
+
+
+def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:
+    """A job of a strip with a shipped chain."""
+    chain = load_profile(profile)
+    return StripJob(Path(path), chain, RunOptions(columns=choose_columns(chain, columns), **options))
+
+
+def run_one(path, folder, *, profile="fast", columns=None, batch=None, **options):
+    """The outcome of one strip; options are those of RunOptions, `batch` those of BatchOptions."""
+    job = make_job(path, profile=profile, columns=columns, **options)
+    result = run_batch([job], BatchOptions(Path(folder), **(batch or {})))
+    return result.outcomes[0]
+
+
+def read_cloud(path) -> tuple[np.ndarray, np.ndarray]:
+    """Records of a cloud under laspy's names, and coordinates [m] (n, 3)."""
+    with laspy.open(path) as reader:
+        points = reader.read_points(reader.header.point_count)
+        return points.array, np.stack([np.asarray(points[axis]) for axis in "xyz"], axis=1)

@@ -1,0 +1,229 @@
+"""Output rows against plain loops over points and packets, on strips with everything that goes wrong in them."""
+
+import dataclasses
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from batch_tools import make_job, read_cloud, run_one
+
+from wavebatch.assemble import assemble_returns, gather_echoes
+from wavebatch.blocks import EchoFlag
+from wavebatch.errors import StageError
+from wavebatch.io.strip import StripReader
+from wavebatch.kernels.pulses import LONGEST_PULSE
+from wavebatch.work import prepare_strip
+
+
+def _spoil(points):
+    """Marks every record, takes away, breaks and shuffles some."""
+    rng = np.random.default_rng(5)
+    n = len(points)
+    points["point_source_id"] = np.arange(n)
+    points["wavepacket_index"][rng.integers(0, n, 12)] = 0
+    points["wavepacket_size"][rng.integers(0, n, 5)] = 0
+    points["wavepacket_offset"][rng.integers(0, n, 7)] = 2**40
+    half = n // 2
+    points[half:] = points[half:][rng.permutation(n - half)]
+    points["point_source_id"] = np.arange(n)
+    return points
+
+
+@pytest.fixture(scope="module")
+def spoilt(tiny_strip, edit_points, tmp_path_factory):
+    return edit_points(tiny_strip, tmp_path_factory.mktemp("spoilt") / "spoilt.las", _spoil)
+
+
+def _read_packets(path):
+    """Per packet, by its first point: the echoes, and the points in it."""
+    prepared = prepare_strip(make_job(path))
+    echoes, members, flags, points = {}, {}, {}, []
+    with StripReader(path) as reader:
+        for number in range(prepared.units):
+            unit = reader.read_unit(number, prepared.scan)
+            points.append(unit.points)
+            flags.update({unit.start + k: flag for k, flag in enumerate(unit.point_flags.tolist())})
+            for block, _ in reader.read_blocks(unit, 100, owned_only=True):
+                table = prepared.job.chain.run(block, prepared.system)
+                for row, owner in enumerate(block.point.tolist()):
+                    mine = np.flatnonzero(table.waveform == row)
+                    a = table.attributes
+                    echoes[owner] = [
+                        {"time": table.time[k], "xyz": [a[c][k] for c in "xyz"], "point": int(a["point"][k]),
+                         "amplitude": a["amplitude"][k], "flags": int(table.flags[k]), "ray": block.direction[row]}
+                        for k in mine
+                    ]  # fmt: skip
+                    members[owner] = {
+                        int(p): float(t)
+                        for p, t in zip(
+                            block.returns.point[block.returns.waveform == row],
+                            block.returns.time[block.returns.waveform == row],
+                            strict=True,
+                        )
+                    }
+    prepared.scan.close()
+    return np.concatenate(points), echoes, members, flags, prepared
+
+
+def _find_pulse(times):
+    start = 0
+    pulse = []
+    for i, time in enumerate(times):
+        if i == 0 or time != times[i - 1]:
+            start = i
+        pulse.append(start)
+    for i, first in enumerate(pulse):
+        if times[i] == 0 or pulse.count(first) >= LONGEST_PULSE:
+            pulse[i] = i
+    return pulse
+
+
+def _expect_rows(points, echoes, members, flags, scales, offsets):
+    """The rows of echoes mode, one dictionary each."""
+    rows = []
+    pulse = _find_pulse(points["gps_time"].tolist())
+
+    def place(i):
+        return [points[axis][i] * s + o for axis, s, o in zip("XYZ", scales, offsets, strict=True)]
+
+    for i in range(len(points)):
+        if flags[i]:
+            row = {"source": i, "xyz": place(i), "flags": flags[i], "amplitude": None, "ray": None}
+            rows.append({**row, "pulse": pulse[i]})
+        elif i in echoes and echoes[i]:
+            for echo in echoes[i]:
+                near = min(members[i], key=lambda p: (abs(members[i][p] - echo["time"]), members[i][p]))
+                source = echo["point"] if echo["point"] >= 0 else near
+                flag = echo["flags"] | (EchoFlag.ADDED if echo["point"] < 0 else 0)
+                rows.append({**echo, "source": source, "flags": int(flag), "pulse": pulse[i]})
+        elif i in echoes:
+            for p in sorted(members[i], key=lambda p: (members[i][p], p)):
+                rows.append({"source": p, "xyz": place(p), "flags": int(EchoFlag.NO_ECHO), "amplitude": None,
+                             "ray": None, "pulse": pulse[i]})  # fmt: skip
+    return rows
+
+
+def _expect_numbers(rows, echoes, members, points):
+    owner_ray = {}
+    for owner in echoes:
+        for echo in echoes[owner]:
+            owner_ray[owner] = echo["ray"]
+    by_pulse = defaultdict(list)
+    for k, row in enumerate(rows):
+        by_pulse[row["pulse"]].append(k)
+    numbers = {}
+    for group in by_pulse.values():
+        ray = next((rows[k]["ray"] for k in group if rows[k]["ray"] is not None), None)
+        along = {k: 0.0 if ray is None else float(np.dot(rows[k]["xyz"], ray)) for k in group}
+        for k in group:
+            ahead = sum(along[other] < along[k] for other in group)
+            numbers[k] = (ahead + 1, len(group)) if ray is not None else None
+    return numbers
+
+
+def test_every_row_of_echoes_mode_is_what_a_loop_makes(spoilt, tmp_path):
+    outcome = run_one(spoilt, tmp_path, format="las")
+    assert outcome.error is None
+    points, echoes, members, flags, prepared = _read_packets(spoilt)
+    facts = prepared.facts
+    expected = _expect_rows(points, echoes, members, flags, facts.scales, facts.offsets)
+    found, xyz = read_cloud(tmp_path / "spoilt.las")
+    assert len(found) == len(expected)
+    assert found["point_source_id"].tolist() == [row["source"] for row in expected]
+    assert found["echo_flags"].tolist() == [row["flags"] for row in expected]
+    assert np.abs(xyz - np.array([row["xyz"] for row in expected])).max() <= 0.5 * max(facts.scales) + 1e-9
+    amplitude = [-9999.0 if row["amplitude"] is None else row["amplitude"] for row in expected]
+    assert found["amplitude"].tolist() == amplitude
+    numbers = _expect_numbers(expected, echoes, members, points)
+    bits = found["bit_fields"]
+    for k, number in numbers.items():
+        if number is not None:
+            assert (bits[k] & 7, bits[k] >> 3 & 7) == number, k
+        elif not echoes.get(expected[k]["source"], None) and expected[k]["flags"] == EchoFlag.NO_WAVEFORM:
+            assert bits[k] & 63 == points["bit_fields"][expected[k]["source"]] & 63
+    kinds = {row["flags"] for row in expected if row["amplitude"] is None}
+    assert kinds == {EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET, EchoFlag.NO_ECHO}
+    assert any(len(group) > 1 for group in members.values())
+
+
+def test_returns_mode_keeps_every_point_and_adds_the_matching_echo(spoilt, tmp_path):
+    outcome = run_one(spoilt, tmp_path, points="returns", format="las")
+    assert outcome.error is None
+    points, echoes, members, flags, _ = _read_packets(spoilt)
+    found, _ = read_cloud(tmp_path / "spoilt.las")
+    for name in ("X", "Y", "Z", "gps_time", "bit_fields", "intensity", "point_source_id", "user_data"):
+        assert (found[name] == points[name]).all(), name
+    matched = {echo["point"]: echo for group in echoes.values() for echo in group if echo["point"] >= 0}
+    for i in range(len(points)):
+        if i in matched:
+            assert found["amplitude"][i] == matched[i]["amplitude"]
+            assert found["echo_flags"][i] == matched[i]["flags"]
+        else:
+            assert found["amplitude"][i] == -9999.0
+            assert found["echo_flags"][i] == (flags[i] or EchoFlag.NO_ECHO)
+    counts = outcome.report
+    assert counts.count("points_out") == counts.count("points_in") == len(points)
+    assert counts.count("matched_returns") == len(matched)
+
+
+def test_counts_are_those_of_a_loop(spoilt, tmp_path):
+    report = run_one(spoilt, tmp_path).report
+    points, echoes, members, flags, _ = _read_packets(spoilt)
+    found = {owner: group for owner, group in echoes.items() if group}
+    matched = sum(echo["point"] >= 0 for group in found.values() for echo in group)
+    expected = {
+        "points_in": len(points),
+        "points_with_waveform": sum(flag == 0 for flag in flags.values()),
+        "points_without_waveform": sum(flag == EchoFlag.NO_WAVEFORM for flag in flags.values()),
+        "points_broken": sum(flag == EchoFlag.BROKEN_PACKET for flag in flags.values()),
+        "waveforms": len(echoes),
+        "echoes": sum(len(group) for group in found.values()),
+        "matched_returns": matched,
+        "no_echo_returns": sum(len(members[owner]) for owner in echoes if not echoes[owner]),
+        "unmatched_returns": sum(len(members[owner]) for owner in found) - matched,
+        "added_echoes": sum(echo["point"] < 0 for group in found.values() for echo in group),
+    }
+    for name, number in expected.items():
+        assert report.count(name) == number, name
+
+
+def test_return_numbers_beyond_the_point_format_are_cut_and_flagged(tiny_strip, edit_points, tmp_path):
+    def join(points):
+        points["gps_time"][:20] = 77.25
+        points["gps_time"][20:] = np.arange(len(points) - 20) + 100.0
+        return points
+
+    path = edit_points(tiny_strip, tmp_path / "joined.las", join)
+    assert run_one(path, tmp_path / "out", format="las").error is None
+    found, _ = read_cloud(tmp_path / "out" / "joined.las")
+    limit = (found["echo_flags"] & EchoFlag.RETURN_LIMIT) > 0
+    same = found["gps_time"] == 77.25
+    assert np.count_nonzero(limit & same) == np.count_nonzero(same) - 7
+    assert not limit[~same].any()
+    assert (found["bit_fields"][limit] & 7 == 7).all()
+    assert run_one(path, tmp_path / "six", format="las", point_format=6).error is None
+    found, _ = read_cloud(tmp_path / "six" / "joined.las")
+    cut = np.count_nonzero(found["echo_flags"] & EchoFlag.RETURN_LIMIT)
+    assert cut == np.count_nonzero(found["gps_time"] == 77.25) - 15
+
+
+def test_a_packet_read_twice_or_not_at_all_is_a_bug_not_a_cloud(tiny_strip):
+    prepared = prepare_strip(make_job(tiny_strip, points="returns"))
+    with StripReader(tiny_strip) as reader:
+        unit = reader.read_unit(0, prepared.scan)
+        results = [
+            (block, index, prepared.job.chain.run(block, prepared.system))
+            for block, index in reader.read_blocks(unit, 100, owned_only=True)
+        ]
+    with pytest.raises(StageError, match="exactly once"):
+        gather_echoes(unit, results[1:])
+    with pytest.raises(StageError, match="exactly once"):
+        gather_echoes(unit, [*results, results[0]])
+    echoes = gather_echoes(unit, results)
+    doubled = echoes.table.attributes["point"].copy()
+    matched = np.flatnonzero(doubled >= 0)
+    doubled[matched[1]] = doubled[matched[0]]
+    wrong = dataclasses.replace(echoes, table=echoes.table.with_attributes(point=doubled))
+    with pytest.raises(StageError, match="one to one"):
+        assemble_returns(unit, wrong, prepared.layout)
+    prepared.scan.close()

@@ -1,0 +1,67 @@
+"""Which strips an argument list means."""
+
+import pytest
+
+from wavebatch.errors import ConfigError
+from wavebatch.inputs import find_strips
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("b.las", "a.LAZ", "a.wdp", "note.txt", ".hidden.las", "sub/c.laz"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    return tmp_path
+
+
+def _names(arguments):
+    return [path.name for path in find_strips(arguments)]
+
+
+def test_a_folder_means_its_strips_by_name(folder):
+    assert _names([str(folder)]) == ["a.LAZ", "b.las"]
+
+
+def test_globs_mean_strips_only(folder):
+    assert _names([str(folder / "*")]) == ["a.LAZ", "b.las"]
+    assert _names([str(folder / "**" / "*")]) == ["a.LAZ", "b.las", "c.laz"]
+
+
+def test_a_list_is_relative_to_itself_and_may_hold_all_of_it(folder):
+    (folder / "strips.txt").write_text("# night of the 21st\n\nb.las\nsub\n*.LAZ\n")
+    assert _names([f"@{folder / 'strips.txt'}"]) == ["b.las", "c.laz", "a.LAZ"]
+
+
+def test_a_strip_counts_once(folder):
+    assert _names([str(folder / "b.las"), str(folder), str(folder / "sub" / ".." / "b.las")]) == ["b.las", "a.LAZ"]
+
+
+def test_a_name_with_brackets_is_a_name(folder):
+    (folder / "x[1].las").write_bytes(b"")
+    assert _names([str(folder / "x[1].las")]) == ["x[1].las"]
+
+
+def test_a_named_file_that_is_missing_fails_later_and_alone(folder):
+    assert _names([str(folder / "none.las"), str(folder / "b.las")]) == ["none.las", "b.las"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["empty"], "holds no .las or .laz"),
+        (["*.laz2"], "matches no"),
+        (["@none.txt"], "list of strips cannot be read"),
+        (["@loop.txt"], "line 1: a list cannot name another list"),
+        (["@blank.txt"], "no strip given"),
+        (["b.las", "sub/b.laz"], "both would be written as b"),
+    ],
+)
+def test_what_means_nothing_is_refused_in_one_line(folder, monkeypatch, arguments, words):
+    monkeypatch.chdir(folder)
+    (folder / "empty").mkdir()
+    (folder / "sub" / "b.laz").write_bytes(b"")
+    (folder / "loop.txt").write_text("@loop.txt\n")
+    (folder / "blank.txt").write_text("# nothing\n")
+    with pytest.raises(ConfigError, match=words) as caught:
+        find_strips(arguments)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,68 @@
+"""Pulses, nearest returns and return numbers, against plain loops."""
+
+import numpy as np
+import pytest
+
+from wavebatch.kernels.pulses import LONGEST_PULSE, find_nearest, find_pulses, number_returns
+
+
+def test_runs_of_equal_time_are_pulses():
+    time = np.array([5.0, 5.0, 6.0, 5.0, 5.0, 5.0])
+    assert find_pulses(time).tolist() == [0, 0, 2, 3, 3, 3]
+    assert find_pulses(np.empty(0)).tolist() == []
+
+
+@pytest.mark.parametrize("length", [LONGEST_PULSE - 1, LONGEST_PULSE])
+def test_a_time_that_stays_says_nothing(length):
+    pulse = find_pulses(np.full(length, 7.0))
+    assert pulse.tolist() == ([0] * length if length < LONGEST_PULSE else list(range(length)))
+
+
+def test_time_zero_says_nothing():
+    assert find_pulses(np.array([0.0, 0.0, 1.0, 1.0])).tolist() == [0, 1, 2, 2]
+
+
+def _nearest_by_loop(echo_waveform, echo_time, return_waveform, return_time):
+    found = []
+    for waveform, time in zip(echo_waveform, echo_time, strict=True):
+        rows = [k for k in range(len(return_waveform)) if return_waveform[k] == waveform]
+        rows.sort(key=lambda k: (abs(return_time[k] - time), return_time[k], k))
+        found.append(rows[0] if rows else -1)
+    return found
+
+
+def test_nearest_return_is_that_of_a_loop(rng):
+    for _ in range(50):
+        m, k = rng.integers(0, 20, 2)
+        echo_waveform = np.sort(rng.integers(0, 6, m)).astype(np.int32)
+        return_waveform = rng.integers(0, 6, k).astype(np.int32)
+        echo_time, return_time = rng.integers(0, 12, m) / 2.0, rng.integers(0, 12, k) / 1.0
+        found = find_nearest(echo_waveform, echo_time, return_waveform, return_time)
+        expected = _nearest_by_loop(echo_waveform, echo_time, return_waveform, return_time)
+        for row, other, w, t in zip(found, expected, echo_waveform, echo_time, strict=True):
+            assert (row < 0) == (other < 0)
+            if row >= 0:
+                assert return_waveform[row] == w
+                assert return_time[row] == return_time[other], (w, t)
+
+
+def test_numbers_follow_the_ray_of_the_pulse(rng):
+    for _ in range(30):
+        m = int(rng.integers(1, 30))
+        pulse = rng.integers(0, 8, m) * 10
+        rays = rng.normal(size=(100, 3))
+        along = rng.permutation(m).astype(float)
+        xyz = np.array([4e5, 5e6, 300.0]) + rays[pulse] * along[:, None]
+        has_ray = rng.random(m) < 0.7
+        direction = np.where(has_ray[:, None], rays[pulse], 0.0)
+        number, total, known = number_returns(pulse, xyz, direction)
+        for row in range(m):
+            same = np.flatnonzero(pulse == pulse[row])
+            assert known[row] == has_ray[same].any()
+            assert total[row] == len(same)
+            if known[row]:
+                assert number[row] == 1 + np.count_nonzero(along[same] < along[row])
+
+
+def test_numbers_of_nothing():
+    assert [len(part) for part in number_returns(np.empty(0, int), np.empty((0, 3)), np.empty((0, 3)))] == [0, 0, 0]
