@@ -1,0 +1,374 @@
+"""Units, packets, blocks: what StripReader gives against a plain reading of the same bytes."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, vlr
+from writer_tools import data_file, read_raw
+
+from wavebatch.blocks import EchoFlag
+from wavebatch.errors import InputError
+from wavebatch.io import sharing, spool, strip
+from wavebatch.io.strip import StripReader
+
+RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
+LEICA = "leica-als/simple1_3_full_internal.las"
+
+
+def assert_same(found, plain):
+    assert found.keys() == plain.keys()
+    for key, (samples, members) in plain.items():
+        np.testing.assert_array_equal(found[key][0], samples)
+        assert found[key][1] == members
+
+
+@pytest.mark.parametrize("point_format", [4, 5, 9, 10])
+@pytest.mark.parametrize("internal", [True, False])
+@pytest.mark.parametrize("bits", [8, 16, 32])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_every_kind_of_strip_gives_the_samples_in_its_bytes(tmp_path, point_format, internal, bits, suffix):
+    raw = make_raw(point_format=point_format, internal=internal, bits=bits)
+    path = raw.write(tmp_path / f"a{suffix}")
+    assert_same(read_all(path), read_plainly(raw.points, bytes(60) + raw.packets, {1: (bits, 32)}))
+
+
+@pytest.mark.parametrize("minor", [3, 4])
+def test_formats_4_and_5_are_read_in_1_3_and_1_4(tmp_path, minor):
+    raw = make_raw(point_format=5, minor=minor)
+    assert len(read_all(raw.write(tmp_path / "a.las"))) == 40
+
+
+def test_las_1_5_is_read(tmp_path):
+    raw = make_raw(point_format=9, minor=5)
+    assert len(read_all(raw.write(tmp_path / "a.las"))) == 40
+
+
+def test_geometry_is_that_of_the_simulated_pulses(tmp_path):
+    raw = make_raw()
+    found = read_all(raw.write(tmp_path / "a.las"))
+    for _, members, origin, direction in found.values():
+        pulse = round((raw.points["gps_time"][members[0]] - 1000.0) * 1e5)
+        np.testing.assert_allclose(origin, [pulse * 0.5, 0, 500], atol=2e-3)
+        np.testing.assert_allclose(direction, -1000 * TOWARD, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "packets"), [(RIEGL, 2375), (LEICA, 999)])
+@pytest.mark.parametrize("unit_points", [50_000, 100])
+def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_points):
+    path = data_file(name)
+    monkeypatch.setattr(strip, "UNIT_POINTS", unit_points)
+    points = read_raw(path)
+    with StripReader(path) as reader:
+        facts = reader.facts
+        kinds = {i: (d.bits, d.n_samples) for i, d in facts.digitizers.items()}
+        data = facts.packet_file.read_bytes()[facts.packet_base :]
+        with reader.scan() as scan:
+            assert scan.packets == packets
+            assert scan.with_waveform == len(points)
+            assert scan.direction == "toward"
+            assert abs(scan.vector_ratio - 0.9997) < 2e-4
+    assert_same(read_all(path, size=100), read_plainly(points, data, kinds))
+
+
+def _shuffled(tmp_path, points, order):
+    source = data_file(RIEGL)
+    with StripReader(source) as reader:
+        start = source.read_bytes()[: source.stat().st_size - points.nbytes]
+        wdp = reader.facts.packet_file.read_bytes()
+    path = tmp_path / "s.las"
+    path.write_bytes(start + points[order].tobytes())
+    path.with_suffix(".wdp").write_bytes(wdp)
+    return path
+
+
+@pytest.mark.parametrize("window", [16_384, 300, 64])
+@pytest.mark.parametrize("order", ["reversed", "by return", "random", "halves"])
+def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monkeypatch, order, window):
+    """Far sharing goes through the disk; the window is made so small that it must."""
+    points = read_raw(data_file(RIEGL))
+    orders = {
+        "reversed": np.arange(len(points))[::-1],
+        "by return": np.argsort(points["bit_fields"] & 15, kind="stable"),
+        "random": np.random.default_rng(3).permutation(len(points)),
+        "halves": np.argsort(np.arange(len(points)) % 2, kind="stable"),
+    }
+    path = _shuffled(tmp_path, points, orders[order])
+    kinds = {1: (16, 60), 2: (16, 120)}
+    plain = read_plainly(points[orders[order]], path.with_suffix(".wdp").read_bytes(), kinds)
+    monkeypatch.setattr(strip, "UNIT_POINTS", 128)
+    monkeypatch.setattr(sharing, "WINDOW", window)
+    monkeypatch.setattr(sharing, "BINS", 64)
+    monkeypatch.setattr(sharing, "_PER_BUCKET", 500)
+    monkeypatch.setattr(spool, "MEMORY", 3000)
+    monkeypatch.setattr(spool, "KEPT", 100)
+    assert_same(read_all(path, size=50), plain)
+    assert_same(read_all(path, size=50, owned_only=False), plain)
+    with StripReader(path) as reader, reader.scan() as scan:
+        assert (scan.packets, scan.with_waveform) == (2375, 2535)
+        spans = [members[-1] - members[0] for _, members in plain.values()]
+        assert scan.reach == max(spans)
+        assert scan.direction == "toward"
+        spooled = scan.spool
+        assert spooled.exists()
+    assert not spooled.exists()
+
+
+def test_block_and_unit_sizes_change_nothing(monkeypatch):
+    path = data_file(RIEGL)
+    whole = read_all(path, size=4096)
+    monkeypatch.setattr(strip, "UNIT_POINTS", 77)
+    for size in (1, 13):
+        parts = read_all(path, size=size)
+        assert list(parts.keys() - whole.keys()) == []
+        for key, (samples, members, origin, direction) in whole.items():
+            np.testing.assert_array_equal(parts[key][0], samples)
+            assert parts[key][1] == members
+            assert parts[key][2].tobytes() == origin.tobytes()
+            assert parts[key][3].tobytes() == direction.tobytes()
+
+
+def test_units_take_every_point_once_and_cut_no_pulse(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    raw = make_raw(400)
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        units = [reader.read_unit(number, scan) for number in range(reader.unit_count())]
+        assert np.concatenate([unit.points for unit in units]).tobytes() == raw.points.tobytes()
+        assert [unit.start for unit in units] == scan.borders[:-1].tolist()
+        for before, after in zip(units[:-1], units[1:], strict=True):
+            assert before.points["gps_time"][-1] != after.points["gps_time"][0]
+        assert any(unit.start % 64 for unit in units)
+        assert sum(int(unit.packets.owned.sum()) for unit in units) == 400
+
+
+def test_a_border_cuts_runs_that_are_not_pulses(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    raw = make_raw(100)
+    raw.points["gps_time"] = 0
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert scan.borders[:-1].tolist() == list(range(0, len(raw.points), 64))
+    assert len(read_all(tmp_path / "a.las")) == 100
+
+
+def test_context_gives_returns_of_other_units(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    raw = make_raw(64, most_returns=1)
+    points = np.concatenate([raw.points, raw.points])
+    points["gps_time"] = np.arange(128)
+    points["bit_fields"][64:] = 2
+    points["return_point_wave_location"][64:] += 8000
+    raw.points = points
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        first, second = reader.read_unit(0, scan), reader.read_unit(1, scan)
+        assert first.context_index.tolist() == list(range(64, 128))
+        assert second.context_index.tolist() == list(range(64))
+        assert first.packets.owned.all() and not second.packets.owned.any()
+        assert list(reader.read_blocks(second, 100, owned_only=True)) == []
+        (block, rows), = reader.read_blocks(second, 100, owned_only=False)
+        assert block.point.tolist() == list(range(64))
+        assert block.returns.point.reshape(64, 2).tolist() == [[i, i + 64] for i in range(64)]
+        assert second.packet_of_point.tolist() == rows.tolist()
+        assert block.gps_time.tolist() == list(range(64))
+
+
+def test_unusable_packets_are_flagged_and_the_rest_is_read(tmp_path):
+    raw = make_raw(40, most_returns=1)
+    p = raw.points
+    end = 60 + len(raw.packets)
+    p["wavepacket_index"][0] = 0
+    p["wavepacket_size"][1] = 0
+    p["wavepacket_offset"][2] = end - 31
+    p["wavepacket_offset"][3] = 59
+    p["wavepacket_offset"][4] = 2**64 - 10
+    p["wavepacket_offset"][5] = 2**63 + 60
+    p["wavepacket_index"][6] = 2
+    p["return_point_wave_location"][7] = np.nan
+    p["x_t"][8] = np.inf
+    p["x_t"][9] = p["y_t"][9] = p["z_t"][9] = 0
+    p["wavepacket_index"][10] = 3
+    raw.vlrs.append(descriptor(3, samples=0, spacing=0))
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        unit = reader.read_unit(0, scan)
+        expected = [EchoFlag.NO_WAVEFORM] * 2 + [EchoFlag.BROKEN_PACKET] * 9 + [0] * 29
+        assert unit.point_flags.tolist() == [int(flag) for flag in expected]
+        assert unit.packet_of_point.tolist() == [-1] * 11 + list(range(29))
+        assert (scan.with_waveform, scan.without_waveform, scan.broken) == (29, 2, 9)
+        assert scan.packets == 29
+        assert sum(count for count, _ in scan.reasons.values()) == 9
+        assert len(scan.warnings) == 4
+        assert [len(block) for block, _ in reader.read_blocks(unit, 100, True)] == [29]
+
+
+def test_the_last_byte_of_the_last_packet_counts(tmp_path):
+    raw = make_raw(4, most_returns=1)
+    raw.packets = raw.packets[:-1]
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert reader.read_unit(0, scan).point_flags.tolist() == [0, 0, 0, EchoFlag.BROKEN_PACKET]
+
+
+def test_packets_shorter_than_the_descriptor_come_by_length(tmp_path):
+    raw = make_raw(40, most_returns=1)
+    raw.points["wavepacket_size"][::2] = 20
+    raw.points["wavepacket_size"][1] = 31
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        unit = reader.read_unit(0, scan)
+        shapes = [block.samples.shape for block, _ in reader.read_blocks(unit, 100, True)]
+        assert shapes == [(20, 20), (1, 31), (19, 32)]
+        assert scan.short == 21
+    assert_same(read_all(tmp_path / "a.las"), read_plainly(raw.points, bytes(60) + raw.packets, {1: (8, 32)}))
+
+
+def test_a_packet_longer_than_the_descriptor_is_cut_to_it(tmp_path):
+    raw = make_raw(10, most_returns=1)
+    raw.points["wavepacket_size"] = 2**32 - 1
+    assert all(len(samples) == 32 for samples, *_ in read_all(raw.write(tmp_path / "a.las")).values())
+
+
+def test_several_descriptors_in_one_file(tmp_path):
+    first, second = make_raw(20, seed=1), make_raw(20, seed=2, bits=16, n_samples=50)
+    first.packets += second.packets
+    second.points["wavepacket_index"] = 7
+    second.points["wavepacket_offset"] += 20 * 32
+    second.points["gps_time"] += 1
+    first.points = np.concatenate([first.points, second.points])
+    unused = [descriptor(index, samples=0, spacing=0) for index in (2, 3, 200)]
+    first.vlrs = [descriptor(7, bits=16, samples=50, gain=0), *unused, first.vlrs[0]]
+    found = read_all(first.write(tmp_path / "a.las"))
+    assert_same(found, read_plainly(first.points, bytes(60) + first.packets, {1: (8, 32), 7: (16, 50)}))
+    with StripReader(tmp_path / "a.las") as reader:
+        assert sorted(reader.facts.digitizers) == [1, 2, 3, 7, 200]
+
+
+def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
+    raw = make_raw(10, most_returns=1)
+    raw.points = np.repeat(raw.points, 2)
+    raw.points["wavepacket_index"][1::2] = 2
+    raw.vlrs.append(descriptor(2, samples=16))
+    found = read_all(raw.write(tmp_path / "a.las"))
+    assert_same(found, read_plainly(raw.points, bytes(60) + raw.packets, {1: (8, 32), 2: (8, 16)}))
+    assert len(found) == 20
+
+
+def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    for window in (16_384, 64):
+        monkeypatch.setattr(sharing, "WINDOW", window)
+        raw = make_raw(1000, most_returns=1)
+        bad = np.arange(0, 1000, 25)
+        raw.points["wavepacket_offset"][bad] = 60
+        with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+            assert (scan.broken, scan.with_waveform, scan.packets) == (40, 960, 960)
+            flags = np.concatenate([reader.read_unit(n, scan).point_flags for n in range(reader.unit_count())])
+            assert np.flatnonzero(flags).tolist() == bad.tolist()
+            assert reader.read_unit(3, scan).context.size == 0
+
+
+def test_offsets_beyond_4_gib(tmp_path):
+    raw = make_raw(20, internal=False, most_returns=2)
+    far = 5 * 2**32
+    path = raw.write(tmp_path / "a.las")
+    with open(path.with_suffix(".wdp"), "r+b") as file:
+        file.seek(far)
+        file.write(raw.packets)
+    raw.points["wavepacket_offset"][::2] += far - 60
+    (path.parent / "b").mkdir()
+    os.replace(path.with_suffix(".wdp"), tmp_path / "b" / "a.wdp")
+    raw.packets = b""
+    moved = raw.write(tmp_path / "a.las")
+    os.replace(moved, tmp_path / "b" / "a.las")
+    found = read_all(tmp_path / "b" / "a.las")
+    with open(tmp_path / "b" / "a.wdp", "rb") as file:
+        for (_, offset), (samples, *_) in found.items():
+            file.seek(offset)
+            assert file.read(32) == samples.tobytes()
+    assert any(offset > 2**32 for _, offset in found)
+    assert any(offset < 2**32 for _, offset in found)
+
+
+def test_samples_are_read_only_and_blocks_hold_at_most_their_size(tmp_path):
+    with StripReader(make_raw(100).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        unit = reader.read_unit(0, scan)
+        sizes = []
+        for block, rows in reader.read_blocks(unit, 33, True):
+            assert not block.samples.flags.writeable
+            assert block.samples.flags.c_contiguous
+            assert len(rows) == len(block)
+            sizes.append(len(block))
+        assert sizes == [33, 33, 33, 1]
+
+
+def test_sample_blocks_spread_over_the_strip_and_repeat(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    with StripReader(make_raw(1000).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        points = [block.point for block in reader.sample_blocks(scan, 100)]
+        again = [block.point for block in reader.sample_blocks(scan, 100)]
+        everything = np.concatenate(points)
+        assert everything.tolist() == np.concatenate(again).tolist()
+        assert 90 <= len(everything) <= 110
+        assert everything.min() < 100 and everything.max() > scan.points - 150
+        assert sum(len(block) for block in reader.sample_blocks(scan, 10**6)) <= scan.packets
+
+
+def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
+    raw = make_raw(5)
+    raw.points = raw.points[:0]
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert (reader.unit_count(), scan.points, scan.packets) == (0, 0, 0)
+        assert list(reader.sample_blocks(scan, 10)) == []
+    raw = make_raw(5)
+    raw.points["wavepacket_index"] = 0
+    with StripReader(raw.write(tmp_path / "b.las")) as reader, reader.scan() as scan:
+        unit = reader.read_unit(0, scan)
+        assert (unit.point_flags == EchoFlag.NO_WAVEFORM).all()
+        assert len(unit.packets) == 0
+        assert list(reader.read_blocks(unit, 10, True)) == []
+
+
+def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(spool, "KEPT", 0)
+    raw = make_raw(64, most_returns=1)
+    raw.points = np.concatenate([raw.points, raw.points])
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        facts, copy = pickle.loads(pickle.dumps((reader.facts, scan)))
+        assert facts.digitizers == reader.facts.digitizers
+        here, there = reader.read_unit(1, scan), reader.read_unit(1, copy)
+        assert here.context_index.tolist() == there.context_index.tolist() != []
+
+
+def test_extra_bytes_and_crs_are_told(tmp_path):
+    raw = make_raw(5)
+    wide = np.zeros(len(raw.points), [*raw.points.dtype.descr, ("tail", "<u2")])
+    for name in raw.points.dtype.names:
+        wide[name] = raw.points[name]
+    wide["tail"] = np.arange(len(wide))
+    raw.points = wide
+    record = bytearray(192)
+    record[2] = 3
+    record[4:8] = b"tail"
+    raw.vlrs += [vlr(b"LASF_Spec", 4, bytes(record)), vlr(b"LASF_Projection", 2112, b"PROJCS[\"x\"]\0")]
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        assert reader.facts.extra_dimensions == ("tail",)
+        assert reader.facts.crs == 'PROJCS["x"]'
+        assert reader.read_unit(0, scan).points["tail"].tolist() == list(range(len(wide)))
+
+
+def test_long_records_make_smaller_units(tmp_path, monkeypatch):
+    monkeypatch.setattr(strip, "UNIT_BYTES", 57 * 100)
+    with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader:
+        assert reader.unit_count() == -(-reader.facts.point_count // 100)
+
+
+def test_a_file_that_shrinks_while_it_is_read_is_an_input_error(tmp_path):
+    raw = make_raw(50, internal=False)
+    with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
+        unit = reader.read_unit(0, scan)
+        os.truncate(tmp_path / "a.wdp", 100)
+        with pytest.raises(InputError, match=r"a\.wdp: packets cannot be read"):
+            list(reader.read_blocks(unit, 10, True))
+        os.truncate(tmp_path / "a.las", 400)
+        with pytest.raises(InputError, match=r"a\.las: points 0 to"):
+            reader.read_unit(0, scan)
+
+
