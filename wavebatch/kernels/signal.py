@@ -46,7 +46,23 @@ def find_peaks(signal: np.ndarray, threshold: np.ndarray | float) -> tuple[np.nd
     flat = np.flatnonzero(falling)
     sample, waveform = np.divmod(flat, n)
     order = np.argsort(waveform.astype(np.uint16) if n <= 65536 else waveform, kind="stable")
-    return waveform[order], sample[order]
+    waveform, sample = waveform[order], sample[order]
+    top = _is_top(signal, waveform, sample)
+    return waveform[top], sample[top]
+
+
+def _is_top(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
+    """False (m,) where the plateau that begins at a sample is a step of a rising flank: the signal rises behind it."""
+    top = np.ones(len(sample), bool)
+    flat = np.arange(len(sample))
+    ahead = sample.copy()
+    while len(flat):
+        ahead[flat] += 1
+        flat = flat[ahead[flat] < len(signal)]
+        rise = signal[ahead[flat], waveform[flat]] - signal[sample[flat], waveform[flat]]
+        top[flat] = rise <= 0
+        flat = flat[rise == 0]
+    return top
 
 
 def widen(mask: np.ndarray, reach: int) -> np.ndarray:
