@@ -44,6 +44,8 @@ def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> Pooled
     reach: samples next to a signal that are not quiet. limit: a smoothed sample further from the level than this many
     standard deviations is signal.
     """
+    if not signal.size:
+        return PooledNoise(0.0, QUANTISATION_STD, QUANTISATION_STD, 0.0, 0.0)
     signal = signal.astype(np.float32)
     level, std = first_level(signal)
     spread = 0.0
