@@ -48,16 +48,17 @@ class Differences:
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
         for name in ("amplitude_err", "echo_width_err", "range_err"):
-            part[name] = a[name].astype(np.float64)
+            part[name] = a[name]
         for name in ("amplitude", "echo_width", "flags"):
             part[f"true_{name}"] = b[name]
         part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
         start = -self.seen % self.step
         self.seen += len(a)
-        self.parts.append({name: values[start :: self.step] for name, values in part.items()})
-        if sum(len(part["time"]) for part in self.parts) > self.LIMIT:
+        # Copies, because slices would keep the whole records alive.
+        self.parts.append({name: values[start :: self.step].copy() for name, values in part.items()})
+        while sum(len(part["time"]) for part in self.parts) > self.LIMIT:
             whole = self._join()
-            self.parts = [{name: values[::2] for name, values in whole.items()}]
+            self.parts = [{name: values[::2].copy() for name, values in whole.items()}]
             self.step *= 2
 
     def _join(self) -> dict[str, np.ndarray]:
@@ -87,12 +88,13 @@ class Differences:
             return {}
         data = self._join()
         sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
+        reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
         bounds = crlb(data["true_amplitude"], sigma, meta["noise_std"], meta["spacing"])
         columns = {
-            "time": (data["time"], bounds[0], data["range_err"] / SPEED),
-            "echo_time": (data["echo_time"], bounds[0], data["range_err"] / SPEED),
-            "amplitude": (data["amplitude"], bounds[1], data["amplitude_err"]),
-            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], data["echo_width_err"] / FWHM_PER_SIGMA),
+            "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
+            "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),
+            "amplitude": (data["amplitude"], bounds[1], reported["amplitude_err"]),
+            "sigma": (data["echo_width"] / FWHM_PER_SIGMA, bounds[2], reported["echo_width_err"] / FWHM_PER_SIGMA),
         }
         classes = {
             "all": np.ones(len(sigma), bool),
