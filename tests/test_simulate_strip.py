@@ -243,3 +243,15 @@ def test_truth_is_an_ordinary_npz_and_read_in_pieces(tmp_path):
         assert np.array_equal(np.concatenate([piece["isolated"] for piece in pieces]), whole["isolated"])
         assert reader.meta["scene"] == "mixed"
         assert reader.meta["noise_std"] == pytest.approx(np.hypot(1.2, 1 / np.sqrt(12)))
+
+
+def test_truth_goes_when_the_strip_cannot_be_published(tmp_path, monkeypatch):
+    from wavebatch.io.fullwave import FullwaveWriter
+
+    def fail(self):
+        raise InputError("disk full")
+
+    monkeypatch.setattr(FullwaveWriter, "commit", fail)
+    with pytest.raises(InputError, match="disk full"):
+        simulate_strip("flat", tmp_path / "s.las", pulses=50, truth=tmp_path / "t.npz")
+    assert not list(tmp_path.iterdir())

@@ -164,6 +164,7 @@ class _Task:
             self.borders = np.quantile(some, np.arange(1, self.number) / self.number)
 
     def add(self, side: int, rows: np.ndarray) -> None:
+        """Takes in rows of a (side 0), b (1) or the truth's packets (2)."""
         self.buckets[side].add(rows, self._sort_by_time if self.by_time else self._sort_by_place)
 
     def _sort_by_time(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,6 +183,7 @@ class _Task:
         return np.concatenate(index), np.concatenate(bucket)
 
     def finish(self, name_a: str, name_b: str) -> Comparison:
+        """Compares bucket by bucket and sums up."""
         for number in range(self.number):
             a, b, packets = (bucket.read(number) for bucket in self.buckets)
             if self.by_time:

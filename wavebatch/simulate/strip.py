@@ -105,18 +105,23 @@ def simulate_strip(
                 summary = _write_block(writer, notes, simulated, scene, options, rng, summary)
                 if progress:
                     progress(n)
-            if notes:
-                notes.publish(_describe(scene, seed, summary))
-            try:
-                writer.commit()
-            except BaseException:
-                if notes:
-                    notes.withdraw()
-                raise
+            _publish(writer, notes, _describe(scene, seed, summary))
     finally:
         if notes:
             notes.discard()
     return summary
+
+
+def _publish(writer: FullwaveWriter, notes: TruthWriter | None, meta: dict) -> None:
+    """Both files or none: the strip appears last."""
+    if notes:
+        notes.publish(meta)
+    try:
+        writer.commit()
+    except BaseException:
+        if notes:
+            notes.withdraw()
+        raise
 
 
 def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: bool) -> FullwaveWriter:
