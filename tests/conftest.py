@@ -48,9 +48,9 @@ def tiny_strip(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def wide_strip(tmp_path_factory) -> Path:
-    """More points than fit in two work units."""
+    """More points than fit in one work unit."""
     path = tmp_path_factory.mktemp("wide") / "wide.las"
-    simulate_strip("urban", path, pulses=104_000, seed=4)
+    simulate_strip("urban", path, pulses=56_000, seed=4)
     return path
 
 
