@@ -1,0 +1,156 @@
+"""Slow, plain references for the fast kernels: loops over waveforms, scipy per problem, differences for derivatives."""
+
+import numpy as np
+from scipy.optimize import least_squares
+
+
+def smooth_121(waveform):
+    """[1 2 1]/4 along one waveform, ends repeated."""
+    last = len(waveform) - 1
+    return np.array(
+        [(waveform[max(i - 1, 0)] + 2 * waveform[i] + waveform[min(i + 1, last)]) / 4 for i in range(last + 1)]
+    )
+
+
+def correlate_symmetric(waveform, taps):
+    """One waveform correlated with a symmetric filter given by its half, zero outside."""
+    s = len(waveform)
+    total = np.zeros(s)
+    for i in range(s):
+        for lag in range(-len(taps) + 1, len(taps)):
+            if 0 <= i + lag < s:
+                total[i] += taps[abs(lag)] * waveform[i + lag]
+    return total
+
+
+def find_peaks(signal, threshold):
+    """(waveform, sample) of local maxima of signal (s, n) above the threshold; a plateau counts at its first sample."""
+    s, n = signal.shape
+    threshold = np.broadcast_to(threshold, n)
+    found = []
+    for w in range(n):
+        for i in range(s):
+            y = signal[i, w]
+            before = i - 1
+            after = i + 1
+            while after < s and signal[after, w] == y:
+                after += 1
+            starts = before < 0 or signal[before, w] < y
+            ends = after >= s or signal[after, w] < y
+            if starts and ends and y > threshold[w]:
+                found.append((w, i))
+    return found
+
+
+def widen(mask, reach):
+    """Boolean (s, n) with `reach` samples marked around every true one."""
+    wide = np.zeros_like(mask)
+    for i, w in zip(*np.nonzero(mask), strict=True):
+        wide[max(i - reach, 0) : i + reach + 1, w] = True
+    return wide
+
+
+def find_runs(signal, level):
+    """(waveform, first, one behind the last) of every run of signal (s, n) above level (n,)."""
+    s, n = signal.shape
+    runs = []
+    for w in range(n):
+        i = 0
+        while i < s:
+            if signal[i, w] > level[w]:
+                start = i
+                while i < s and signal[i, w] > level[w]:
+                    i += 1
+                runs.append((w, start, i))
+            else:
+                i += 1
+    return runs
+
+
+def match_returns(echo_waveform, echo_time, return_waveform, return_time, tolerance):
+    """Greedy pairs by distance, each echo and each return once: the row of the return per echo, -1 without one."""
+    pairs = []
+    for i, (w, t) in enumerate(zip(echo_waveform, echo_time, strict=True)):
+        for j, (v, u) in enumerate(zip(return_waveform, return_time, strict=True)):
+            if w == v and abs(t - u) <= tolerance:
+                pairs.append((abs(t - u), i, j))
+    matched = np.full(len(echo_waveform), -1)
+    taken = set()
+    for _, i, j in sorted(pairs):
+        if matched[i] < 0 and j not in taken:
+            matched[i] = j
+            taken.add(j)
+    return matched
+
+
+def pulse(x, t, s, kappa=0.0, components=()):
+    """Unit pulse of ALGORITHMS.md 0 and R1 in float64: Gaussian, skewed, or with further components."""
+    if abs(kappa) > 0:
+        u = 1 + kappa * (x - t) / s
+        level = np.log(np.where(u > 0, u, 1.0)) / kappa
+        return np.where(u > 0, np.exp(-0.5 * level**2), 0.0)
+    total = np.exp(-0.5 * ((x - t) / s) ** 2)
+    for weight, delay, extra in components:
+        wide = s * s + extra
+        total = total + weight * s / np.sqrt(wide) * np.exp(-0.5 * (x - t - delay) ** 2 / wide)
+    return total
+
+
+def model(parameters, x, **shape):
+    """Sum of echoes; parameters (3, k): amplitude, time, width."""
+    return sum(a * pulse(x, t, s, **shape) for a, t, s in parameters.T)
+
+
+def fit(y, x, std, start, low, high, clipped=None, weight=None, prior=None, **shape):
+    """Parameters (3, k) and chi2 of one problem by scipy, with the same box, censoring and prior as the batch."""
+    k = start.shape[1]
+
+    def residual(flat):
+        parameters = flat.reshape(3, k)
+        r = y - model(parameters, x, **shape)
+        if clipped is not None:
+            r = np.where(clipped & (r <= 0), 0.0, r)
+        if weight is not None:
+            r = r * weight
+        r = r / std
+        if prior is None:
+            return r
+        width, spread = prior
+        return np.concatenate([r, np.maximum(width - parameters[2], 0) / spread])
+
+    low, high = (np.broadcast_to(edge, start.shape).ravel() for edge in (low, high))
+    inner = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
+    result = least_squares(residual, inner, bounds=(low, high), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
+    return result.x.reshape(3, k), 2 * result.cost
+
+
+def differentiate(function, parameters, step=1e-5):
+    """Central differences of function(parameters) -> (L,) by every parameter: (L, p)."""
+    flat = np.asarray(parameters, float).ravel()
+    columns = []
+    for i in range(len(flat)):
+        up, down = flat.copy(), flat.copy()
+        up[i] += step
+        down[i] -= step
+        columns.append((function(up) - function(down)) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def fisher_errors(parameters, x, std, **shape):
+    """Standard deviations (3, k) from the inverse Fisher matrix, derivatives by differences."""
+    jacobian = differentiate(lambda flat: model(flat.reshape(parameters.shape), x, **shape), parameters)
+    return np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))).reshape(parameters.shape) * std
+
+
+def closed_form(y, fraction):
+    """Amplitude, time after the middle and width of one window by a weighted parabola through its logarithms."""
+    middle = len(y) // 2
+    low = high = middle
+    while low > 0 and y[low - 1] >= fraction * y[middle]:
+        low -= 1
+    while high < len(y) - 1 and y[high + 1] >= fraction * y[middle]:
+        high += 1
+    x = np.arange(low - middle, high - middle + 1)
+    part = y[low : high + 1]
+    c2, c1, c0 = np.polyfit(x, np.log(part), 2, w=part)
+    return np.exp(c0 - c1 * c1 / (4 * c2)), -c1 / (2 * c2), np.sqrt(-1 / (2 * c2))
