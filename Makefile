@@ -1,0 +1,53 @@
+# A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
+#   make demo      simulate a forest strip, run it, compare the result with the truth
+#   make test      the fast tests          make test-all   all of them
+#   make bench     waveforms per second    make lint       ruff       make clean   remove what was made
+
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+DEMO   := demo
+BENCH  := bench
+
+.PHONY: demo test test-all bench lint clean
+.DELETE_ON_ERROR:
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "wavebatch needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.run: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+$(VENV)/.test: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $@ $(VENV)/.run
+
+demo: $(VENV)/.run
+	@mkdir -p $(DEMO)
+	$(BIN)/wavebatch simulate forest -o $(DEMO)/forest.laz --pulses 50000 --seed 1 --truth $(DEMO)/truth.npz --overwrite
+	$(BIN)/wavebatch info $(DEMO)/forest.laz
+	$(BIN)/wavebatch run $(DEMO)/forest.laz -o $(DEMO)/out --profile accurate --overwrite -v
+	$(BIN)/wavebatch compare $(DEMO)/out/forest.laz --truth $(DEMO)/truth.npz
+	@echo
+	@echo "cloud:  $(DEMO)/out/forest.laz"
+	@echo "report: $(DEMO)/out/forest.report.json"
+
+test: $(VENV)/.test
+	$(BIN)/python -m pytest -q -n auto -m 'not slow'
+
+test-all: $(VENV)/.test
+	$(BIN)/python -m pytest -q -n auto
+
+bench: $(VENV)/.test
+	@mkdir -p $(BENCH)
+	$(BIN)/python tests/benchmark.py $(BENCH)
+
+lint: $(VENV)/.test
+	$(BIN)/python -m ruff check .
+
+clean:
+	rm -rf $(VENV) $(DEMO) $(BENCH) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

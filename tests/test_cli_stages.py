@@ -1,0 +1,52 @@
+"""`wavebatch stages`: every algorithm can be looked up, and its example is a chain that loads."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from wavebatch import stages  # noqa: F401
+from wavebatch.chain import STAGES
+from wavebatch.cli import main
+from wavebatch.config import effective, parse_chain
+
+
+def _invoke(*arguments):
+    return CliRunner().invoke(main, ["stages", *arguments])
+
+
+def test_the_list_has_every_stage_with_its_summary():
+    result = _invoke()
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert len(lines) == len(STAGES)
+    for stage in STAGES.values():
+        assert any(line.split()[0] == stage.name and stage.summary in line for line in lines)
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
+    text = _invoke(name).stdout
+    for parameter in STAGES[name].parameters.values():
+        assert f"{parameter.name} (" in text and f"default {parameter.default}" in text
+        assert parameter.meaning in text
+    example = text[text.index("[[chain]]") :]
+    others = {kind: next(s for s in STAGES if s.startswith(kind)) for kind in ("noise", "detect", "decompose")}
+    kind = name.split(".")[0]
+    tables = [example if k == kind else f'[[chain]]\nstage = "{other}"\n' for k, other in others.items()]
+    if kind == "attribute":
+        tables.append(example)
+    chain = parse_chain("\n".join(tables), "example")
+    assert example.strip() in effective(chain)
+
+
+def test_json_for_programs():
+    told = json.loads(_invoke("--json").stdout)
+    assert {stage["name"] for stage in told} == set(STAGES)
+    one = json.loads(_invoke("detect.maximum", "--json").stdout)[0]
+    assert one["parameters"]["threshold"]["default"] == STAGES["detect.maximum"].parameters["threshold"].default
+
+
+def test_an_unknown_stage_names_the_nearest():
+    result = _invoke("detect.maximun")
+    assert result.exit_code == 2 and "did you mean 'detect.maximum'" in result.stderr

@@ -1,0 +1,50 @@
+"""Every example runs."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from batch_tools import read_cloud
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+
+ROOT = Path(__file__).resolve().parent.parent
+CHAINS = sorted((ROOT / "examples").glob("*.toml"))
+
+
+def test_there_is_a_chain_for_open_urban_and_forest_scenes():
+    assert {"open", "urban", "forest"} <= {path.stem for path in CHAINS}
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=lambda path: path.stem)
+def test_example_chains_run(chain, tiny_strip, tmp_path):
+    result = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(tmp_path), "--chain", str(chain)])
+    assert result.exit_code == 0, result.output
+    cloud, _ = read_cloud(tmp_path / "tiny.laz")
+    assert len(cloud) > 300
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
+    strips = tmp_path / "strips"
+    strips.mkdir()
+    for name in ("a.las", "b.las"):
+        shutil.copyfile(tiny_strip, strips / name)
+    out = tmp_path / "clouds"
+    command = ["make", "-C", str(ROOT / "examples" / "pipeline"), f"STRIPS={strips}", f"OUT={out}",
+               f"WAVEBATCH={sys.executable} -m wavebatch", "CHAIN=../open.toml"]  # fmt: skip
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    subprocess.run(command, check=True, env=environment, capture_output=True)
+    summary = json.loads((out / "summary.json").read_text())
+    assert [strip["status"] for strip in summary["strips"]] == ["skipped", "skipped"]
+    assert summary["counts"]["points_in"] > 800
+    made = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert set(made) == {"a.laz", "a.report.json", "b.laz", "b.report.json", "summary.json"}
+    again = subprocess.run(command, check=True, env=environment, capture_output=True, text=True)
+    assert "wavebatch run" not in again.stdout
+    assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == made
