@@ -1,0 +1,79 @@
+"""The closed form of single echoes: the test vector of ALGORITHMS.md 4.1, and a plain weighted parabola."""
+
+import naive
+import numpy as np
+import pytest
+
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.closed_form import fit_closed_form
+from wavebatch.stages.decompose import closed_form
+
+VECTOR = 37.5 * np.exp(-0.5 * ((np.arange(31) - 14.3) / 1.8) ** 2)
+PEAK = 14
+
+
+def windows(y, reach=12):
+    return y[None, PEAK - reach : PEAK + reach + 1]
+
+
+def test_a_gaussian_is_found_exactly():
+    amplitude, time, width, holds = fit_closed_form(windows(VECTOR), 0.2)
+    assert holds.all()
+    assert amplitude[0] == pytest.approx(37.5, rel=1e-12)
+    assert time[0] + PEAK == pytest.approx(14.3, rel=1e-12)
+    assert width[0] == pytest.approx(1.8, rel=1e-12)
+
+
+def test_rounded_gaussian_gives_the_published_numbers():
+    amplitude, time, width, _ = fit_closed_form(windows(np.rint(VECTOR)), 0.2)
+    assert amplitude[0] == pytest.approx(37.6073, abs=5e-5)
+    assert time[0] + PEAK == pytest.approx(14.28882, abs=5e-6)
+    assert width[0] == pytest.approx(1.80415, abs=5e-6)
+
+
+@pytest.mark.parametrize(("steps", "tolerance"), [(2, 2e-5), (30, 1e-5)])
+def test_steps_lead_to_the_published_least_squares(steps, tolerance):
+    """Two Gauss-Newton steps after the closed form, and the minimum itself."""
+    block = WaveformBlock.from_samples(np.rint(VECTOR)[None].astype(np.uint8))
+    noise = Noise(np.zeros(1, np.float32), np.full(1, 0.3, np.float32))
+    start = EchoTable.build([0], [14.0], [37.0], [2.0])
+    # A wide system pulse makes the window cover all samples.
+    echoes = closed_form(block, noise, SystemPulse(2.4, noise_std=0.3), start, steps=steps)
+    assert echoes.amplitude[0] == pytest.approx(37.62496, abs=5 * tolerance)
+    assert echoes.time[0] == pytest.approx(14.294543, abs=tolerance)
+    assert echoes.sigma[0] == pytest.approx(1.802284, abs=tolerance)
+
+
+@pytest.mark.parametrize("fraction", [0.1, 0.2, 0.5])
+def test_noisy_windows_equal_a_plain_parabola(fraction):
+    rng = np.random.default_rng(3)
+    x = np.arange(-8, 9)
+    true = rng.uniform(-0.5, 0.5, (300, 1)), rng.uniform(1.0, 3.0, (300, 1))
+    y = np.rint(60 * np.exp(-0.5 * ((x - true[0]) / true[1]) ** 2) + rng.standard_normal((300, 17)))
+    amplitude, time, width, holds = fit_closed_form(y, fraction)
+    assert holds.mean() > 0.95
+    for row in np.flatnonzero(holds):
+        plain = naive.closed_form(y[row], fraction)
+        np.testing.assert_allclose((amplitude[row], time[row], width[row]), plain, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "y",
+    [
+        [0, 0, 0, 0, 0],
+        [9, 9, 9, 9, 9],
+        [9, 7, 5, 7, 9],
+        [-3, -2, -1, -2, -3],
+        [0, 0, 9, 0, 0],
+        [0, 9, 9, 0, 0],
+        [1, 3, 9, 27, 81],
+    ],
+)
+def test_windows_without_a_peak_do_not_hold_and_stay_finite(y):
+    amplitude, time, width, holds = fit_closed_form(np.array([y], float), 0.2)
+    assert not holds.any()
+    assert np.isfinite([amplitude, time, width]).all()
+
+
+def test_no_windows():
+    assert [len(part) for part in fit_closed_form(np.empty((0, 9)), 0.2)] == [0, 0, 0, 0]
