@@ -39,6 +39,9 @@ BEFORE, AFTER = 9.0, 25.0
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
 
+NEAR_BEST = 1.25
+"""Misfit, over that of the best model, at which a simpler one is taken."""
+
 ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
 """Thresholds tried for one more echo, in chi2."""
 
@@ -231,8 +234,9 @@ def _learn(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: 
 
 
 def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
-    """The first fit that reaches the goal, or the best of all."""
-    return next((fit for fit in fits if fit.rms <= goal), min(fits, key=lambda fit: fit.rms))
+    """The first fit that reaches the goal, or comes near the best of all."""
+    enough = max(goal, NEAR_BEST * min(fit.rms for fit in fits))
+    return next(fit for fit in fits if fit.rms <= enough)
 
 
 def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:

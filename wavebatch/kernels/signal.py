@@ -32,15 +32,18 @@ def find_peaks(signal: np.ndarray, threshold: np.ndarray | float) -> tuple[np.nd
     """Local maxima of signal (s, n) above threshold (scalar or (n,)): waveform and sample, sorted by both.
 
     A plateau counts once, at its first sample; the first and the last sample count when they stand above
-    their one neighbour.
+    their one neighbour. A constant waveform has no peak.
     """
     s, n = signal.shape
+    if s < 2:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
     rising = np.empty((s + 1, n), bool)
     rising[0] = True
     rising[-1] = False
     np.greater(signal[1:], signal[:-1], out=rising[1:-1])
     peak = rising[:-1]
     falling = ~rising[1:]
+    np.less(signal[1], signal[0], out=falling[0])
     falling &= peak
     falling &= signal > threshold
     flat = np.flatnonzero(falling)

@@ -14,6 +14,7 @@ from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit import WidthPrior
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal import smooth_121, transpose_samples
+from wavebatch.stages.flags import drop_unproven, flag_echoes
 from wavebatch.stages.shapes import ShapeLimits, describe_echoes, model_parameters, pulse_shape, shape_limits
 from wavebatch.units import SQRT_PI
 
@@ -30,7 +31,7 @@ MOST_JOINED = 6
 @stage("decompose")
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """The detector's echoes as they are, without a fit and without errors."""
-    return _flag_plain(block, noise, system, echoes)
+    return flag_echoes(block, noise, system, echoes)
 
 
 @stage("decompose")
@@ -188,7 +189,7 @@ def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> 
         expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
         expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)
     std = noise.std[waveform]
-    keep = (expected <= 0) | (amplitude - expected > 2.2 * std + 0.25 * expected)
+    keep = (expected <= 0) | (amplitude - expected > 2.2 * std + 0.5 * expected)
     candidates = Candidates(*(field[keep] for field in candidates))
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
@@ -226,7 +227,9 @@ def _table(
         residual=misfit[keep],
         flags=flags[keep],
     )
-    return _flag_plain(block, noise, system, table)
+    if settings.shape.components:
+        table = drop_unproven(table, system)
+    return flag_echoes(block, noise, system, table)
 
 
 def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
@@ -243,34 +246,6 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
         np.repeat(solution.misfit, k),
         flags.reshape(-1),
     )
-
-
-def _flag_plain(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:
-    """Flags that need no fit: weak, near an edge, narrow, saturated."""
-    last = (block.samples.shape[1] - 1) * block.spacing
-    table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
-    edge = np.minimum(table.time, last - table.time) < table.sigma
-    table = table.with_flags(EchoFlag.NEAR_EDGE, edge)
-    narrow = table.sigma + 3 * np.nan_to_num(table.sigma_err) < system.sigma_ref
-    table = table.with_flags(EchoFlag.NARROW, narrow & (table.sigma < 0.93 * system.sigma_ref))
-    if system.saturation is None:
-        return table
-    return _flag_saturated(block, system.saturation, table)
-
-
-def _flag_saturated(block: WaveformBlock, level: float, table: EchoTable) -> EchoTable:
-    """Echoes with clipped samples within 1.5 widths of their centre; amplitudes that are guesses (H6)."""
-    rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
-    if not len(rows):
-        return table
-    sample = np.arange(block.samples.shape[1]) * block.spacing
-    near = np.abs(sample - table.time[rows, None]) <= 1.5 * table.sigma[rows, None]
-    clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
-    saturated = np.zeros(len(table), bool)
-    saturated[rows] = clipped
-    guess = saturated & (table.amplitude > 2.5 * level)
-    table = table.with_flags(EchoFlag.SATURATED, saturated)
-    return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)
 
 
 def _start_closed_form(

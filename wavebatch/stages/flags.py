@@ -1,0 +1,77 @@
+"""What is known to be wrong or doubtful about echoes, from the table and the samples alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+
+NEIGHBOURS = 5
+"""Echoes before and behind that one is compared with."""
+
+RINGING_REACH = 12.0
+"""Widths of the system pulse behind an echo in which its ringing is looked for (H7)."""
+
+RINGING_FACTOR = 1.2
+"""Echoes up to this many times the strip's ringing may be ringing (H7)."""
+
+LEAST_RATIO = 0.02
+"""Share of a stronger echo beside it that an echo must exceed: no learned pulse is known better (R3)."""
+
+UNRELIABLE_ABOVE = 2.5
+"""Amplitudes this many times the digitizer's limit are guesses (H6)."""
+
+
+def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:
+    """The table with the flags that need no fit: weak, near an edge, narrow, ringing suspect, saturated."""
+    last = (block.samples.shape[1] - 1) * block.spacing
+    table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
+    edge = np.minimum(table.time, last - table.time) < table.sigma
+    table = table.with_flags(EchoFlag.NEAR_EDGE, edge)
+    narrow = table.sigma + 3 * np.nan_to_num(table.sigma_err) < system.sigma_ref
+    table = table.with_flags(EchoFlag.NARROW, narrow & (table.sigma < 0.93 * system.sigma_ref))
+    if system.ringing > 0:
+        limit = RINGING_FACTOR * system.ringing
+        suspect = _faint_beside(table, limit, 2.0 * system.sigma_ref, RINGING_REACH * system.sigma_ref, before=False)
+        table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect & (table.amplitude > 0))
+    if system.saturation is None:
+        return table
+    return _flag_saturated(block, system.saturation, table)
+
+
+def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
+    """The table without echoes so faint beside a stronger one that an error of the learned pulse explains them."""
+    delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
+    reach = max([4 * system.sigma_ref, *delays])
+    return table.take(np.flatnonzero(~_faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)))
+
+
+def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: float, *, before: bool) -> np.ndarray:
+    """True (m,) for echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
+
+    before: also of one that lies behind them.
+    """
+    faint = np.zeros(len(table), bool)
+    waveform, time, amplitude = table.waveform, table.time, table.amplitude
+    for step in range(1, min(NEIGHBOURS, len(table) - 1) + 1):
+        gap = time[step:] - time[:-step]
+        near = (waveform[step:] == waveform[:-step]) & (gap >= nearest) & (gap <= furthest)
+        faint[step:] |= near & (amplitude[step:] < ratio * amplitude[:-step])
+        if before:
+            faint[:-step] |= near & (amplitude[:-step] < ratio * amplitude[step:])
+    return faint
+
+
+def _flag_saturated(block: WaveformBlock, level: float, table: EchoTable) -> EchoTable:
+    """Echoes with clipped samples within 1.5 widths of their centre; amplitudes that are guesses (H6)."""
+    rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
+    if not len(rows):
+        return table
+    sample = np.arange(block.samples.shape[1]) * block.spacing
+    near = np.abs(sample - table.time[rows, None]) <= 1.5 * table.sigma[rows, None]
+    clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
+    saturated = np.zeros(len(table), bool)
+    saturated[rows] = clipped
+    guess = saturated & (table.amplitude > UNRELIABLE_ABOVE * level)
+    table = table.with_flags(EchoFlag.SATURATED, saturated)
+    return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)
