@@ -19,10 +19,18 @@ def hermite_moments(windows: Windows, parameters: np.ndarray, rows: np.ndarray) 
     """
     k = parameters.shape[2]
     _, time, width = parameters.astype(np.float32).transpose(1, 0, 2)[..., None]
-    pulse, by_time, by_width = rows[:, :k], rows[:, k : 2 * k], rows[:, 2 * k : 3 * k]
     z = windows.x[:, None, :] - time
     z *= 1 / width
     np.clip(z, -HERMITE_REACH, HERMITE_REACH, out=z)
+    p3, p4 = _hermite(z, rows[:, :k], rows[:, k : 2 * k], rows[:, 2 * k : 3 * k])
+    residual, std = rows[:, -1], windows.std[:, None]
+    return _project(p3, residual) / std, _project(p4, residual) / std
+
+
+def _hermite(
+    z: np.ndarray, pulse: np.ndarray, by_time: np.ndarray, by_width: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The two directions from a pulse e, e z and e z^2."""
     p3 = by_width * z
     p4 = p3 * z
     p3 *= np.float32(8)
@@ -30,8 +38,32 @@ def hermite_moments(windows: Windows, parameters: np.ndarray, rows: np.ndarray) 
     p4 *= np.float32(16)
     p4 -= np.float32(48) * by_width
     p4 += np.float32(12) * pulse
-    residual, std = rows[:, -1], windows.std[:, None]
-    return _project(p3, residual) / std, _project(p4, residual) / std
+    return p3, p4
+
+
+def residual_moments(
+    residual: np.ndarray, waveform: np.ndarray, time: np.ndarray, width: np.ndarray, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Hermite moments h3, h4 (m,) of residual waveforms (n, s) around echoes, within five widths of each.
+
+    time, width: in samples (m,); std: noise (m,).
+    """
+    s = residual.shape[1]
+    h3, h4 = np.zeros(len(time)), np.zeros(len(time))
+    reach = np.minimum(np.ceil(HERMITE_REACH * width), s).astype(np.int64)
+    for size in np.unique(reach):
+        rows = np.flatnonzero(reach == size)
+        for begin in range(0, len(rows), 4096):
+            part = rows[begin : begin + 4096]
+            at = np.rint(time[part]).astype(np.int64)[:, None] + np.arange(-size, size + 1)
+            inside = (at >= 0) & (at < s)
+            values = np.where(inside, residual[waveform[part][:, None], np.clip(at, 0, s - 1)], 0).astype(np.float32)
+            z = ((at - time[part][:, None]) / width[part][:, None]).astype(np.float32)
+            pulse = np.exp(np.float32(-0.5) * z * z) * inside
+            p3, p4 = _hermite(z, pulse, pulse * z, pulse * z * z)
+            h3[part] = _project(p3[:, None], values)[:, 0] / std[part]
+            h4[part] = _project(p4[:, None], values)[:, 0] / std[part]
+    return h3, h4
 
 
 def _project(direction: np.ndarray, residual: np.ndarray) -> np.ndarray:
