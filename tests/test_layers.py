@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent / "wavebatch"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
-    {"errors", "units", "words"},
+    {"errors", "units", "words", "allocator", "flags"},
     {"kernels", "blocks"},
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
@@ -19,6 +19,7 @@ RANKS = [
     {"task", "workers"},
     {"plan"},
     {"batch"},
+    {"bench"},
     {"cli"},
     {"__main__"},
 ]
