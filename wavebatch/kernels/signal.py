@@ -91,5 +91,12 @@ def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int) -> np.
 def quiet_mean(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (n,) of the quiet samples of signal (s, n), 0 where there are none, and their number (n,)."""
     number = quiet.sum(axis=0, dtype=np.int32)
-    total = np.where(quiet, signal, np.float32(0)).sum(axis=0)
+    total = sum_samples(np.where(quiet, signal, np.float32(0)))
     return total / np.maximum(number, 1).astype(np.float32), number
+
+
+def sum_samples(values: np.ndarray) -> np.ndarray:
+    """Sums (n,) over the samples of (s, n), in the same order whatever n: NumPy adds a single column pairwise."""
+    if values.shape[1] != 1:
+        return values.sum(axis=0)
+    return np.repeat(values, 2, axis=1).sum(axis=0)[:1]

@@ -6,7 +6,7 @@ import numpy as np
 
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, transpose_samples
+from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.units import QUANTISATION_STD
 
 
@@ -48,7 +48,7 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: int = 16) -> Noi
     end = transpose_samples(block.samples[:, -samples:])
     baseline = np.median(end, axis=0)
     deviation = end - baseline
-    std = np.sqrt(np.sum(deviation * deviation, axis=0) / max(len(end) - 1, 1))
+    std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
     return Noise(
         baseline.astype(np.float32), np.maximum(std, max(system.noise_std, QUANTISATION_STD)).astype(np.float32)
     )
