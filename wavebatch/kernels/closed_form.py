@@ -25,8 +25,9 @@ def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndar
     weight = np.where(used, y * y, 0.0)
     x = np.arange(-middle, y.shape[1] - middle, dtype=np.float64)
     log = weight * np.log(safe)
-    moments = [weight @ x**p for p in range(5)]
-    right = [log @ x**p for p in range(3)]
+    # Not a matrix product: its sums depend on how many rows there are.
+    moments = [np.sum(weight * x**p, axis=1) for p in range(5)]
+    right = [np.sum(log * x**p, axis=1) for p in range(3)]
     c0, c1, c2 = solve_parabola(moments, right)
     holds = c2 < 0
     c2 = np.where(holds, c2, -1.0)
