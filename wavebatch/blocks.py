@@ -362,8 +362,8 @@ class EchoTable:
         tables = [(table, shift) for table, shift in tables]
         if not tables:
             return EchoTable.empty()
-        names = set(tables[0][0].attributes)
-        if any(set(table.attributes) != names for table, _ in tables):
+        names = list(tables[0][0].attributes)
+        if any(set(table.attributes) != set(names) for table, _ in tables):
             raise StageError("tables with different columns cannot be joined")
         core = {name: np.concatenate([getattr(table, name) for table, _ in tables]) for name in _FIELDS}
         core["waveform"] = np.concatenate([table.waveform + np.int32(shift) for table, shift in tables])
