@@ -90,16 +90,18 @@ def _expect_rows(points, echoes, members, flags, scales, offsets):
         if flags[i]:
             row = {"source": i, "xyz": place(i), "flags": flags[i], "amplitude": None, "ray": None}
             rows.append({**row, "pulse": pulse[i]})
-        elif i in echoes and echoes[i]:
+        elif i in echoes:
+            group = []
             for echo in echoes[i]:
                 near = min(members[i], key=lambda p: (abs(members[i][p] - echo["time"]), members[i][p]))
                 source = echo["point"] if echo["point"] >= 0 else near
                 flag = echo["flags"] | (EchoFlag.ADDED if echo["point"] < 0 else 0)
-                rows.append({**echo, "source": source, "flags": int(flag), "pulse": pulse[i]})
-        elif i in echoes:
-            for p in sorted(members[i], key=lambda p: (members[i][p], p)):
-                rows.append({"source": p, "xyz": place(p), "flags": int(EchoFlag.NO_ECHO), "amplitude": None,
-                             "ray": None, "pulse": pulse[i]})  # fmt: skip
+                group.append({**echo, "source": source, "flags": int(flag), "pulse": pulse[i]})
+            ray = group[0]["ray"] if group else None
+            for p in set(members[i]) - {echo["point"] for echo in echoes[i]}:
+                group.append({"source": p, "xyz": place(p), "flags": int(EchoFlag.NO_ECHO), "amplitude": None,
+                              "ray": ray, "pulse": pulse[i], "time": members[i][p]})  # fmt: skip
+            rows += sorted(group, key=lambda row: (row["time"], row["source"]))
     return rows
 
 

@@ -15,9 +15,9 @@ def _report(**changes):
     counts = {
         "points_in": 10, "points_with_waveform": 7, "points_without_waveform": 2, "points_broken": 1, "waveforms": 6,
         "echoes": 8, "matched_returns": 5, "unmatched_returns": 1, "no_echo_returns": 1, "added_echoes": 3,
-        "points_out": 12,
+        "points_out": 13,
     }  # fmt: skip
-    passed = {"NO_WAVEFORM": 2, "BROKEN_PACKET": 1, "NO_ECHO": 1}
+    passed = {"NO_WAVEFORM": 2, "BROKEN_PACKET": 1, "NO_ECHO": 2}
     quality = RunReport.of_echoes(np.array([1, 2, 2, 2, 1, 0]), np.full(8, 50.0), np.full(8, 1.9))
     return RunReport(counts={**counts, **changes}, passed_through=passed) + quality
 

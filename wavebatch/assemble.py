@@ -12,6 +12,7 @@ from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
 from wavebatch.errors import StageError
 from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns
 from wavebatch.report import RunReport, count_flags
+from wavebatch.units import PS_PER_NS
 
 if TYPE_CHECKING:
     from wavebatch.io.layout import OutputLayout
@@ -104,9 +105,10 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
 
 
 def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
-    """A row per echo of the packets that the unit owns, and one per point without any; with the account of both.
+    """A row per echo of the packets that the unit owns, and one per point that no echo matches; with the account.
 
-    Rows are ordered by the packet's first point, then time; points without a packet stand at their own place.
+    Rows are ordered by the packet's first point, then time; points without a packet stand at their own place. A return
+    that no echo of its packet matches is passed through as it is: what the vendor saw there is flagged, not lost.
     """
     members = _join_points(unit)
     owned = np.append(unit.packets.owned, False)
@@ -115,7 +117,9 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
     point = table.attributes["point"]
     table = table.with_flags(EchoFlag.ADDED, point < 0)
     per_packet = np.append(table.count(len(owned) - 1), 0)
-    rows = _place_rows(unit, members, table, np.where(point >= 0, point, nearest), per_packet, owned)
+    found = np.zeros(len(members.index), bool)
+    found[members.find(point[point >= 0])] = True
+    rows = _place_rows(unit, members, table, np.where(point >= 0, point, nearest), found, owned)
 
     records = members.source[rows.source]
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
@@ -136,8 +140,6 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
         time=np.append(table.time, np.nan)[rows.echo],
     )
     inside = owned[members.packet]
-    found = np.zeros(len(members.index), bool)
-    found[members.find(point[point >= 0])] = True
     report = _count_packets(unit, table, per_packet, owned)
     report += _count_returns(inside, per_packet[members.packet] > 0, found)
     return output, report + _count_rows(output, rows.reason, flags)
@@ -165,7 +167,7 @@ def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tu
     has_echoes = per_packet[unit.packet_of_point] > 0
     report = _count_packets(unit, table.take(np.flatnonzero(owned[table.waveform])), per_packet, owned)
     report += _count_returns(inside, has_echoes, found)
-    return output, report + _count_rows(output, np.where(has_echoes, np.uint16(0), reason), flags)
+    return output, report + _count_rows(output, np.where(found, np.uint16(0), reason), flags)
 
 
 def _bug(unit: Unit, what: str) -> StageError:
@@ -186,11 +188,11 @@ def _join_points(unit: Unit) -> _Members:
 
 
 def _place_rows(
-    unit: Unit, members: _Members, table: EchoTable, point: np.ndarray, per_packet: np.ndarray, owned: np.ndarray
+    unit: Unit, members: _Members, table: EchoTable, point: np.ndarray, found: np.ndarray, owned: np.ndarray
 ) -> _Rows:
-    """Echoes, points without a packet, and points of packets without echoes, in the order of the output."""
+    """Echoes, points without a packet, and points that no echo matches, in the order of the output."""
     missing = np.flatnonzero(unit.point_flags)
-    silent = np.flatnonzero(owned[members.packet] & (per_packet[members.packet] == 0))
+    silent = np.flatnonzero(owned[members.packet] & ~found)
     passed = np.concatenate([missing, silent])
     no_echo = np.full(len(silent), EchoFlag.NO_ECHO, np.uint16)
     owner = np.append(unit.packets.owner - unit.start, -1)
@@ -218,8 +220,8 @@ def _number_rows(
 
 
 def _locations(records: np.ndarray) -> np.ndarray:
-    """Return locations, for the order of points that share a packet; what is not a number comes first."""
-    return np.nan_to_num(records["return_point_wave_location"].astype(np.float64), nan=-np.inf)
+    """Return locations [ns], for the order of points that share a packet; what is not a number comes first."""
+    return np.nan_to_num(records["return_point_wave_location"].astype(np.float64) / PS_PER_NS, nan=-np.inf)
 
 
 def _coordinates(records: np.ndarray, layout: OutputLayout) -> np.ndarray:
@@ -258,6 +260,4 @@ def _count_returns(inside: np.ndarray, has_echoes: np.ndarray, found: np.ndarray
 
 
 def _count_rows(output: np.ndarray, reason: np.ndarray, flags: np.ndarray) -> RunReport:
-    return RunReport(
-        counts={"points_out": len(output)}, passed_through=count_flags(reason), flags=count_flags(flags)
-    )
+    return RunReport(counts={"points_out": len(output)}, passed_through=count_flags(reason), flags=count_flags(flags))

@@ -20,8 +20,8 @@ COUNTS: dict[str, str] = {
     "waveforms": "packets that went through the chain, each once however many points share it",
     "echoes": "echoes found in them",
     "matched_returns": "points whose echo was found",
-    "unmatched_returns": "points in a packet with echoes, none of which is theirs",
-    "no_echo_returns": "points in a packet without any echo",
+    "unmatched_returns": "points in a packet with echoes, none of which is theirs; passed through",
+    "no_echo_returns": "points in a packet without any echo; passed through",
     "added_echoes": "echoes that the input does not have as a return",
     "points_out": "points written",
 }
@@ -121,13 +121,13 @@ class RunReport:
         if points == "echoes":
             out = get("echoes") + sum(passed.values())
         else:
-            out = get("matched_returns") + get("unmatched_returns") + sum(passed.values())
+            out = get("matched_returns") + sum(passed.values())
         sums = {
             "points_in": get("points_with_waveform") + get("points_without_waveform") + get("points_broken"),
             "points_with_waveform": get("matched_returns") + get("unmatched_returns") + get("no_echo_returns"),
             "points_without_waveform": passed.get("NO_WAVEFORM", 0),
             "points_broken": passed.get("BROKEN_PACKET", 0),
-            "no_echo_returns": passed.get("NO_ECHO", 0),
+            "no_echo_returns": passed.get("NO_ECHO", 0) - get("unmatched_returns"),
             "echoes": get("matched_returns") + get("added_echoes"),
             "points_out": out,
             "waveforms": int(self.echoes_per_waveform.sum()),
