@@ -103,6 +103,8 @@ def measure_block(block: WaveformBlock, *, learn: bool = True) -> SystemPulse:
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
+    if not len(block):
+        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
     system = _measure_gaussian(block)
     figures: dict[str, float] = {}
     if learn:
