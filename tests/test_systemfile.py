@@ -1,0 +1,167 @@
+"""SYSTEM.toml: every number comes back to the last bit, and what is wrong is said in one line."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+from helpers_scenes import make_block
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wavebatch.blocks import SystemPulse
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.survey import Decision, Survey, survey_block
+from wavebatch.systemfile import (
+    QUANTITIES,
+    SYSTEM_SCHEMA,
+    SavedSurvey,
+    describe_system,
+    format_survey,
+    load_survey,
+    parse_survey,
+    write_survey,
+)
+
+SYSTEM = SystemPulse(
+    sigma_ref=1.8581162121217176,
+    baseline=3.6834210432062053,
+    baseline_spread=0.1 + 0.2,
+    noise_std=1.2997285311240736,
+    noise_by_kind={"quiet": 1 / 3, "tail smoothed": 2e-7, "core": 1e22},
+    noise_gain=5e-324,
+    kappa=-0.1,
+    components=((1.0, 0.0, 1.8836713464397783), (-0.03361226544360852, 10.587040699291984, 1.5927024379059929)),
+    ringing=0.04428410627806453,
+    saturation=255.0,
+    acceptance=18.0,
+)
+SURVEY = Survey(
+    SYSTEM,
+    2311,
+    {"empty_share": 0.1, "kappa": np.float64(0.05534052830222781), "misfit_1_gaussians": 1e-17},
+    (Decision("growth of fits", True, 'says "11 %",\nin two lines \\ with a \x7f'), Decision("ä", False, "")),
+)
+FINGERPRINT = {"size": 12345678901, "sha256_sampled": "ab" * 32, "packets": {"size": 7, "sha256_sampled": "cd" * 32}}
+SAVED = SavedSurvey(SURVEY, 'a "strip".las', FINGERPRINT, "1.2.3")
+TEXT = format_survey(SAVED)
+
+
+def _same(a: SavedSurvey, b: SavedSurvey) -> bool:
+    """Equal in every field, floats by their bits."""
+    return repr(describe_system(a.survey.system)) == repr(describe_system(b.survey.system)) and a == b
+
+
+def test_everything_comes_back():
+    assert _same(parse_survey(TEXT, "x"), SAVED)
+    assert format_survey(parse_survey(TEXT, "x")) == TEXT
+
+
+positive = st.floats(1e-3, 1e4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    width=positive,
+    numbers=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2),
+    gain=st.floats(0, 1e6),
+    rows=st.lists(st.tuples(st.floats(0.01, 10), st.floats(-1e4, 1e4), positive), min_size=2, max_size=5),
+    reason=st.text(st.characters(exclude_categories=["Cs"])),
+    saturation=st.none() | st.floats(1, 1e10),
+)
+def test_any_system_comes_back_to_the_last_bit(width, numbers, gain, rows, reason, saturation):
+    system = SystemPulse(
+        sigma_ref=width, baseline=numbers[0], noise_gain=gain, components=tuple(rows), saturation=saturation
+    )
+    survey = Survey(system, 1, {"a figure": numbers[1]}, (Decision("part", False, reason),))
+    assert _same(parse_survey(format_survey(SavedSurvey(survey)), "x"), SavedSurvey(survey))
+
+
+def test_a_real_survey_comes_back():
+    survey = survey_block(make_block("urban", 2000, seed=1)[0])
+    again = parse_survey(format_survey(SavedSurvey(survey)), "x").survey
+    assert again == survey and describe_system(again.system) == describe_system(survey.system)
+
+
+def test_figures_that_are_no_numbers_are_left_out():
+    text = format_survey(SavedSurvey(Survey(SYSTEM, 0, {"good": 1.0, "bad": math.nan}, ())))
+    assert dict(parse_survey(text, "x").survey.figures) == {"good": 1.0}
+
+
+def test_every_number_of_the_system_has_a_key():
+    fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components"}
+    assert fields == set(SystemPulse.__dataclass_fields__)
+
+
+def test_figures_decisions_and_fingerprint_may_be_missing():
+    start = TEXT.index("[system]")
+    text = f'schema = "{SYSTEM_SCHEMA}"\n' + TEXT[start : TEXT.index("[figures]")]
+    saved = parse_survey(text, "x")
+    assert saved.survey.system == SYSTEM
+    assert not saved.survey.figures and saved.survey.decisions == () and not saved.fingerprint
+
+
+@pytest.mark.parametrize("key", [key for key in QUANTITIES if not QUANTITIES[key].optional])
+def test_a_missing_quantity_is_named(key):
+    text = re.sub(rf"^{key} = .*\n", "", TEXT, flags=re.M)
+    with pytest.raises(ConfigError, match=rf"x\.toml: \[system\]: key '{key}' is missing"):
+        parse_survey(text, "x.toml")
+
+
+def test_without_saturation_nothing_clips():
+    assert parse_survey(re.sub(r"^saturation_dn.*\n", "", TEXT, flags=re.M), "x").survey.system.saturation is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("sigma_ref_ns =", "sigma_ref =", "did you mean 'sigma_ref_ns'"),
+        ("acceptance = 18.0", "acceptance = true", "acceptance must be a number, it is True"),
+        ("acceptance = 18.0", 'acceptance = "18"', "acceptance must be a number, it is '18'"),
+        ("acceptance = 18.0", "acceptance = nan", "acceptance must be a finite number"),
+        ("acceptance = 18.0", "acceptance = 1" + "0" * 400, "acceptance must be a finite number"),
+        ("noise_std_dn = 1.2997285311240736", "noise_std_dn = 0.0", "noise_std_dn must lie between 0.001"),
+        ("sigma_ref_ns = 1.8581162121217176", "sigma_ref_ns = -1.8", "sigma_ref_ns must lie between"),
+        ("sigma_ref_ns = 1.8581162121217176", "sigma_ref_ns = 1e300", "sigma_ref_ns must lie between"),
+        ("ringing = 0.04428410627806453", "ringing = 7", "ringing must lie between 0 and 1"),
+        ("components = [[1.0, ", "components = [[-1.0, ", "row 1 is the main Gaussian"),
+        ("1.8836713464397783]", "0.0]", "components row 1 must lie between 0.001"),
+        ("1.8836713464397783]", "1.0, 2.0]", r"must be a list of \[weight, delay, sigma\]"),
+        ("components = [", "components = 3 # [", "must be a list of"),
+        (", [-0.03361226544360852, 10.587040699291984, 1.5927024379059929]", "", "must be empty or hold 2 to"),
+        ("quiet = ", "quiet = '1' # ", "noise_by_kind_dn: quiet must be a number"),
+        ("quiet = ", "quiet = -1 # ", "noise_by_kind_dn: quiet must lie between"),
+        ("empty_share = 0.1", "empty_share = inf", r"\[figures\]: empty_share must be a finite number"),
+        ("needed = true", "needed = 1", r"\[\[decision\]\] 1: needed must be true or false, it is 1"),
+        ("needed = true", "neded = true", "did you mean 'needed'"),
+        ("[[decision]]", "[[decisions]]", "did you mean 'decision'"),
+        ("waveforms = 2311", "waveforms = 1.5", "waveforms must be an integer"),
+        ("waveforms = 2311", "waveforms = -5", "waveforms must not be negative"),
+        ("system/1", "system/2", "this version reads 'wavebatch.system/1'"),
+        ("schema = ", "# schema = ", "key 'schema' is missing"),
+        ("[figures]", "[figures", "not valid TOML"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(old, new, words):
+    assert old in TEXT
+    with pytest.raises(ConfigError, match=words) as caught:
+        parse_survey(TEXT.replace(old, new), "x.toml")
+    assert str(caught.value).startswith("x.toml: ") and "\n" not in str(caught.value)
+
+
+def test_files(tmp_path):
+    path = tmp_path / "SYSTEM.toml"
+    write_survey(path, SAVED, overwrite=False)
+    assert _same(load_survey(path), SAVED)
+    with pytest.raises(InputError, match="exists already"):
+        write_survey(path, SAVED, overwrite=False)
+    write_survey(path, SavedSurvey(SURVEY), overwrite=True)
+    assert load_survey(path).strip == ""
+    assert [entry.name for entry in tmp_path.iterdir()] == ["SYSTEM.toml"]
+    with pytest.raises(ConfigError, match=r"none\.toml: system file cannot be read"):
+        load_survey(tmp_path / "none.toml")
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="not UTF-8"):
+        load_survey(path)
+    with pytest.raises(InputError, match="make the folder first"):
+        write_survey(tmp_path / "none" / "x.toml", SAVED, overwrite=False)
