@@ -7,11 +7,13 @@ an airborne sensor is above its returns.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from wavebatch.errors import ConfigError
+from wavebatch.io.rawbytes import widen
 from wavebatch.units import HALF_C, PS_PER_NS
 
 OPTIONS = ("auto", "toward", "away")
@@ -19,7 +21,6 @@ VECTORS = ("x_t", "y_t", "z_t")
 LEAST_RATIO, LARGEST_RATIO = 0.7, 1.02
 RANGE_RATIO = 100.0
 """Vectors longer than this many times c/2 are not speeds: Optech wrote the vector from sample 0 to the return."""
-_FORMS = ("stored", "range")
 _APART = 2.0 * PS_PER_NS
 _PER_CALL = 256
 _CLEAR, _MOSTLY = 0.95, 0.8
@@ -45,40 +46,56 @@ class Decision:
 class DirectionTally:
     """Votes for either direction, collected part by part; each part counts with at most a few hundred points."""
 
-    votes: dict[str, list[int]] = field(default_factory=lambda: {form: [0, 0] for form in _FORMS})
-    """Per form: pairs of returns that say toward, away."""
+    form: str
+    """See `Decision`."""
+    pairs: list[int] = field(default_factory=lambda: [0, 0])
+    """Pairs of returns that say toward, away."""
     heights: list[int] = field(default_factory=lambda: [0, 0])
-    """Stored vectors that point up, down."""
-    ratios: dict[str, list[np.ndarray]] = field(default_factory=lambda: {form: [] for form in _FORMS})
+    """Vectors that point up, down."""
+    ratios: list[np.ndarray] = field(default_factory=list)
+    """Lengths over c/2."""
 
     def add_points(self, points: np.ndarray) -> None:
         """Takes usable points into account: length and height of their vectors."""
-        points = _spread(points)
-        vectors = stack_vectors(points)
-        location = points["return_point_wave_location"].astype(np.float64)
-        self.heights[0] += int((vectors[:, 2] > 0).sum())
-        self.heights[1] += int((vectors[:, 2] < 0).sum())
-        length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
-        self.ratios["stored"].append(length)
-        self.ratios["range"].append(length[location != 0] / np.abs(location[location != 0]))
+        some = _spread(points)
+        height = read_toward(some, "toward", self.form)[:, 2]
+        self.heights[0] += int((height > 0).sum())
+        self.heights[1] += int((height < 0).sum())
+        self.ratios.append(measure_ratio(some, self.form))
 
     def add_pairs(self, xyz: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-        """Takes pairs of points that share a packet into account: xyz f8 (2, n, 3) [m], records (n,) each."""
-        a, b = first["return_point_wave_location"], second["return_point_wave_location"]
-        use = np.flatnonzero(np.abs(a.astype(np.float64) - b) > _APART)
+        """Takes pairs of usable points that share a packet into account: xyz f8 (2, n, 3) [m], records (n,) each."""
+        a, b = widen(first["return_point_wave_location"]), widen(second["return_point_wave_location"])
+        use = np.flatnonzero(np.abs(a - b) > _APART)
         use = use[:: max(1, len(use) // _PER_CALL)]
         if not len(use):
             return
         step = xyz[0, use] - xyz[1, use]
-        plain = _paths(first[use], scaled=True) - _paths(second[use], scaled=True)
-        whole = _paths(second[use], scaled=False) - _paths(first[use], scaled=False)
-        for form, paths in (("stored", plain), ("range", whole)):
-            toward = np.sqrt(((step + paths) ** 2).sum(axis=1))
-            away = np.sqrt(((step - paths) ** 2).sum(axis=1))
-            large, small = np.maximum(toward, away), np.minimum(toward, away)
-            clear = (large > 0.1) & (small < 0.5 * large)
-            self.votes[form][0] += int((clear & (toward < away)).sum())
-            self.votes[form][1] += int((clear & (away < toward)).sum())
+        paths = read_toward(first[use], "toward", self.form) * a[use, None]
+        paths -= read_toward(second[use], "toward", self.form) * b[use, None]
+        toward = np.sqrt(((step + paths) ** 2).sum(axis=1))
+        away = np.sqrt(((step - paths) ** 2).sum(axis=1))
+        large, small = np.maximum(toward, away), np.minimum(toward, away)
+        clear = (large > 0.1) & (small < 0.5 * large)
+        self.pairs[0] += int((clear & (toward < away)).sum())
+        self.pairs[1] += int((clear & (away < toward)).sum())
+
+
+def find_form(points: np.ndarray) -> str:
+    """How the vectors of these points, the strip's first ones, are to be read: `stored` or `range`."""
+    ratio = measure_ratio(points, "stored")
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+    return "range" if len(ratio) and np.median(ratio) > RANGE_RATIO else "stored"
+
+
+def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
+    """Length of the vectors over c/2, f8 (n,); not finite where there is none."""
+    vectors = stack_vectors(points)
+    length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
+    if form == "range":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            length = length / np.abs(widen(points["return_point_wave_location"]))
+    return length
 
 
 def check_option(option: str) -> str:
@@ -90,27 +107,25 @@ def check_option(option: str) -> str:
 
 def stack_vectors(points: np.ndarray) -> np.ndarray:
     """The vectors of the records as they stand, f8 (n, 3)."""
-    return np.stack([points[name].astype(np.float64) for name in VECTORS], axis=1)
+    return np.stack([widen(points[name]) for name in VECTORS], axis=1)
 
 
 def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
     """Vectors toward the sensor, metres per picosecond, f8 (n, 3), length as the file has it."""
     vectors = stack_vectors(points)
     if form == "range":
-        location = points["return_point_wave_location"].astype(np.float64)
-        vectors /= -np.where(location == 0, 1.0, location)[:, None]
+        vectors /= -widen(points["return_point_wave_location"])[:, None]
     return vectors if direction == "toward" else -vectors
 
 
 def decide(tally: DirectionTally, option: str) -> Decision:
     """What the votes say. Where they contradict each other or say nothing, `auto` leaves a problem."""
-    if not any(len(part) for part in tally.ratios["stored"]):
+    if not any(len(part) for part in tally.ratios):
         chosen = "toward" if option == "auto" else option
-        return Decision(chosen, "stored", float("nan"), "no waveform to judge by", (), ())
-    form, ratio, warnings = _judge_length(tally)
-    problems: list[str] = []
-    toward, away = tally.votes[form]
-    up, down = tally.heights if form == "stored" else tally.heights[::-1]
+        return Decision(chosen, tally.form, float("nan"), "no waveform to judge by", (), ())
+    ratio = float(np.median(np.concatenate(tally.ratios)))
+    warnings, problems = list(_judge_length(ratio, tally.form)), []
+    (toward, away), (up, down) = tally.pairs, tally.heights
     pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
     evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
     if toward + away < _ENOUGH and heights:
@@ -124,24 +139,17 @@ def decide(tally: DirectionTally, option: str) -> Decision:
         if chosen != option or problems:
             warnings.append(f"--direction {option} overrides what the file says: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
-    return Decision(chosen, form, ratio, evidence, tuple(warnings), tuple(problems))
+    return Decision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
 
 
-def _judge_length(tally: DirectionTally) -> tuple[str, float, list[str]]:
-    ratio = float(np.median(np.concatenate(tally.ratios["stored"])))
-    form, warnings = "stored", []
-    if ratio > RANGE_RATIO and sum(len(part) for part in tally.ratios["range"]):
-        divided = float(np.median(np.concatenate(tally.ratios["range"])))
-        form, stored, ratio = "range", ratio, divided
-        warnings.append(
-            f"packet vectors are {stored:.4g} times c/2 long, so they are taken for whole paths (as Optech wrote them) "
-            "and divided by minus the return location"
+def _judge_length(ratio: float, form: str) -> Iterator[str]:
+    if form == "range":
+        yield (
+            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long, so they are taken for whole paths (as "
+            "Optech wrote them) and divided by minus the return location"
         )
     if not LEAST_RATIO <= ratio <= LARGEST_RATIO:
-        warnings.append(
-            f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
-        )
-    return form, ratio, warnings
+        yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
 
 
 def _verdict(toward: int, away: int, share: float) -> str:
@@ -149,11 +157,6 @@ def _verdict(toward: int, away: int, share: float) -> str:
     if total and toward >= share * total:
         return "toward"
     return "away" if total and away >= share * total else ""
-
-
-def _paths(points: np.ndarray, *, scaled: bool) -> np.ndarray:
-    vectors = stack_vectors(points)
-    return vectors * points["return_point_wave_location"].astype(np.float64)[:, None] if scaled else vectors
 
 
 def _spread(points: np.ndarray) -> np.ndarray:

@@ -8,12 +8,17 @@ from enum import IntEnum
 import numpy as np
 
 from wavebatch.blocks import EchoFlag
-from wavebatch.io.direction import VECTORS
+from wavebatch.io.direction import RANGE_RATIO, measure_ratio
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.packets import MAX_SAMPLES, refuse_compressed
+from wavebatch.io.rawbytes import widen
 
 INDEX_BITS = np.uint64(8)
 READABLE_BITS = (8, 16, 32)
+MAX_SPACING = 1000.0
+"""Samples farther apart than this are damage [ns]."""
+MAX_LOCATION = 1e9
+"""Return locations beyond this are damage [ps]."""
 
 
 class Reason(IntEnum):
@@ -31,10 +36,10 @@ class Reason(IntEnum):
 
 REASON_TEXTS = {
     Reason.NO_DESCRIPTOR: "refer to a descriptor that the header does not have",
-    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, longer than 65536 samples, or not of 8, 16 or 32 bits",
+    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or not of 8, 16 or 32 bits",
     Reason.EMPTY: "have a packet without a whole sample",
     Reason.OUTSIDE: "have a packet outside the waveform data",
-    Reason.NO_GEOMETRY: "have a return location or a packet vector that is no number, or a vector of length 0",
+    Reason.NO_GEOMETRY: "have a return location or a packet vector that cannot be (no number, 0, or absurdly long)",
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
 }
 
@@ -74,7 +79,7 @@ class Judge:
         self._bits, self._samples = np.full(256, 8, np.int64), np.zeros(256, np.int64)
         for index, digitizer in facts.digitizers.items():
             self._known[index] = True
-            self._good[index] = digitizer.bits in READABLE_BITS and digitizer.spacing > 0
+            self._good[index] = digitizer.bits in READABLE_BITS and 0 < digitizer.spacing <= MAX_SPACING
             self._good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
             self._compressed[index] = facts.compression.get(index, 0) != 0 and digitizer.n_samples > 0
             if self._good[index]:
@@ -82,8 +87,10 @@ class Judge:
         self._least = facts.packet_start - facts.packet_base
         self._end = facts.packet_end - facts.packet_base
 
-    def judge(self, points: np.ndarray, overfull: np.ndarray | None = None) -> Judged:
-        """What the packets of points (n,) are; `overfull` are keys that too many points refer to, sorted.
+    def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
+        """What the packets of points (n,) are.
+
+        form: how vectors are stored. overfull: keys that too many points refer to, sorted.
 
         Raises InputError where a point refers to compressed packets.
         """
@@ -100,7 +107,7 @@ class Judge:
         if overfull is not None and len(overfull):
             place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
             reason[overfull[place] == keys] = Reason.OVERFULL
-        reason[~_has_geometry(points)] = Reason.NO_GEOMETRY
+        reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
         reason[~inside] = Reason.OUTSIDE
         reason[n_samples == 0] = Reason.EMPTY
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
@@ -116,9 +123,8 @@ class Judge:
             raise refuse_compressed(self._facts.path, self._facts.compression[int(index[np.argmax(bad)])])
 
 
-def _has_geometry(points: np.ndarray) -> np.ndarray:
-    """Points whose packet has a place in space: finite location and vector, and a vector that is not zero."""
-    length = np.zeros(len(points))
-    for name in VECTORS:
-        length += np.abs(points[name].astype(np.float64))
-    return np.isfinite(points["return_point_wave_location"]) & np.isfinite(length) & (length > 0)
+def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:
+    """Points whose packet has a place in space: location and vector are numbers that can be."""
+    ratio = measure_ratio(points, form)
+    location = np.abs(widen(points["return_point_wave_location"]))
+    return (ratio > 0) & (ratio <= RANGE_RATIO) & (location <= MAX_LOCATION)

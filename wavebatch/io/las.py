@@ -27,6 +27,8 @@ WAVEFORM_FORMATS = (4, 5, 9, 10)
 MAX_FRONT = 1 << 26
 """Most bytes of header and VLRs: they are held in memory."""
 MAX_VLRS = 1 << 16
+LEAST_SCALE, LARGEST_SCALE, LARGEST_OFFSET = 1e-12, 1e6, 1e12
+"""Beyond these, scale and offset of coordinates are damage [m]."""
 MAX_FILE = 1 << 54
 """Byte offsets below this can share 64 bits with the number of a descriptor."""
 _FRONT_FIELDS = struct.Struct("<4s20xBB68xHIIBH")
@@ -124,7 +126,7 @@ def _check_format(path: Path, header: LasHeader) -> None:
 
 def _check_numbers(path: Path, header: LasHeader) -> None:
     for axis, scale, offset in zip("xyz", header.scales, header.offsets, strict=True):
-        if not (np.isfinite(scale) and scale != 0 and np.isfinite(offset)):
+        if not (LEAST_SCALE <= abs(scale) <= LARGEST_SCALE and abs(offset) <= LARGEST_OFFSET):
             raise InputError(
                 f"{path}: scale {scale} and offset {offset} of {axis} give no coordinates; the header is damaged: "
                 "get the file again"

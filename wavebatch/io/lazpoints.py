@@ -12,17 +12,14 @@ import numpy as np
 from wavebatch.errors import InputError
 from wavebatch.io.header import LasHeader, has_record
 from wavebatch.io.las import CheckedHeader
+from wavebatch.io.laszippoints import LaszipPoints
 from wavebatch.io.rawbytes import guarded, read_exactly
-
-try:
-    import laszip
-except ImportError:  # optional: only LAS 1.5 coding, which lazrs does not know, needs it
-    laszip = None
 
 LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
 MAX_CHUNKS = 2_000_000
 MAX_CHUNK_POINTS = 5_000_000
 MAX_CHUNK_BYTES = 1 << 28
+MAX_POINTS_PER_BYTE = 1000
 _PIECE = 50_000
 _LASZIP = struct.Struct("<HHBBHIIqqH")
 _ITEM = struct.Struct("<HHH")
@@ -40,6 +37,7 @@ def open_laz(checked: CheckedHeader) -> LazPoints | LaszipPoints:
     Raises InputError where the compression's own records are damaged or nobody here can decode them.
     """
     coding = _read_coding(checked.path, checked.header)
+    _check_total(checked)
     return LaszipPoints(checked) if coding.newest > 3 else LazPoints(checked, coding)
 
 
@@ -192,38 +190,13 @@ def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple
     return first, place
 
 
-class LaszipPoints:
-    """LASzip reads the file by itself; it knows the coding of LAS 1.5."""
-
-    def __init__(self, checked: CheckedHeader) -> None:
-        if laszip is None:
-            raise InputError(
-                f"{checked.path}: coded by LAZ items of version 4 (LAS 1.5), which lazrs cannot read; pip install "
-                "laszip, or decompress it first: laszip -i IN.laz -o OUT.las"
-            )
-        self._checked = checked
-        self._next = 0
-        self._file = open(checked.path, "rb")  # noqa: SIM115 - closed by close()
-        try:
-            with guarded(checked.path, 0, checked.header.point_count):
-                self._zipper = laszip.LasUnZipper(self._file)
-        except BaseException:
-            self._file.close()
-            raise
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        rows = np.empty(stop - start, self._checked.dtype)
-        with guarded(self._checked.path, start, stop):
-            if start != self._next:
-                self._zipper.seek(start)
-            if len(rows):
-                self._zipper.decompress_into(rows.view(np.uint8).reshape(-1))
-        self._next = stop
-        return rows
-
-    def close(self) -> None:
-        self._zipper = None
-        self._file.close()
+def _check_total(checked: CheckedHeader) -> None:
+    """Refuses counts that no compression could hold: they would make a scan of nothing last for ever."""
+    total = checked.header.point_count
+    if total > checked.size * MAX_POINTS_PER_BYTE:
+        raise InputError(
+            f"{checked.path}: the header claims {total} points in {checked.size} bytes; damaged: get the file again"
+        )
 
 
 def _read_i8(fd: int, at: int) -> int:

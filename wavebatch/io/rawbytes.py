@@ -30,6 +30,12 @@ def _seek_read(fd: int, view: memoryview, at: int) -> int:
     return len(data)
 
 
+def widen(values: np.ndarray) -> np.ndarray:
+    """Floating-point values as f8; signalling NaN, which a damaged file may hold, is NaN and no warning."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
 @contextlib.contextmanager
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     """Turns whatever a decoder or the disk says into one line with the points that were wanted."""

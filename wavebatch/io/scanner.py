@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from wavebatch.io import sharing
-from wavebatch.io.direction import DirectionTally, decide
+from wavebatch.io.direction import DirectionTally, decide, find_form
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.judge import REASON_TEXTS, Judge, Judged, Reason
 from wavebatch.io.points import PointSource
@@ -20,6 +20,7 @@ LONGEST_RUN = 64
 """Runs of points with one gps time that are shorter than this are not cut by a border."""
 _PAIRS = 4096
 _FAR_SAMPLES = 32
+_FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
 
 def scan_strip(facts: StripFacts, source: PointSource, unit_points: int) -> StripScan:
@@ -53,13 +54,20 @@ class _Scanner:
     def __init__(self, facts: StripFacts, source: PointSource, unit_points: int) -> None:
         self._facts, self._source, self._unit_points = facts, source, unit_points
         self._judge = Judge(facts)
-        self._tally, self._votes = _Tally(), DirectionTally()
+        self._form = find_form(self._take_first())
+        self._tally, self._votes = _Tally(), DirectionTally(self._form)
         self._borders = [0]
         units = -(-facts.point_count // unit_points)
         self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
         low = facts.packet_start - facts.packet_base
         self._near = NearSharing(low, max(low, facts.packet_end - facts.packet_base), self._context)
         self._window: list[_Part] = []
+
+    def _take_first(self) -> np.ndarray:
+        """The first points that have packets."""
+        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.point_length)
+        points = self._source.read(0, min(self._facts.point_count, most))
+        return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
 
     def run(self) -> StripScan:
         try:
@@ -102,7 +110,7 @@ class _Scanner:
             yield self._borders[-2], held
 
     def _add_unit(self, start: int, points: np.ndarray) -> None:
-        judged = self._judge.judge(points)
+        judged = self._judge.judge(points, self._form)
         self._tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
         part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points[rows])
@@ -145,7 +153,7 @@ class _Scanner:
 
     def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            judged = self._judge.judge(self._source.read(start, stop))
+            judged = self._judge.judge(self._source.read(start, stop), self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[self._near.is_suspect(judged.keys[rows], suspects)]
             yield judged.keys[rows], start + rows
@@ -164,7 +172,7 @@ class _Scanner:
             context = unique_entries(self._context.read(unit))
             points = np.concatenate([self._source.read(start, stop), context["record"]])
             index = np.concatenate([np.arange(start, stop), context["index"]])
-            judged = self._judge.judge(points)
+            judged = self._judge.judge(points, self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[np.argsort(index[rows], kind="stable")]
             parts = _Parts([_Part(judged.keys[rows], index[rows], unit, points[rows])])
@@ -172,7 +180,7 @@ class _Scanner:
 
     def _count_overfull(self, overfull: np.ndarray) -> None:
         for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            reason = self._judge.judge(self._source.read(start, stop), overfull).reason
+            reason = self._judge.judge(self._source.read(start, stop), self._form, overfull).reason
             many = int((reason == Reason.OVERFULL).sum())
             if many and self._tally.first[Reason.OVERFULL] < 0:
                 self._tally.first[Reason.OVERFULL] = start + int(np.argmax(reason == Reason.OVERFULL))

@@ -15,6 +15,7 @@ from wavebatch.io.judge import Judge
 from wavebatch.io.las import read_checked_header
 from wavebatch.io.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
 from wavebatch.io.points import open_points
+from wavebatch.io.rawbytes import widen
 from wavebatch.io.scan import StripScan, raise_problem
 from wavebatch.io.scanner import locate, scan_strip, unique_entries
 from wavebatch.io.sharing import expand, group_keys
@@ -138,9 +139,9 @@ class StripReader:
         """Unit `number` (0 to unit_count() - 1): its points and their packets; samples are read by `read_blocks`."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
         points = self._points.read(start, stop)
-        judged = self._judge.judge(points, scan.overfull)
+        judged = self._judge.judge(points, scan.vector_form, scan.overfull)
         entries = unique_entries(scan.context.read(number))
-        near = self._judge.judge(entries["record"], scan.overfull)
+        near = self._judge.judge(entries["record"], scan.vector_form, scan.overfull)
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
         own = np.flatnonzero(judged.usable)
         index = np.concatenate([start + own, entries["index"]])
@@ -229,7 +230,7 @@ class _Geometry:
         place = expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
         xyz = locate(records, self._facts)
-        location = records["return_point_wave_location"].astype(np.float64)
+        location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
         toward = read_toward(records[owner], self._unit.direction, self._unit.vector_form)
         owners = self._unit.packets.owner[rows]
@@ -238,7 +239,7 @@ class _Geometry:
             samples=samples,
             first=int(owners[0]),
             point=owners,
-            gps_time=records["gps_time"][owner].astype(np.float64),
+            gps_time=widen(records["gps_time"][owner]),
             origin=xyz[owner] + location[owner, None] * toward,
             direction=-PS_PER_NS * toward,
             returns=ReturnTable(
