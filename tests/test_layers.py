@@ -13,7 +13,7 @@ RANKS = [
     {"kernels", "blocks"},
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
-    {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare", "systemfile"},
+    {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare"},
     {"auto", "trial"},
     {"work"},
     {"record"},
