@@ -1,0 +1,178 @@
+"""`info` and `check`: what they say of good strips, bad strips and chain files, and their exit codes."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from strips import descriptor, make_raw
+from writer_tools import data_file
+
+from wavebatch.cli import main
+from wavebatch.errors import InputError
+from wavebatch.inspection import check_file, describe_strip
+
+RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def test_info_of_the_riegl_pair():
+    facts = describe_strip(data_file(RIEGL))
+    assert (facts["points"], facts["points_with_waveform"], facts["share_with_waveform"]) == (2535, 2535, 1.0)
+    assert (facts["las_version"], facts["point_format"], facts["compressed"]) == ("1.4", 9, False)
+    assert facts["packets"]["count"] == 2375
+    assert facts["packets"]["where"] == "external"
+    assert facts["packets"]["descriptors_unused"] == 98
+    assert [d["samples"] for d in facts["packets"]["descriptors"]] == [60, 120]
+    assert facts["samples"]["lengths"] == [60, 120] and facts["samples"]["largest"] == 248
+    assert facts["extra_dimensions"] == ["Amplitude", "Pulse width"]
+    assert facts["vectors"]["direction"] == "toward"
+    assert facts["crs"].startswith("PROJCS")
+    assert facts["warnings"] == facts["problems"] == []
+    json.dumps(facts, allow_nan=False)
+
+
+def test_info_of_the_leica_file():
+    facts = describe_strip(data_file("leica-als/simple1_3_full_internal.las"))
+    assert (facts["packets"]["count"], facts["packets"]["where"]) == (999, "internal")
+    assert facts["packets"]["descriptors"][0]["gain"] == pytest.approx(0.01729, abs=1e-5)
+
+
+def test_info_prints_text_and_json(tmp_path):
+    path = make_raw().write(tmp_path / "a.las")
+    text = run("info", path)
+    assert text.exit_code == 0
+    for word in ("point format 4", "packets        40", "toward the sensor", "32 samples of 8 bits", "CRS"):
+        assert word in text.stdout
+    result = run("info", path, "--json")
+    assert json.loads(result.stdout) == describe_strip(path)
+
+
+def test_info_counts_samples_at_the_limit(tmp_path):
+    raw = make_raw(10, most_returns=1)
+    data = bytearray(b"\x0a" * 320)
+    data[33] = data[40] = data[100] = 255
+    raw.packets = bytes(data)
+    samples = describe_strip(raw.write(tmp_path / "a.las"))["samples"]
+    assert samples == {"waveforms_read": 10, "least": 10, "largest": 255, "waveforms_at_limit": 2, "lengths": [32]}
+
+
+def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_path):
+    raw = make_raw()
+    raw.packets = b""
+    path = raw.write(tmp_path / "a.las")
+    facts = describe_strip(path)
+    assert facts["points_broken"] == facts["points"]
+    assert facts["problems"][0].startswith("no packet can be used")
+    assert facts["samples"]["least"] is None
+    json.dumps(facts, allow_nan=False)
+    result = run("info", path)
+    assert result.exit_code == 0 and "problem        no packet can be used" in result.stdout
+
+
+def test_info_of_something_else_is_one_line_and_exit_1(tmp_path):
+    path = tmp_path / "a.las"
+    path.write_bytes(b"nothing")
+    result = run("info", path)
+    assert result.exit_code == 1 and result.stdout == ""
+    assert result.stderr == f"error: {path}: not a LAS or LAZ file (it does not begin with LASF)\n"
+    with pytest.raises(InputError):
+        describe_strip(path)
+
+
+def test_check_of_clean_files_is_0():
+    result = run("check", data_file(RIEGL), data_file("leica-als/simple1_3_full_internal.las"))
+    assert result.exit_code == 0
+    assert result.stdout.count(": ok (") == 2
+    assert "note: points lie outside the bounds" in result.stdout
+
+
+@pytest.mark.parametrize(
+    "name", ["fullwave.laz", "pdrf9-1.4.laz", "pdrf10-1.4.laz", "pdrf4-1.3.laz", "pdrf5-1.3.laz", "simple1_3.las"]
+)
+def test_check_gives_files_without_packets_one_line(name):
+    path = data_file(f"no-packets/{name}")
+    result = run("check", path)
+    assert result.exit_code == 1
+    assert len(result.stdout.splitlines()) == 1
+    assert result.stdout.startswith(f"{path}: ")
+
+
+def make_bad(tmp_path):
+    raw = make_raw(60, most_returns=1)
+    raw.points["wavepacket_offset"][3] = 2**64 - 1
+    raw.points["wavepacket_index"][4:6] = 9
+    raw.points["wavepacket_size"][7] = 16
+    raw.points["x_t"][8] = np.nan
+    raw.head = None
+    return raw.write(tmp_path / "bad.las")
+
+
+def test_check_gives_every_problem_a_line_with_its_place(tmp_path):
+    path = make_bad(tmp_path)
+    lines = run("check", path).stdout.splitlines()
+    for text in (
+        "1 points (first: point 3) have a packet outside the waveform data",
+        "2 points (first: point 4) refer to a descriptor that the header does not have",
+        "1 points (first: point 8) have a return location or a packet vector that cannot be",
+        "1 points have packets shorter than their descriptor says",
+    ):
+        assert sum(text in line for line in lines) == 1, text
+    assert all(line.startswith(f"{path}: ") for line in lines)
+
+
+def test_check_as_json_and_several_files(tmp_path):
+    good = make_raw().write(tmp_path / "good.las")
+    result = run("check", good, make_bad(tmp_path), tmp_path / "none.las", "--json")
+    assert result.exit_code == 1
+    found = json.loads(result.stdout)
+    assert [entry["clean"] for entry in found] == [True, False, False]
+    assert "No such file" in found[2]["problems"][0]
+
+
+def test_check_reports_directions_and_obeys_the_option(tmp_path):
+    raw = make_raw(most_returns=1)
+    raw.points["z_t"][::2] *= -1
+    path = raw.write(tmp_path / "a.las")
+    assert any("--direction" in line for line in check_file(path).problems)
+    assert not any("cannot be told" in line for line in check_file(path, direction="away").problems)
+
+
+def test_check_notes_do_no_harm_unless_strict(tmp_path):
+    raw = make_raw()
+    raw.vlrs = [descriptor(1, gain=0.0)]
+    path = raw.write(tmp_path / "a.las")
+    result = run("check", path)
+    assert result.exit_code == 0
+    assert "note: descriptor 1 has gain 0" in result.stdout
+    assert "note: counts by return in the header are wrong (first returns: 0, really 40)" in result.stdout
+    assert run("check", path, "--strict").exit_code == 1
+
+
+def test_check_notices_packets_that_cannot_be_read(tmp_path, monkeypatch):
+    path = make_raw().write(tmp_path / "a.las")
+
+    def fail(*arguments):
+        raise InputError(f"{path}: packets cannot be read: Input/output error; check the disk")
+
+    monkeypatch.setattr("wavebatch.io.packets.PacketFile.read", fail)
+    assert any("Input/output error" in line for line in check_file(path).problems)
+
+
+def test_check_takes_chain_files(tmp_path):
+    good, bad, missing = tmp_path / "good.toml", tmp_path / "bad.toml", tmp_path / "none.toml"
+    bad.write_text('[[chain]]\nstage = "detect.nothing"\n')
+    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian")
+    good.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
+    assert run("check", good).exit_code == 0
+    result = run("check", bad)
+    assert result.exit_code == 1
+    assert len(result.stdout.splitlines()) == 1 and "detect.nothing" in result.stdout
+    assert run("check", missing).exit_code == 1
+
+
+def test_check_without_files_is_wrong_usage():
+    assert run("check").exit_code == 2
