@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent / "wavebatch"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
-    {"errors", "units", "words", "allocator", "flags"},
+    {"errors", "units", "words", "allocator"},
     {"kernels", "blocks"},
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
