@@ -24,7 +24,10 @@ def correlate_symmetric(waveform, taps):
 
 
 def find_peaks(signal, threshold):
-    """(waveform, sample) of local maxima of signal (s, n) above the threshold; a plateau counts at its first sample."""
+    """(waveform, sample) of local maxima of signal (s, n) above the threshold; a plateau counts at its first sample.
+
+    The first sample must be above its one neighbour; a constant waveform has no peak.
+    """
     s, n = signal.shape
     threshold = np.broadcast_to(threshold, n)
     found = []
@@ -35,7 +38,7 @@ def find_peaks(signal, threshold):
             after = i + 1
             while after < s and signal[after, w] == y:
                 after += 1
-            starts = before < 0 or signal[before, w] < y
+            starts = signal[before, w] < y if before >= 0 else after == 1 < s
             ends = after >= s or signal[after, w] < y
             if starts and ends and y > threshold[w]:
                 found.append((w, i))
