@@ -108,6 +108,15 @@ def _sum(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.exp(-0.5 * ((lag[:, None] - delay) / sigma) ** 2) @ weight
 
 
+def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
+    """Derivatives of `_sum` by weight, delay and sigma of every component (b, 3 c)."""
+    weight, delay, sigma = parameters.reshape(-1, 3).T
+    z = (lag[:, None] - delay) / sigma
+    bell = np.exp(-0.5 * z * z)
+    steep = weight * bell * z / sigma
+    return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
+
+
 def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray) -> np.ndarray:
     width = abs(start[2])
     low = np.tile([-1.0, stack.lag[0], 0.35 * width], len(start) // 3)
@@ -115,6 +124,7 @@ def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray) -> np.ndarray:
     result = least_squares(
         lambda p: (_sum(p, stack.lag) - stack.value) * weight,
         np.clip(start, low, high),
+        jac=lambda p: _slopes(p, stack.lag) * weight[:, None],
         bounds=(low, high),
         max_nfev=200,
     )
