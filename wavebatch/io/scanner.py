@@ -12,13 +12,14 @@ from wavebatch.io.direction import DirectionTally, decide, find_form
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.judge import REASON_TEXTS, Judge, Judged, Reason
 from wavebatch.io.points import PointSource
+from wavebatch.io.rawbytes import take_records
 from wavebatch.io.scan import StripScan, describe_hopeless, describe_oddities
 from wavebatch.io.sharing import Groups, NearSharing, find_far, group_keys
 from wavebatch.io.spool import Spool
 
 LONGEST_RUN = 64
 """Runs of points with one gps time that are shorter than this are not cut by a border."""
-_PAIRS = 4096
+_PAIRS, _VOTERS = 4096, 256
 _FAR_SAMPLES = 32
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
@@ -113,13 +114,13 @@ class _Scanner:
         judged = self._judge.judge(points, self._form)
         self._tally.add(points, start, judged)
         rows = np.flatnonzero(judged.usable)
-        part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points[rows])
+        part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points, start)
         self._window = [old for old in (old.tail(start - sharing.WINDOW) for old in self._window) if len(old.keys)]
         parts = _Parts([*self._window, part])
         own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
         groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
         if len(rows):
-            self._votes.add_points(part.points)
+            self._votes.add_points(take_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
             self._vote(groups, parts, own)
         self._window.append(part)
 
@@ -161,7 +162,7 @@ class _Scanner:
     def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
         points = self._source.read(start, stop)
         entries = np.empty(len(wants), self._context.dtype)
-        entries["index"], entries["record"] = wants["index"], points[wants["index"] - start]
+        entries["index"], entries["record"] = wants["index"], take_records(points, wants["index"] - start)
         self._context.append(wants["unit"], entries)
 
     def _vote_far(self) -> None:
@@ -175,7 +176,7 @@ class _Scanner:
             judged = self._judge.judge(points, self._form)
             rows = np.flatnonzero(judged.usable)
             rows = rows[np.argsort(index[rows], kind="stable")]
-            parts = _Parts([_Part(judged.keys[rows], index[rows], unit, points[rows])])
+            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_records(points, rows), 0)])
             self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
 
     def _count_overfull(self, overfull: np.ndarray) -> None:
@@ -220,15 +221,22 @@ class _Scanner:
 class _Part:
     """Usable points of one unit, as far as they matter to the next ones."""
 
-    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray) -> None:
-        self.keys, self.index, self.unit, self.points = keys, index, unit, points
+    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray, start: int) -> None:
+        self.keys, self.index, self.unit = keys, index, unit
+        self._points, self._start = points, start
+
+    def take(self, rows: np.ndarray) -> np.ndarray:
+        """Records of the usable points `rows`."""
+        return take_records(self._points, self.index[rows] - self._start)
 
     def tail(self, least: int) -> _Part:
         """The part from file index `least` on; copied where that frees memory."""
         at = int(np.searchsorted(self.index, least))
         if not at:
             return self
-        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, self.points[at:].copy())
+        first = max(self._start, least)
+        points = self._points[first - self._start :].copy()
+        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, points, first)
 
 
 class _Parts:
@@ -243,11 +251,14 @@ class _Parts:
 
     def take(self, rows: np.ndarray) -> np.ndarray:
         """Records at `rows` of all parts."""
-        records = np.empty(len(rows), self._parts[0].points.dtype)
+        taken, places = [], []
         for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
             here = np.flatnonzero((rows >= start) & (rows < stop))
-            records[here] = part.points[rows[here] - start]
-        return records
+            taken.append(part.take(rows[here] - start))
+            places.append(here)
+        back = np.empty(len(rows), np.int64)
+        back[np.concatenate(places)] = np.arange(len(rows))
+        return take_records(np.concatenate(taken), back)
 
 
 def _find_cut(before: np.ndarray, after: np.ndarray) -> int:

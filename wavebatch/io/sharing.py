@@ -20,7 +20,7 @@ WINDOW = 16_384
 """Points before a border among which shared packets are found while reading on."""
 MAX_RETURNS = 32
 """More points than this on one packet are damage: LAS knows 15 returns."""
-BINS = 1 << 21
+BINS = 1 << 18
 _LEAST_BIN = 64
 _PER_BUCKET = 500_000
 _KEY = np.dtype([("key", "<u8"), ("index", "<i8")])

@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.errors import InputError
 from wavebatch.io.rawbytes import read_exactly
 
-MEMORY = 1 << 25
+MEMORY = 1 << 24
 """Bytes of entries that are held before they go to disk."""
 KEPT = 1 << 20
 """Bytes of entries that stay in memory after all: a sealed spool travels to other processes."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,11 @@ import numpy as np
 from wavebatch.blocks import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.io.direction import check_option, read_toward
 from wavebatch.io.facts import StripFacts, collect_facts
-from wavebatch.io.judge import Judge
+from wavebatch.io.judge import INDEX_BITS, Judge
 from wavebatch.io.las import read_checked_header
 from wavebatch.io.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
 from wavebatch.io.points import open_points
-from wavebatch.io.rawbytes import widen
+from wavebatch.io.rawbytes import take_records, widen
 from wavebatch.io.scan import StripScan, raise_problem
 from wavebatch.io.scanner import locate, scan_strip, unique_entries
 from wavebatch.io.sharing import expand, group_keys
@@ -145,17 +145,18 @@ class StripReader:
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
         own = np.flatnonzero(judged.usable)
         index = np.concatenate([start + own, entries["index"]])
-        records = np.concatenate([points[own], entries["record"]])
         keys = np.concatenate([judged.keys[own], keys])
+        sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
-        packets, packet_of = _collect_packets(keys, index, records, n_samples, start, stop)
+        packets, packet_of = _collect_packets(keys, index, sizes, n_samples)
+        packets = replace(packets, owned=(packets.owner >= start) & (packets.owner < stop))
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
         return Unit(
             number=number,
             start=start,
             points=points,
-            context=records[len(own) :],
+            context=np.ascontiguousarray(entries["record"]),
             context_index=index[len(own) :],
             packets=packets,
             packet_of_point=packet_of_point,
@@ -216,6 +217,7 @@ class _Geometry:
 
     def __init__(self, unit: Unit, facts: StripFacts) -> None:
         self._unit, self._facts = unit, facts
+        self._all: np.ndarray | None = None
         packet_of = np.concatenate([unit.packet_of_point, unit.packet_of_context])
         index = np.concatenate([np.arange(unit.start, unit.start + len(unit.points)), unit.context_index])
         used = np.flatnonzero(packet_of >= 0)
@@ -250,18 +252,16 @@ class _Geometry:
     def _take(self, entries: np.ndarray) -> np.ndarray:
         unit = self._unit
         if not len(unit.context):
-            return unit.points[entries]
-        records = np.empty(len(entries), unit.points.dtype)
-        here = entries < len(unit.points)
-        records[here] = unit.points[entries[here]]
-        records[~here] = unit.context[entries[~here] - len(unit.points)]
-        return records
+            return take_records(unit.points, entries)
+        if self._all is None:
+            self._all = np.concatenate([unit.points, unit.context])
+        return take_records(self._all, entries)
 
 
 def _collect_packets(
-    keys: np.ndarray, index: np.ndarray, records: np.ndarray, n_samples: np.ndarray, start: int, stop: int
+    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray
 ) -> tuple[PacketTable, np.ndarray]:
-    """The packets of records (n,) in order of their owners, and the row of each record, i4 (n,)."""
+    """The packets of points (n,) in order of their owners, all of them called owned, and the row of each, i4 (n,)."""
     by_index = np.argsort(index, kind="stable")
     groups = group_keys(keys[by_index])
     lead = by_index[groups.order[groups.starts]]
@@ -271,13 +271,12 @@ def _collect_packets(
     packet_of = np.empty(len(keys), np.int32)
     packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
     lead = lead[order]
-    owner = index[lead]
     table = PacketTable(
-        digitizer=records["wavepacket_index"][lead],
-        offset=records["wavepacket_offset"][lead].astype(np.uint64),
-        size=records["wavepacket_size"][lead],
+        digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
+        offset=keys[lead] >> INDEX_BITS,
+        size=sizes[lead],
         n_samples=n_samples[lead],
-        owner=owner,
-        owned=(owner >= start) & (owner < stop),
+        owner=index[lead],
+        owned=np.ones(len(lead), bool),
     )
     return table, packet_of
