@@ -21,8 +21,8 @@ from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
 from wavebatch.report import RunReport
 from wavebatch.words import nearest
 
-BLOCK_SAMPLES = 1 << 20
-"""Samples of a block, unless told otherwise: 8,192 waveforms of 128."""
+BLOCK_SAMPLES = 1 << 22
+"""Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""
 
 SURVEY_SAMPLES = 1 << 21
 """Samples that the survey looks at, at most."""
@@ -176,7 +176,7 @@ def process_packed_unit(blob: bytes, number: int, block_size: int | None) -> tup
 
 def _block_size(unit: Unit) -> int:
     longest = int(unit.packets.n_samples.max(initial=1))
-    return int(np.clip(BLOCK_SAMPLES // longest, 64, 8192))
+    return int(np.clip(BLOCK_SAMPLES // longest, 64, 65536))
 
 
 def _run_blocks(

@@ -143,8 +143,16 @@ def _join(parts: list) -> tuple:
     return type(parts[0])(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
-LENGTHS = np.array([8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 65536])
-"""Window lengths: few, so that batches are large."""
+_LONG = (64, 80, 96, 128, 160, 192, 256, 384, 512, 768, 1024, 2048, 4096, 65536)
+
+FINE_LENGTHS = np.array([8, 12, 16, 20, 24, 28, 32, 40, 48, *_LONG])
+"""Window lengths of problems with one or two echoes: many problems, each window hardly longer than it must be."""
+
+COARSE_LENGTHS = np.array([16, 32, 48, *_LONG])
+"""Window lengths of problems with more echoes: few problems, in as few batches as possible."""
+
+LAST_LENGTHS = np.array([48, 96, 192, 512, 1024, 4096, 65536])
+"""Window lengths of the stragglers."""
 
 PATIENCE = 5
 """Iterations of the first attempt; what has not converged then goes on together with others of any length."""
@@ -158,8 +166,9 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
     longest = work.samples.shape[1]
     rows = np.arange(len(problem.cluster))
     most = work.settings.max_iterations
-    for lengths, iterations in ((LENGTHS, min(PATIENCE, most)), (LENGTHS[5::2], most - PATIENCE)):
-        last = iterations == most or lengths is not LENGTHS
+    first = FINE_LENGTHS if problem.start.shape[2] <= 2 else COARSE_LENGTHS
+    for lengths, iterations in ((first, min(PATIENCE, most)), (LAST_LENGTHS, most - PATIENCE)):
+        last = iterations == most or lengths is LAST_LENGTHS
         needed = work.clusters.high[problem.cluster] - work.clusters.low[problem.cluster]
         length = np.minimum(lengths[np.searchsorted(lengths, needed)], longest)
         order = np.argsort(length, kind="stable")

@@ -18,7 +18,7 @@ from wavebatch.stages.flags import drop_unproven, flag_echoes
 from wavebatch.stages.shapes import ShapeLimits, describe_echoes, model_parameters, pulse_shape, shape_limits
 from wavebatch.units import SQRT_PI
 
-MARGIN = 1.6
+MARGIN = 1.2
 """Windows extend this many system widths beyond the signal above the noise."""
 
 REACH = 3.0
@@ -67,7 +67,7 @@ def gaussian(
     echoes: EchoTable,
     *,
     max_iterations: int = 40,
-    tolerance: float = 0.01,
+    tolerance: float = 0.1,
     significance: float = 5.0,
 ) -> EchoTable:
     """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
@@ -96,7 +96,7 @@ def adaptive(
     gate_hermite: float = 11.9,
     width_prior: float = 0.05,
     max_iterations: int = 40,
-    tolerance: float = 0.05,
+    tolerance: float = 0.2,
     significance: float = 5.0,
 ) -> EchoTable:
     """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
