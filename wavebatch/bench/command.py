@@ -1,0 +1,218 @@
+"""The benchmark as a whole: scenes, chains, peers and stability in, one document of plain values out."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
+from wavebatch.bench.figures import median_range
+from wavebatch.bench.pareto import choose_cheapest, find_front
+from wavebatch.bench.peers import list_peers, run_peer
+from wavebatch.bench.promises import judge, measure_system
+from wavebatch.bench.scenes import find_bench_scene, shape_scene
+from wavebatch.bench.speed import Laps, make_strip, time_chains
+from wavebatch.bench.stability import FAILURES, measure_stability
+from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.chain import Chain
+from wavebatch.config import load_chain, load_profile
+from wavebatch.errors import ConfigError
+from wavebatch.simulate import Scene
+from wavebatch.simulate.blocks import SEED_BLOCK
+
+SCHEMA = "wavebatch.bench/1"
+
+PROFILES = ("fast", "balanced", "accurate")
+"""Shipped chains that are always measured, cheapest first."""
+
+COSTS = ("microseconds", "rmse_all_cm", "wrong")
+"""What a chain costs: time per waveform, error of range, share of echoes missed or false."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class BenchOptions:
+    """What is measured."""
+
+    strip: Path | None = None
+    """Strip after whose survey the waveforms are simulated."""
+    scenes: tuple[str, ...] = ()
+    """Named scenes, besides the strip."""
+    chains: tuple[Path, ...] = ()
+    """Chain files, besides the shipped chains."""
+    seed: int = 0
+    waveforms: int = 32_768
+    """Simulated waveforms per scene."""
+    repeats: int = 3
+    """Turns of the timing."""
+    pulses: int = 50_000
+    """Pulses of the strip that goes from file to file; 0 leaves it out."""
+    peers: bool = True
+    peer_waveforms: int = 2_000
+    stability: bool = True
+    stability_waveforms: int = 900
+    """Per case."""
+    tolerance_cm: float | None = None
+    """Error of the range of isolated echoes that the cheapest chain must meet."""
+    promises: bool = False
+    """Also measure start-up, memory and jobs, and hold everything to what is promised."""
+    large: bool = False
+    """Measure memory with 100 times as many pulses too."""
+
+
+def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> dict[str, Any]:
+    """The document of a benchmark: plain values, reproducible but for times and memory.
+
+    Raises ConfigError for unknown scenes and chains that cannot run, InputError for a strip that cannot be used.
+    """
+    chains = load_chains(options.chains)
+    scenes: list[Scene] = [find_bench_scene(name) for name in options.scenes]
+    if options.strip is not None:
+        progress(f"surveying {options.strip}")
+        scenes.insert(0, shape_scene(options.strip, chains["accurate"]))
+    if not scenes:
+        raise ConfigError("nothing to measure: give a strip or --scene NAME")
+    sections = [_measure_scene(scene, chains, options, place, progress) for place, scene in enumerate(scenes)]
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "version": __version__,
+        "seed": options.seed,
+        "error_means": "standard error of the difference between two runs that differ in their seed",
+        "scenes": sections,
+    }
+    if options.stability:
+        document["failure_kinds"] = FAILURES
+        document["stability"] = measure_stability(
+            lambda block, system: choose_chains(chains, block, system),
+            options.stability_waveforms,
+            min(SEED_BLOCK // 2, options.waveforms),
+            options.seed,
+            progress=progress,
+        )
+    if options.tolerance_cm is not None:
+        document["tolerance_cm"] = options.tolerance_cm
+    if options.promises:
+        pulses = 2 * max(options.pulses, 1000)
+        document["system"] = measure_system(options.seed, pulses=pulses, large=options.large, progress=progress)
+        document["promises"] = judge(document)
+    return document
+
+
+def load_chains(files: tuple[Path, ...]) -> dict[str, Chain]:
+    """The shipped chains and those of the files, by the names that rows carry."""
+    chains = {name: load_profile(name) for name in PROFILES}
+    for path in files:
+        name = path.stem if path.stem not in chains else str(path)
+        if name in chains:
+            raise ConfigError(f"{path}: given twice; give every chain file once")
+        chains[name] = load_chain(path)
+    return chains
+
+
+def choose_chains(chains: Mapping[str, Chain], block: WaveformBlock, system: SystemPulse) -> dict[str, Chain]:
+    """The chains that run on every strip, and with them the one that the strip's survey chooses."""
+    chosen = choose_auto(block, system)
+    return {**chains, **({"auto": chosen} if chosen else {})}
+
+
+def choose_auto(block: WaveformBlock, system: SystemPulse) -> Chain | None:
+    """The chain of `--profile auto` for a strip of which the block is a sample; None where there is no such profile."""
+    return None
+
+
+def _measure_scene(
+    scene: Scene, chains: Mapping[str, Chain], options: BenchOptions, place: int, progress: Progress
+) -> dict[str, Any]:
+    seed = derive_seed(options.seed, place)
+    groups = make_groups(scene, options.waveforms, seed, progress)
+    chosen = [choose_chains(chains, group.block, group.system) for group in groups]
+    tallies = {name: Tally() for name in chosen[0]}
+    for name, tally in tallies.items():
+        progress(f"{scene.name}: error of {name}")
+        for group, of_group in zip(groups, chosen, strict=True):
+            tally.add(group, describe_found(of_group[name].run(group.block, group.system)))
+    laps = _time(scene, groups[0], chosen[0], options, seed, progress)
+    rows = [_row(name, "chain", tally, laps[name].to_json()) for name, tally in tallies.items()]
+    if options.peers:
+        rows += _measure_peers(scene, groups[0], options, progress)
+    _mark_front(rows)
+    section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
+    if options.tolerance_cm is not None:
+        cheapest = choose_cheapest([row for row in rows if row["kind"] == "chain"], options.tolerance_cm)
+        section["cheapest"] = cheapest["name"] if cheapest else None
+    return section
+
+
+def _time(
+    scene: Scene, group: Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int, progress: Progress
+) -> dict[str, Laps]:
+    timed = {name: (chain, group.system) for name, chain in chains.items()}
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
+        folder, strip = Path(name), None
+        if options.pulses:
+            strip = make_strip(scene, folder / "strip.laz", options.pulses, seed)
+        return time_chains(timed, group.block, strip, folder, options.repeats, progress)
+
+
+def _measure_peers(scene: Scene, group: Group, options: BenchOptions, progress: Progress) -> list[dict[str, Any]]:
+    n = min(options.peer_waveforms, len(group.block))
+    part = cut_group(group, n)
+    rows = []
+    for name in list_peers():
+        progress(f"{scene.name}: {name} on {n} waveforms")
+        result = run_peer(name, part.block, part.system)
+        tally = Tally()
+        tally.add(part, result.found)
+        laps = Laps(kernels=[1e6 * result.seconds / max(result.waveforms, 1)]).to_json()
+        rows.append({**_row(name, "peer", tally, laps), "crashed_or_hung": result.failures})
+    return rows
+
+
+def cut_group(group: Group, n: int) -> Group:
+    """The first n waveforms of a group."""
+    m = int(np.searchsorted(group.truth.waveform, n))
+    rows: EchoTable = group.truth.take(np.arange(m))
+    return replace(
+        group,
+        block=group.block.rows(slice(0, n)),
+        truth=rows,
+        isolated=group.isolated[:m],
+        bounds=group.bounds[:m],
+        clear=group.clear[:m],
+    )
+
+
+def _row(name: str, kind: str, tally: Tally, laps: Mapping[str, Any]) -> dict[str, Any]:
+    figures = {key: figure.to_json() for key, figure in tally.figures().items()}
+    return {"name": name, "kind": kind, "waveforms": tally.waveforms, "figures": figures, **laps}
+
+
+def _mark_front(rows: list[dict[str, Any]]) -> None:
+    """Adds to every row whether no other is as good in time, error and wrong echoes, and better in one."""
+    costs = [
+        [row["kernels"]["median"], row["figures"]["rmse_all_cm"]["value"], row["figures"]["wrong"]["value"]]
+        for row in rows
+    ]
+    front = find_front(np.array([[np.nan if cost is None else cost for cost in line] for line in costs]))
+    for row, best in zip(rows, front.tolist(), strict=True):
+        row["pareto"] = best
+
+
+def _describe(groups: list[Group]) -> dict[str, Any]:
+    """Range of what the surveys of the groups found."""
+    return {
+        "groups": len(groups),
+        "waveforms_of_a_group": len(groups[0].block),
+        **{
+            name: median_range([float(getattr(group.system, name)) for group in groups])
+            for name in ("sigma_ref", "noise_std", "kappa", "noise_gain", "ringing", "acceptance")
+        },
+        "components": sorted({len(group.system.components) for group in groups}),
+    }
