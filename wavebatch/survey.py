@@ -21,6 +21,12 @@ from wavebatch.units import FWHM_PER_SIGMA, MAD_TO_STD, QUANTISATION_STD
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
 
+FIRST_LOOK = 2048
+"""Waveforms from which the noise and the width to begin with are found."""
+
+RESIDUAL_LOOK = 4096
+"""Waveforms whose residuals are looked at."""
+
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
 
@@ -112,7 +118,8 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
         figures["isolated_echoes"] = len(main)
         if len(main) >= ENOUGH_TO_LEARN:
             system = _learn(block, system, main, figures)
-        system = _measure_residuals(block, system, _decompose(block, system))
+        part = _thin(block, RESIDUAL_LOOK)
+        system = _measure_residuals(part, system, _decompose(part, system))
         system = _choose_acceptance(block, system, main)
     echoes = _decompose(block, system)
     figures.update(_describe(block, system, echoes))
@@ -123,15 +130,19 @@ def _measure_gaussian(block: WaveformBlock) -> SystemPulse:
     """Noise and the width of isolated echoes, each from the other, three times."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     width = FIRST_WIDTH
-    signal = transpose_samples(block.samples)
-    for _ in range(3):
-        noise = estimate_noise(signal, int(np.ceil(3 * width)))
+    few = _thin(block, FIRST_LOOK)
+    for part in (few, few, block):
+        noise = estimate_noise(transpose_samples(part.samples), int(np.ceil(3 * width)))
         system = _gaussian_system(block.spacing, noise, width, saturation)
-        found = _isolated_widths(block, system)
-        if len(found) < FEW:
-            break
-        width = float(np.clip(_mode_of_narrow(found), 0.5, 50.0))
+        found = _isolated_widths(part, system)
+        if len(found) >= FEW:
+            width = float(np.clip(_mode_of_narrow(found), 0.5, 50.0))
     return replace(system, sigma_ref=width * block.spacing)
+
+
+def _thin(block: WaveformBlock, number: int) -> WaveformBlock:
+    """About `number` waveforms spread over the block, at least as many where it has them."""
+    return block.rows(slice(None, None, max(len(block) // number, 1)))
 
 
 def _gaussian_system(spacing: float, noise: PooledNoise, width: float, saturation: float | None) -> SystemPulse:
@@ -327,14 +338,14 @@ def _choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTabl
     """
     if len(main) < ENOUGH_TO_LEARN:
         return system
-    part = block.rows(main.waveform)
-    noise = pooled_noise(part, system)
-    candidates = matched_filter(part, noise, system)
-    shares = []
+    rows, shares = np.arange(len(main)), []
     for acceptance in ACCEPTANCES:
-        found = adaptive(part, noise, replace(system, acceptance=acceptance), candidates)
-        near = np.abs(found.time - main.time[found.waveform]) < NEAR * system.sigma_ref
-        shares.append(float((np.bincount(found.waveform[near], minlength=len(part)) > 1).mean()))
+        # What a threshold leaves whole, a higher one does too: only the split ones are tried again.
+        part, time = block.rows(main.waveform[rows]), main.time[rows]
+        found = _decompose(part, replace(system, acceptance=acceptance))
+        near = np.abs(found.time - time[found.waveform]) < NEAR * system.sigma_ref
+        rows = rows[np.bincount(found.waveform[near], minlength=len(part)) > 1]
+        shares.append(len(rows) / len(main))
         if shares[-1] <= SPLIT_SHARE:
             return replace(system, acceptance=acceptance)
     useful = [i for i in range(1, len(shares)) if shares[i] < 0.75 * shares[i - 1]]
@@ -353,6 +364,11 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
     narrow = (number[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
     deviation = (echoes.sigma - system.sigma_ref) / np.maximum(echoes.sigma_err, 1e-6)
     return {
+        "spacing_ns": block.spacing,
+        "n_samples": float(block.samples.shape[1]),
+        "bits": float(block.digitizer.bits),
+        "least_count": float(block.samples.min(initial=block.digitizer.max_count)),
+        "largest_count": float(block.samples.max(initial=0)),
         "empty_share": float((number == 0).mean()),
         "single_share": float((number == 1).mean()),
         "overlapped_share": float(overlapped.mean()),
