@@ -104,7 +104,7 @@ def _check_format(path: Path, header: LasHeader) -> None:
     if any(vlr.user == "lascompatible" for vlr in header.vlrs):
         raise InputError(
             f"{path}: written in LAStools' LAS 1.4 compatibility mode; restore it first: laszip -i {path.name} -o "
-            "restored.las -remove_extra is not enough, use las2las -i IN -o OUT (LAStools), which undoes the mode"
+            f"{path.stem}_restored.las"
         )
     if number not in WAVEFORM_FORMATS:
         raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import selectors
 import subprocess
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,7 @@ class LaszipPoints:
                 "laszip, or decompress it first: laszip -i IN.laz -o OUT.las"
             )
         self._checked = checked
-        self._next = -1
+        self._next, self._late = -1, False
         self._child: subprocess.Popen | None = None
         self._talk = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
 
@@ -57,20 +56,22 @@ class LaszipPoints:
 
     def _fill(self, view: memoryview) -> None:
         while view:
-            self._wait()
-            got = os.readv(self._child.stdout.fileno(), [view[: 1 << 20]])
+            watch = threading.Timer(PATIENCE, self._give_up)
+            watch.start()
+            got = self._child.stdout.readinto(view[: 1 << 20])
+            watch.cancel()
             if not got:
                 raise InputError(self._explain())
             view = view[got:]
 
-    def _wait(self) -> None:
-        with selectors.DefaultSelector() as selector:
-            selector.register(self._child.stdout, selectors.EVENT_READ)
-            if not selector.select(PATIENCE):
-                raise InputError("LASzip does not come to an end; the file is damaged: get it again")
+    def _give_up(self) -> None:
+        self._late = True
+        self._child.kill()
 
     def _explain(self) -> str:
         status = self._child.wait()
+        if self._late:
+            return "LASzip does not come to an end; the file is damaged: get it again"
         self._talk.seek(0)
         said = " ".join(self._talk.read(500).decode("utf-8", "replace").split())
         reason = f"crashed (signal {-status})" if status < 0 else f"says: {said or 'nothing'}"
