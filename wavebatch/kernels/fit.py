@@ -73,13 +73,16 @@ class WidthPrior(NamedTuple):
         """Adds the prior to the products (m, 3 k + 1, 3 k + 1) of rows and residual in place; its cost (m,)."""
         k = parameters.shape[2]
         lack = np.maximum(self.width - parameters[:, 2], 0.0)
-        if not lack.any():
-            return np.zeros(len(lack))
-        unit = parameter_units(parameters, std)[:, 2]
-        weight = (std[:, None] / self.spread) ** 2
-        gram[:, 2 * k : 3 * k, -1] += weight * lack * unit
-        np.einsum("mpp->mp", gram)[:, 2 * k : 3 * k] += weight * unit * unit * (lack > 0)
-        return np.sum(weight * lack * lack, axis=1)
+        cost = np.zeros(len(lack))
+        rows = np.flatnonzero(lack.any(axis=1))
+        if len(rows):
+            lack, spread = lack[rows], (std[rows] / self.spread)[:, None] ** 2
+            unit = parameter_units(parameters[rows], std[rows])[:, 2]
+            gram[rows, 2 * k : 3 * k, -1] += spread * lack * unit
+            diagonal = np.arange(2 * k, 3 * k)
+            gram[rows[:, None], diagonal, diagonal] += spread * unit * unit * (lack > 0)
+            cost[rows] = np.sum(spread * lack * lack, axis=1)
+        return cost
 
 
 class Fit(NamedTuple):

@@ -67,7 +67,7 @@ def gaussian(
     echoes: EchoTable,
     *,
     max_iterations: int = 40,
-    tolerance: float = 0.1,
+    tolerance: float = 0.5,
     significance: float = 5.0,
 ) -> EchoTable:
     """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
@@ -76,7 +76,8 @@ def gaussian(
     Source: Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
 
     max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that another step may still promise when a fit is done.
+    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
+        standard deviation of the minimum.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
     settings = _settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
@@ -96,7 +97,7 @@ def adaptive(
     gate_hermite: float = 11.9,
     width_prior: float = 0.05,
     max_iterations: int = 40,
-    tolerance: float = 0.2,
+    tolerance: float = 0.5,
     significance: float = 5.0,
 ) -> EchoTable:
     """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
@@ -112,7 +113,8 @@ def adaptive(
     width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths;
         0 for no prior.
     max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that another step may still promise when a fit is done.
+    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
+        standard deviation of the minimum.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
     shape = pulse_shape(system, block.spacing)
