@@ -15,6 +15,7 @@ from wavebatch.kernels.fit import WidthPrior
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal import smooth_121, transpose_samples
 from wavebatch.stages.flags import drop_unproven, flag_echoes
+from wavebatch.stages.merge import merge_unresolved
 from wavebatch.stages.shapes import ShapeLimits, describe_echoes, model_parameters, pulse_shape, shape_limits
 from wavebatch.units import SQRT_PI
 
@@ -229,6 +230,7 @@ def _table(
         residual=misfit[keep],
         flags=flags[keep],
     )
+    table = merge_unresolved(table)
     if settings.shape.components:
         table = drop_unproven(table, system)
     return flag_echoes(block, noise, system, table)

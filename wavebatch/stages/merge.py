@@ -1,0 +1,75 @@
+"""Echoes too close to be told apart become one (ALGORITHMS H1)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable
+
+
+def merge_unresolved(table: EchoTable) -> EchoTable:
+    """The table with neighbours closer than the error of their distance merged, one pair after the other.
+
+    Area, mean time and variance of the pair are kept; errors of time and width are those of the better echo, widened
+    by nothing: together the pair is as well determined as one echo. The result is flagged.
+    """
+    while True:
+        first = _unresolved(table)
+        if not len(first):
+            return table
+        table = _merge(table, first)
+
+
+def _unresolved(table: EchoTable) -> np.ndarray:
+    """Rows whose next row is of the same waveform and not resolved from it; no row takes part in two pairs."""
+    if len(table) < 2:
+        return np.empty(0, np.int64)
+    gap = np.diff(table.time)
+    error = np.hypot(table.time_err[1:], table.time_err[:-1])
+    close = (np.diff(table.waveform) == 0) & (gap < error)
+    rows = np.flatnonzero(close)
+    run = np.cumsum(np.r_[True, np.diff(rows) > 1]) if len(rows) else rows
+    start = rows[np.r_[True, np.diff(rows) > 1]] if len(rows) else rows
+    return rows[(rows - start[run - 1]) % 2 == 0] if len(rows) else rows
+
+
+def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
+    a, b = table.take(first), table.take(first + 1)
+    area_a, area_b = (part.amplitude.astype(np.float64) * part.sigma for part in (a, b))
+    total = np.maximum(area_a + area_b, 1e-12)
+    share = area_a / total
+    time = share * a.time + (1 - share) * b.time
+    variance = share * (a.sigma**2 + (a.time - time) ** 2) + (1 - share) * (b.sigma**2 + (b.time - time) ** 2)
+    sigma = np.sqrt(variance)
+    relative = np.minimum(a.amplitude_err / a.amplitude, b.amplitude_err / b.amplitude)
+    merged = replace(
+        a,
+        time=time,
+        amplitude=(total / sigma).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        time_err=np.minimum(a.time_err, b.time_err),
+        amplitude_err=(relative * total / sigma).astype(np.float32),
+        sigma_err=np.minimum(a.sigma_err, b.sigma_err),
+        flags=(a.flags | b.flags | np.uint16(EchoFlag.MERGED)).astype(np.uint16),
+    )
+    keep = np.ones(len(table), bool)
+    keep[first] = keep[first + 1] = False
+    rest = table.take(np.flatnonzero(keep))
+    return EchoTable.build(
+        **{
+            name: np.concatenate([getattr(rest, name), getattr(merged, name)])
+            for name in (
+                "waveform",
+                "time",
+                "amplitude",
+                "sigma",
+                "time_err",
+                "amplitude_err",
+                "sigma_err",
+                "residual",
+                "flags",
+            )
+        }
+    )
