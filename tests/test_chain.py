@@ -1,0 +1,219 @@
+"""Stages and chains: what the decorator refuses, the order of kinds, needs and makes, and a stage that fails."""
+
+import numpy as np
+import pytest
+
+from wavebatch import chain as chain_module
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import KINDS, STAGES, Chain, Step, stage
+from wavebatch.config import list_profiles, load_profile
+from wavebatch.errors import ConfigError, StageError
+
+SYSTEM = SystemPulse(2.0, baseline=12.0, noise_std=1.0)
+
+
+@pytest.fixture(autouse=True)
+def own_stages(monkeypatch):
+    """Stages that a test registers are gone after it."""
+    monkeypatch.setattr(chain_module, "STAGES", dict(STAGES))
+
+
+def block(n=3):
+    samples = 12 + 80 * np.exp(-0.5 * ((np.arange(48) - 20.3) / 2) ** 2)
+    return WaveformBlock.from_samples(np.rint(np.tile(samples, (n, 1))).astype(np.uint8), first=700)
+
+
+def steps(*names):
+    return tuple(Step(STAGES[name]) for name in names)
+
+
+BASE = ("noise.pooled", "detect.maximum", "decompose.gaussian")
+
+
+def test_a_stage_is_known_by_kind_and_name_with_its_schema():
+    @stage("detect")
+    def invented(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 3.0) -> EchoTable:
+        """Echoes of a test.
+
+        level: least height,
+            in noise standard deviations.
+        """
+        return EchoTable.empty()
+
+    made = chain_module.STAGES["detect.invented"]
+    assert made.kind == "detect"
+    assert made.summary == "Echoes of a test."
+    parameter = made.parameters["level"]
+    assert parameter.default == 3.0
+    assert parameter.types == (float,)
+    assert parameter.meaning == "least height, in noise standard deviations."
+    assert made.function is invented
+
+
+def no_default(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float) -> EchoTable:
+    """Echoes.
+
+    level: least height.
+    """
+
+
+def no_meaning(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 1.0) -> EchoTable:
+    """Echoes."""
+
+
+def wrong_data(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Echoes."""
+
+
+def wrong_order(noise: Noise, block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Echoes."""
+
+
+def wrong_return(block: WaveformBlock, noise: Noise, system: SystemPulse) -> Noise:
+    """Echoes."""
+
+
+def no_return(block: WaveformBlock, noise: Noise, system: SystemPulse):
+    """Echoes."""
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [
+        (no_default, "parameter level needs a default"),
+        (no_meaning, "a line in the docstring"),
+        (wrong_data, "a detect stage takes"),
+        (wrong_order, "a detect stage takes"),
+        (wrong_return, "annotated to return EchoTable"),
+        (no_return, "annotated to return EchoTable"),
+    ],
+)
+def test_the_decorator_refuses_functions_that_are_no_stage(function, words):
+    with pytest.raises(StageError, match=words) as caught:
+        stage("detect")(function)
+    assert f"detect.{function.__name__}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert f"detect.{function.__name__}" not in chain_module.STAGES
+
+
+def test_the_decorator_refuses_unknown_kinds_and_second_names():
+    with pytest.raises(StageError, match="'filter' is not one of noise, detect, decompose, attribute"):
+        stage("filter")
+    with pytest.raises(StageError, match="noise.pooled is registered twice"):
+        stage("noise")(STAGES["noise.pooled"].function)
+
+
+def test_every_registered_stage_has_the_signature_of_its_kind():
+    for name, made in STAGES.items():
+        assert name == f"{made.kind}.{made.function.__name__}"
+        assert made.kind in KINDS
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        (),
+        BASE[:1],
+        BASE[:2],
+        (BASE[1], BASE[0], BASE[2]),
+        (*BASE, "noise.tail"),
+        (*BASE, "decompose.none"),
+        ("noise.pooled", "noise.tail", *BASE[1:]),
+        (*BASE[:2], "attribute.amplitude", BASE[2]),
+        ("attribute.amplitude", *BASE),
+    ],
+)
+def test_kinds_must_come_in_order(names):
+    with pytest.raises(ConfigError, match="one noise, one detect and one decompose stage") as caught:
+        Chain(steps(*names), "mine.toml")
+    assert str(caught.value).startswith("chain mine.toml: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_attributes_run_in_the_order_given():
+    chain = Chain(steps(*BASE, "attribute.echo_width", "attribute.amplitude"))
+    assert chain.makes == ("echo_width", "echo_width_err", "amplitude", "amplitude_err")
+    assert list(chain.run(block(), SYSTEM).attributes) == list(chain.makes)
+
+
+@pytest.fixture
+def dependent():
+    """A pair of attribute stages, of which the second needs the first's column."""
+
+    @stage("attribute", makes=("energy",))
+    def first(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+        """A column."""
+        return echoes.with_attributes(energy=echoes.amplitude)
+
+    @stage("attribute", makes=("twice",), needs=("energy",))
+    def second(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+        """Twice the column."""
+        return echoes.with_attributes(twice=2 * echoes.attributes["energy"])
+
+    return tuple(Step(chain_module.STAGES[f"attribute.{name}"]) for name in ("first", "second"))
+
+
+def test_a_stage_that_needs_a_column_comes_after_the_one_that_makes_it(dependent):
+    first, second = dependent
+    table = Chain((*steps(*BASE), first, second)).run(block(), SYSTEM)
+    np.testing.assert_array_equal(table.attributes["twice"], 2 * table.amplitude)
+    for wrong in ((second,), (second, first)):
+        with pytest.raises(ConfigError, match="attribute.second needs energy; put the stage that makes it before"):
+            Chain((*steps(*BASE), *wrong))
+
+
+def test_parameters_reach_the_stage_and_the_effective_ones_name_all():
+    quiet = Step(STAGES["detect.maximum"], {"threshold": 1e6})
+    assert len(Chain((Step(STAGES["noise.pooled"]), quiet, Step(STAGES["decompose.none"]))).run(block(), SYSTEM)) == 0
+    step = Step(STAGES["noise.pooled"], {"guard": 5.0})
+    assert step.effective() == {"guard": 5.0, "limit": STAGES["noise.pooled"].parameters["limit"].default}
+
+
+@pytest.mark.parametrize(
+    "failure", [ValueError("bad"), IndexError("out"), ZeroDivisionError("zero"), np.linalg.LinAlgError("singular")]
+)
+def test_a_stage_that_fails_names_itself_and_the_waveforms_in_one_line(failure):
+    @stage("decompose")
+    def broken(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+        """Never anything."""
+        raise failure
+
+    chain = Chain((*steps(*BASE[:2]), Step(chain_module.STAGES["decompose.broken"])))
+    with pytest.raises(StageError) as caught:
+        chain.run(block(), SYSTEM)
+    message = str(caught.value)
+    assert message.startswith("stage decompose.broken failed on the 3 waveforms from point 700: ")
+    assert type(failure).__name__ in message
+    assert str(failure) in message
+    assert "\n" not in message
+    assert caught.value.__cause__ is failure
+
+
+def test_time_is_kept_per_stage_and_added_up():
+    chain = load_profile("fast")
+    timing = {}
+    chain.run(block(), SYSTEM, timing)
+    once = dict(timing)
+    assert list(timing) == [step.stage.name for step in chain.steps]
+    assert all(seconds >= 0 for seconds in timing.values())
+    chain.run(block(), SYSTEM, timing)
+    assert all(timing[name] >= once[name] for name in once)
+
+
+@pytest.mark.parametrize("profile", list_profiles())
+def test_shipped_chains_find_a_plain_echo(profile):
+    table = load_profile(profile).run(block(), SYSTEM)
+    assert table.waveform.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(table.time, 20.3, atol=0.02)
+    np.testing.assert_allclose(table.amplitude, 80, atol=1)
+    np.testing.assert_allclose(table.sigma, 2, atol=0.02)
+
+
+def test_joined_tables_keep_their_columns_in_order():
+    chain = load_profile("fast")
+    parts = [(chain.run(block(2), SYSTEM), 0), (chain.run(block(1), SYSTEM), 2)]
+    whole = chain.run(block(3), SYSTEM)
+    joined = EchoTable.concatenate(parts)
+    assert list(joined.attributes) == list(whole.attributes)
+    np.testing.assert_array_equal(joined.waveform, whole.waveform)
+    np.testing.assert_array_equal(joined.time, whole.time)
