@@ -18,8 +18,8 @@ RINGING_FACTOR = 1.2
 LEAST_RATIO = 0.02
 """Share of a stronger echo beside it that an echo must exceed: no learned pulse is known better (R3)."""
 
-UNRELIABLE_ABOVE = 2.5
-"""Amplitudes this many times the digitizer's limit are guesses (H6)."""
+UNRELIABLE_BELOW = 0.15
+"""Share of an echo's height below the digitizer's limit under which its amplitude is a guess (H6)."""
 
 
 def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:
@@ -36,7 +36,7 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
         table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect & (table.amplitude > 0))
     if system.saturation is None:
         return table
-    return _flag_saturated(block, system.saturation, table)
+    return _flag_saturated(block, noise, system.saturation, table)
 
 
 def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
@@ -62,7 +62,7 @@ def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: floa
     return faint
 
 
-def _flag_saturated(block: WaveformBlock, level: float, table: EchoTable) -> EchoTable:
+def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: EchoTable) -> EchoTable:
     """Echoes with clipped samples within 1.5 widths of their centre; amplitudes that are guesses (H6)."""
     rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
     if not len(rows):
@@ -72,6 +72,6 @@ def _flag_saturated(block: WaveformBlock, level: float, table: EchoTable) -> Ech
     clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
     saturated = np.zeros(len(table), bool)
     saturated[rows] = clipped
-    guess = saturated & (table.amplitude > UNRELIABLE_ABOVE * level)
+    guess = saturated & (UNRELIABLE_BELOW * table.amplitude > level - noise.baseline[table.waveform])
     table = table.with_flags(EchoFlag.SATURATED, saturated)
     return table.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE, guess)
