@@ -1,7 +1,7 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
 #   make test      the fast tests          make test-all   all of them
-#   make bench     waveforms per second    make lint       ruff       make clean   remove what was made
+#   make bench     error against run time  make lint       ruff       make clean   remove what was made
 
 PYTHON ?= python3
 VENV   := .venv
@@ -43,7 +43,8 @@ test-all: $(VENV)/.test
 
 bench: $(VENV)/.test
 	@mkdir -p $(BENCH)
-	$(BIN)/python tests/benchmark.py $(BENCH)
+	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
+	$(BIN)/wavebatch bench --scene mixed --scene open --scene forest --scene empty --promises -o $(BENCH)
 
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .

@@ -13,7 +13,7 @@ from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
 from wavebatch.evaluate import QUANTITIES, find_isolated, match_echoes
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.simulate.blocks import SEED_BLOCK
-from wavebatch.survey import survey_block
+from wavebatch.survey import Survey, survey_block
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 
 CLEAR = 10.0
@@ -40,9 +40,14 @@ class Group:
     """bool (m,)."""
     bounds: np.ndarray
     """Cramer-Rao bounds of time, amplitude and sigma, (m, 3)."""
-    system: SystemPulse
+    survey: Survey
     clear: np.ndarray
     """Strong enough for its error to be compared with its bound, bool (m,)."""
+
+    @property
+    def system(self) -> SystemPulse:
+        """What the survey says of the sensor."""
+        return self.survey.system
 
 
 def derive_seed(*numbers: int) -> int:
@@ -60,7 +65,7 @@ def make_groups(
     for place in range(number):
         progress(f"{scene.name}: simulating and surveying, group {place + 1} of {number}")
         ((block, truth),) = simulate_blocks(scene, size, seed=derive_seed(seed, place), size=size)
-        groups.append(make_group(scene, place, block, truth, survey_block(block).system))
+        groups.append(make_group(scene, place, block, truth, survey_block(block)))
     return groups
 
 
@@ -69,7 +74,7 @@ def make_group(
     number: int,
     block: WaveformBlock,
     truth: EchoTable,
-    system: SystemPulse,
+    survey: Survey,
     *,
     clear: float = CLEAR,
 ) -> Group:
@@ -81,7 +86,7 @@ def make_group(
         truth=describe_truth(truth, recording.pulse),
         isolated=find_isolated(truth),
         bounds=find_bounds(recording, truth, len(block)),
-        system=system,
+        survey=survey,
         clear=truth.amplitude >= clear * recording.recorded_noise,
     )
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.auto import choose_chain
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.pareto import choose_cheapest, find_front
@@ -18,21 +19,20 @@ from wavebatch.bench.peers import list_peers, run_peer
 from wavebatch.bench.promises import judge, measure_system
 from wavebatch.bench.scenes import find_bench_scene, shape_scene
 from wavebatch.bench.speed import Laps, make_strip, time_chains
-from wavebatch.bench.stability import FAILURES, measure_stability
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.bench.stability import AUTO, FAILURES, find_twin, list_cases, measure_stability
+from wavebatch.blocks import EchoTable, WaveformBlock
 from wavebatch.chain import Chain
 from wavebatch.config import load_chain, load_profile
 from wavebatch.errors import ConfigError
-from wavebatch.simulate import Scene
+from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.simulate.blocks import SEED_BLOCK
+from wavebatch.survey import Survey
+from wavebatch.work import BLOCK_SAMPLES
 
 SCHEMA = "wavebatch.bench/1"
 
 PROFILES = ("fast", "balanced", "accurate")
 """Shipped chains that are always measured, cheapest first."""
-
-COSTS = ("microseconds", "rmse_all_cm", "wrong")
-"""What a chain costs: time per waveform, error of range, share of echoes missed or false."""
 
 Progress = Callable[[str], None]
 
@@ -59,6 +59,8 @@ class BenchOptions:
     stability: bool = True
     stability_waveforms: int = 900
     """Per case."""
+    hazards: tuple[str, ...] = ()
+    """Hazards whose cases are measured; all where none is given."""
     tolerance_cm: float | None = None
     """Error of the range of isolated echoes that the cheapest chain must meet."""
     promises: bool = False
@@ -72,7 +74,7 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
 
     Raises ConfigError for unknown scenes and chains that cannot run, InputError for a strip that cannot be used.
     """
-    chains = load_chains(options.chains)
+    chains, cases = load_chains(options.chains), list_cases(options.hazards)
     scenes: list[Scene] = [find_bench_scene(name) for name in options.scenes]
     if options.strip is not None:
         progress(f"surveying {options.strip}")
@@ -90,10 +92,11 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
     if options.stability:
         document["failure_kinds"] = FAILURES
         document["stability"] = measure_stability(
-            lambda block, system: choose_chains(chains, block, system),
+            lambda survey: choose_chains(chains, survey),
             options.stability_waveforms,
             min(SEED_BLOCK // 2, options.waveforms),
             options.seed,
+            cases=cases,
             progress=progress,
         )
     if options.tolerance_cm is not None:
@@ -116,15 +119,9 @@ def load_chains(files: tuple[Path, ...]) -> dict[str, Chain]:
     return chains
 
 
-def choose_chains(chains: Mapping[str, Chain], block: WaveformBlock, system: SystemPulse) -> dict[str, Chain]:
-    """The chains that run on every strip, and with them the one that the strip's survey chooses."""
-    chosen = choose_auto(block, system)
-    return {**chains, **({"auto": chosen} if chosen else {})}
-
-
-def choose_auto(block: WaveformBlock, system: SystemPulse) -> Chain | None:
-    """The chain of `--profile auto` for a strip of which the block is a sample; None where there is no such profile."""
-    return None
+def choose_chains(chains: Mapping[str, Chain], survey: Survey) -> dict[str, Chain]:
+    """The chains that run on every strip, and `auto`, the one that the strip's survey chooses."""
+    return {**chains, AUTO: choose_chain(survey)}
 
 
 def _measure_scene(
@@ -132,14 +129,18 @@ def _measure_scene(
 ) -> dict[str, Any]:
     seed = derive_seed(options.seed, place)
     groups = make_groups(scene, options.waveforms, seed, progress)
-    chosen = [choose_chains(chains, group.block, group.system) for group in groups]
-    tallies = {name: Tally() for name in chosen[0]}
+    chosen = [choose_chains(chains, group.survey) for group in groups]
+    twin = find_twin(chosen)
+    measured = {name: chain for name, chain in chosen[0].items() if name != AUTO or twin is None}
+    tallies = {name: Tally() for name in measured}
     for name, tally in tallies.items():
         progress(f"{scene.name}: error of {name}")
         for group, of_group in zip(groups, chosen, strict=True):
             tally.add(group, describe_found(of_group[name].run(group.block, group.system)))
-    laps = _time(scene, groups[0], chosen[0], options, seed, progress)
+    laps = _time(scene, groups[0], measured, options, seed, progress)
     rows = [_row(name, "chain", tally, laps[name].to_json()) for name, tally in tallies.items()]
+    if twin:
+        rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
     if options.peers:
         rows += _measure_peers(scene, groups[0], options, progress)
     _mark_front(rows)
@@ -154,11 +155,18 @@ def _time(
     scene: Scene, group: Group, chains: Mapping[str, Chain], options: BenchOptions, seed: int, progress: Progress
 ) -> dict[str, Laps]:
     timed = {name: (chain, group.system) for name, chain in chains.items()}
+    block = _make_block(scene, options, seed) if options.pulses else group.block
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
         folder, strip = Path(name), None
         if options.pulses:
             strip = make_strip(scene, folder / "strip.laz", options.pulses, seed)
-        return time_chains(timed, group.block, strip, folder, options.repeats, progress)
+        return time_chains(timed, block, strip, folder, options.repeats, progress)
+
+
+def _make_block(scene: Scene, options: BenchOptions, seed: int) -> WaveformBlock:
+    """As many waveforms as a run takes through a chain at a time."""
+    n = min(options.pulses, BLOCK_SAMPLES // scene.recording.n_samples)
+    return next(simulate_blocks(scene, n, seed=seed, size=n))[0]
 
 
 def _measure_peers(scene: Scene, group: Group, options: BenchOptions, progress: Progress) -> list[dict[str, Any]]:

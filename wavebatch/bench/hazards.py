@@ -55,9 +55,7 @@ def draw_echoes(
     return _flatten(time, np.broadcast_to(np.array(heights, np.float64), (n, k)), s)
 
 
-def draw_between(
-    rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float
-) -> Drawn:
+def draw_between(rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float) -> Drawn:
     """One echo of the system's width between two heights [count], evenly over their logarithm."""
     s = recording.pulse.sigma
     time = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
@@ -84,13 +82,16 @@ def _flatten(time: np.ndarray, amplitude: np.ndarray, sigma: float) -> Drawn:
 def _list_cases() -> tuple[Case, ...]:
     base = Recording(n_samples=96, pulse=PulseModel(SIGMA))
     deep = replace(base, bits=16, baseline=200.0)
+    clipping = replace(base, saturation=255)
     one = partial(partial, draw_echoes)
     cases = [
         Case("H1", f"pair {gap:g} s apart, SNR 50", one(heights=(52.0, 52.0), gap=gap), base)
         for gap in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5)
     ]
     cases += [Case("H1", "pair 1.75 s apart, 52 and 10 DN", one(heights=(52.0, 10.4), gap=1.75), base)]
-    cases += [Case("H2", f"pair {gap:g} s apart, 20000 DN", one(heights=(2e4, 2e4), gap=gap), deep) for gap in (0.25, 1)]
+    cases += [
+        Case("H2", f"pair {gap:g} s apart, 20000 DN", one(heights=(2e4, 2e4), gap=gap), deep) for gap in (0.25, 1)
+    ]
     cases += [Case("H3", f"weak: SNR {snr}", one(heights=(1.041 * snr,)), base) for snr in (3, 4, 5)]
     cases += [
         Case("H4", f"skew {kappa:g}, SNR 100", one(heights=(104.0,)), replace(base, pulse=PulseModel(SIGMA, kappa)))
@@ -98,10 +99,11 @@ def _list_cases() -> tuple[Case, ...]:
     ]
     cases += [Case("H5", "50 to 50000 DN in 16 bit", partial(draw_between, low=50.0, high=5e4), deep)]
     cases += [
-        Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), base)
+        Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), clipping)
         for level in (0.95, 0.8, 0.64, 0.5, 0.3)
     ]
-    cases += [Case("H6", "5 to 500 times the range", draw_huge, base)]
+    cases += [Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)]
+    cases += [Case("H6", "5 to 500 times the range", draw_huge, clipping)]
     cases += [
         Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), replace(base, pulse=base.pulse.with_ringing(ring)))
         for ring in (0.01, 0.02, 0.03)
@@ -112,9 +114,13 @@ def _list_cases() -> tuple[Case, ...]:
     ]
     quiet = replace(base, noise_std=0.5, baseline_spread=0.1)
     cases += [Case("H9", "2 to 6 DN, noise 0.5", partial(draw_between, low=2.0, high=6.0), quiet)]
-    cases += [Case("H10", "constant 0, 12 or 255", draw_constant, base), Case("H10", "noise only", one(heights=()), base)]
     cases += [
-        Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho)) for rho in (0.5, 0.667, 0.8)
+        Case("H10", "constant 0, 12 or 255", draw_constant, base),
+        Case("H10", "noise only", one(heights=()), base),
+    ]
+    cases += [
+        Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho))
+        for rho in (0.5, 0.667, 0.8)
     ]
     cases += [
         Case("H12", f"variance +{gain:g} per DN", one(heights=(150.0,)), replace(base, noise_gain=gain))

@@ -33,7 +33,7 @@ def parse_length(text: str) -> float:
 
 
 def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | None:
-    """The row of least time per waveform whose isolated echoes meet the tolerance within their error; None if none does.
+    """The row of least time per waveform whose isolated echoes meet the tolerance, their error added; None if none.
 
     rows: as in the document of the benchmark.
     """

@@ -11,7 +11,10 @@ import numpy as np
 
 from wavebatch.bench.pareto import find_front
 
-PANELS = (("wrong", 100.0, "echoes missed or false [%]"), ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"))
+PANELS = (
+    ("wrong", 100.0, "echoes missed or false [%]"),
+    ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
+)
 
 
 def can_plot() -> bool:
@@ -33,11 +36,16 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
 
 
 def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
     known = [row for row in rows if row["kernels"]["median"] and row["figures"][name]["value"] is not None]
     time = np.array([row["kernels"]["median"] for row in known])
     value = np.array([row["figures"][name]["value"] * factor for row in known])
     error = np.array([(row["figures"][name]["error"] or 0.0) * factor for row in known])
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("kernels: microseconds per waveform")
     axes.set_ylabel(label)
     axes.grid(alpha=0.3)

@@ -127,12 +127,10 @@ STABLE = {
 
 
 def _judge_stability(rows: list[dict[str, Any]], cases: list[Mapping[str, Any]]) -> None:
-    names = {row["chain"] for row in cases}
-    main = "auto" if "auto" in names else "accurate"
     for row in cases:
-        if row["chain"] == main and row["case"] in STABLE:
+        if row["is_auto"] and row["case"] in STABLE:
             figure, limit, most = STABLE[row["case"]]
-            _add(rows, f"{row['hazard']} {row['case']}: {main}, {figure}", _percent(row, figure), limit, "%", most)
+            _add(rows, f"{row['hazard']} {row['case']}: auto, {figure}", _percent(row, figure), limit, "%", most)
     if cases:
         failures = sum(sum(row["failures"].values()) for row in cases)
         _add(rows, "stiff cases: failures of all chains", failures, 0, "", True)
@@ -156,7 +154,9 @@ def format_promises(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         sign = "<=" if row["at_most"] else ">="
         verdict = "met" if row["met"] else "short"
-        lines.append([row["what"], _number(row["measured"]), f"{sign} {_number(row['promised'])}", row["unit"], verdict])
+        lines.append(
+            [row["what"], _number(row["measured"]), f"{sign} {_number(row['promised'])}", row["unit"], verdict]
+        )
     return "\n".join(align(lines))
 
 

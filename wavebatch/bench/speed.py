@@ -150,5 +150,3 @@ def measure_memory(chain: Chain, strip: Path, folder: Path) -> tuple[int | None,
     with Worker() as worker:
         run = worker.call(run_file, chain, strip, folder, 1)
         return worker.call(peak_memory), int(run["waveforms"])
-
-

@@ -11,10 +11,17 @@ import numpy as np
 
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
 from wavebatch.bench.hazards import CASES, Case, make_scene
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse
 from wavebatch.chain import Chain
+from wavebatch.config import effective
+from wavebatch.errors import ConfigError
 from wavebatch.simulate import Recording, Scene, find_scene, simulate_blocks
-from wavebatch.survey import survey_block
+from wavebatch.simulate.draws import LogUniform, Mixture
+from wavebatch.survey import Survey, survey_block
+from wavebatch.words import nearest
+
+AUTO = "auto"
+"""Name of the chain that a survey chooses."""
 
 GROUPS = 3
 """Groups of every case, each with a survey of its own of an ordinary scene with the same receiver."""
@@ -34,7 +41,7 @@ FAILURES: dict[str, str] = {
 
 
 def measure_stability(
-    choose: Callable[[WaveformBlock, SystemPulse], Mapping[str, Chain]],
+    choose: Callable[[Survey], Mapping[str, Chain]],
     waveforms: int,
     surveyed: int,
     seed: int,
@@ -43,46 +50,74 @@ def measure_stability(
 ) -> list[dict[str, Any]]:
     """A row per case and chain, plain values for JSON.
 
-    choose: chains by name for a strip of which the block is a sample and the system its survey.
+    choose: chains by name for a strip of that survey.
     waveforms: per case. surveyed: waveforms of the ordinary scene that each survey sees.
     """
-    ordinary: dict[Recording, list[tuple[SystemPulse, Mapping[str, Chain]]]] = {}
+    ordinary: dict[Recording, list[tuple[Survey, Mapping[str, Chain]]]] = {}
     rows = []
     for number, case in enumerate(cases):
         progress(f"stability: {case.hazard} {case.name}")
         if case.recording not in ordinary:
             ordinary[case.recording] = _survey(case.recording, choose, surveyed, seed)
         groups = [
-            _make_case(case, system, waveforms // GROUPS, derive_seed(seed, 77, number, place), place)
-            for place, (system, _) in enumerate(ordinary[case.recording])
+            _make_case(case, survey, waveforms // GROUPS, derive_seed(seed, 77, number, place), place)
+            for place, (survey, _) in enumerate(ordinary[case.recording])
         ]
-        for name in ordinary[case.recording][0][1]:
-            chains = [chains[name] for _, chains in ordinary[case.recording]]
-            rows.append({"hazard": case.hazard, "case": case.name, "chain": name, **_measure(chains, groups)})
+        chosen = [chains for _, chains in ordinary[case.recording]]
+        twin = find_twin(chosen)
+        for name in chosen[0]:
+            if name == AUTO and twin:
+                continue
+            told = {"hazard": case.hazard, "case": case.name, "chain": name, "is_auto": name in (AUTO, twin)}
+            rows.append({**told, **_measure([chains[name] for chains in chosen], groups)})
     return rows
 
 
+def list_cases(hazards: Sequence[str]) -> tuple[Case, ...]:
+    """The cases of the given hazards, all where none is given; raises ConfigError for a hazard without cases."""
+    known = list(dict.fromkeys(case.hazard for case in CASES))
+    for name in hazards:
+        if name not in known:
+            raise ConfigError(f"hazard {name!r} cannot be simulated; {nearest(name, known)}")
+    return tuple(case for case in CASES if not hazards or case.hazard in hazards)
+
+
+def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
+    """The chain that `auto` is on every strip, so that it need not be measured again; None where it is one of its own.
+
+    chosen: the chains of each strip.
+    """
+    for name in chosen[0]:
+        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
+            return name
+    return None
+
+
 def _survey(
-    recording: Recording, choose: Callable[[WaveformBlock, SystemPulse], Mapping[str, Chain]], surveyed: int, seed: int
-) -> list[tuple[SystemPulse, Mapping[str, Chain]]]:
-    """Survey and chains of GROUPS ordinary, open strips with this receiver."""
+    recording: Recording, choose: Callable[[Survey], Mapping[str, Chain]], surveyed: int, seed: int
+) -> list[tuple[Survey, Mapping[str, Chain]]]:
+    """Survey and chains of GROUPS ordinary, open strips with this receiver.
+
+    Where the receiver is said to clip, one echo in a hundred does.
+    """
     scale = 30.0 if recording.bits > 8 else 1.0
     urban = find_scene("urban")
-    laws = urban.amplitude
-    law = replace(laws, median=laws.median * scale, high=laws.high * scale)
+    law = replace(urban.amplitude, median=urban.amplitude.median * scale, high=urban.amplitude.high * scale)
+    if recording.saturation is not None:
+        law = Mixture(0.99, law, LogUniform(recording.clip, 3.0 * recording.clip))
     scene: Scene = replace(urban, amplitude=law, recording=recording)
     surveys = []
     for place in range(GROUPS):
         ((block, _),) = simulate_blocks(scene, surveyed, seed=derive_seed(seed, 78, place), size=surveyed)
-        system = survey_block(block).system
-        surveys.append((system, choose(block, system)))
+        survey = survey_block(block)
+        surveys.append((survey, choose(survey)))
     return surveys
 
 
-def _make_case(case: Case, system: SystemPulse, n: int, seed: int, place: int) -> Group:
+def _make_case(case: Case, survey: Survey, n: int, seed: int, place: int) -> Group:
     scene = make_scene(case)
     ((block, truth),) = simulate_blocks(scene, n, seed=seed, size=n)
-    return make_group(scene, place, block, truth, system, clear=0.0)
+    return make_group(scene, place, block, truth, survey, clear=0.0)
 
 
 def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:

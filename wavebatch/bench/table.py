@@ -46,7 +46,8 @@ def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str
     lines = [
         f"== {section['scene']}: {section['meaning']}",
         f"survey of {survey['groups']} x {survey['waveforms_of_a_group']} waveforms: "
-        f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, kappa {_span(survey['kappa'])}, "
+        f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, "
+        f"kappa {_span(survey['kappa'])}, "
         f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}",
         "",
         *_speed_table(rows),
@@ -83,10 +84,12 @@ def rate_text(times: Mapping[str, Any]) -> str:
 
 
 def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    head = ["waveforms/s: median (least..most)", "kernels", "file to file", "with survey", "survey s", "MB", "front"]
+    head = ["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]
     lines = [head]
     for row in rows:
         name = row["name"]
+        if row.get("same_as"):
+            name += f" (is {row['same_as']})"
         if row.get("crashed_or_hung"):
             name += f" ({row['crashed_or_hung']} crashed or hung)"
         once, memory = row["survey_seconds"]["median"], row["peak_bytes"]
@@ -134,27 +137,36 @@ def align(lines: Sequence[Sequence[str]]) -> list[str]:
 
 def _format_stability(document: Mapping[str, Any]) -> str:
     rows = document["stability"]
-    parts = ["== stiff and extreme cases; s is the width of the system pulse, err the rms error / Cramer-Rao bound"]
+    parts = [
+        "== stiff and extreme cases: s is the width of the system pulse, false the share of single echoes split or of "
+        "empty waveforms with an echo, err the rms error / Cramer-Rao bound"
+    ]
     for chain in dict.fromkeys(row["chain"] for row in rows):
         parts.append("\n".join(align(_stability_lines([row for row in rows if row["chain"] == chain], chain))))
     return "\n\n".join(parts)
 
 
 def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list[str]]:
-    heads = ("found %", "exact %", "splits %", "false in empty %", "err time", "err amplitude", "err sigma", "gross %")
-    lines = [[chain, "waveforms", *heads, "failures", "flags of the echoes"]]
+    heads = ("found %", "exact %", "false %", "err time", "err amplitude", "err sigma", "gross %")
+    title = f"{chain} (is auto)" if all(row["is_auto"] for row in rows) and chain != "auto" else chain
+    lines = [[title, "waveforms", *heads, "failures", "flags of the echoes"]]
     for row in rows:
-        kind = "isolated" if row["figures"]["found_isolated"]["value"] is not None else "overlapped"
+        known = {name for name, figure in row["figures"].items() if figure["value"] is not None}
+        kind = "isolated" if "found_isolated" in known else "overlapped"
         columns: list[Column] = [
             ("", "completeness", 100, 1),
             ("", "exact_count", 100, 1),
-            ("", "false_splits", 100, 1),
-            ("", "false_alarms", 100, 1),
+            ("", "false_splits" if "false_splits" in known else "false_alarms", 100, 1),
             *(("", f"{name}_ratio_{kind}", 1.0, 2) for _, name in QUANTITIES),
             ("", f"gross_{kind}", 100, 1),
         ]
         failures = ", ".join(f"{number} {name}" for name, number in row["failures"].items() if number)
-        flags = ", ".join(f"{name} {number / max(row['echoes'], 1):.0%}" for name, number in row["flags"].items())
         cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
-        lines.append([*cells, *(figure_text(row, column) for column in columns), failures or "none", flags])
+        figures = [figure_text(row, column) for column in columns]
+        lines.append([*cells, *figures, failures or "none", _tell_flags(row)])
     return lines
+
+
+def _tell_flags(row: Mapping[str, Any]) -> str:
+    shares = {name: number / max(row["echoes"], 1) for name, number in row["flags"].items()}
+    return ", ".join(f"{name} {share:.0%}" if share >= 0.005 else f"{name} <1%" for name, share in shares.items())

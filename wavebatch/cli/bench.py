@@ -12,15 +12,22 @@ from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP] [CHAIN...]")
-@click.option("--scene", "scenes", multiple=True, metavar="NAME", help="Scene: mixed, open, forest, empty, flat, stiff.")
+@click.option(
+    "--scene", "scenes", multiple=True, metavar="NAME", help="Scene: mixed, open, forest, empty, flat, stiff."
+)
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for bench.json, bench.txt and the plots.")
 @click.option("--seed", default=0, show_default=True, help="Of the simulated waveforms.")
 @click.option("--waveforms", default=32_768, show_default=True, help="Simulated waveforms per scene.")
 @click.option("--pulses", default=50_000, show_default=True, help="Pulses from file to file; 0 for kernels only.")
 @click.option("--repeat", "repeats", default=3, show_default=True, help="Turns of the timing.")
-@click.option("--tolerance", metavar="LENGTH", help="Name the cheapest chain with this error for isolated echoes: 0.02m.")
-@click.option("--peers/--no-peers", default=True, help="Measure gdecomp (if installed) and scipy too.  [default: peers]")
+@click.option(
+    "--tolerance", metavar="LENGTH", help="Name the cheapest chain with this error for isolated echoes: 0.02m."
+)
+@click.option(
+    "--peers/--no-peers", default=True, help="Measure gdecomp (if installed) and scipy too.  [default: peers]"
+)
 @click.option("--stability/--no-stability", default=True, help="The stiff and extreme cases.  [default: stability]")
+@click.option("--hazard", "hazards", multiple=True, metavar="H1..H16", help="Only the cases of this hazard.")
 @click.option("--promises", is_flag=True, help="Also measure what each release promises, and say what is met.")
 @click.option("--large", is_flag=True, envvar="BENCH_LARGE", help="With --promises: memory for 10^7 pulses too.")
 @click.option("--json", "as_json", is_flag=True, help="Print the JSON document in place of the tables.")
@@ -67,7 +74,7 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, a
         click.echo(text)
 
 
-_PASSED = ("seed", "waveforms", "pulses", "repeats", "peers", "stability", "promises", "large")
+_PASSED = ("seed", "waveforms", "pulses", "repeats", "peers", "stability", "hazards", "promises", "large")
 
 
 def _quiet(text: str) -> None:
