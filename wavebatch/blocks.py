@@ -148,6 +148,8 @@ class WaveformBlock:
     """Away from the sensor, as long as the light's one-way path per two-way ns, f8 (n, 3) [m/ns]."""
     returns: ReturnTable | None = None
     """The input's returns in these packets; None for waveforms that never had any."""
+    sensor: np.ndarray | None = None
+    """Position of the sensor at each pulse, f8 (n, 3) [m]; None where nobody knows it."""
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -205,6 +207,7 @@ class WaveformBlock:
             origin=self.origin[index],
             direction=self.direction[index],
             returns=returns,
+            sensor=None if self.sensor is None else self.sensor[index],
         )
 
 
