@@ -14,7 +14,7 @@ RANKS = [
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
     {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare"},
-    {"auto", "trial"},
+    {"auto", "trial", "choice"},
     {"work"},
     {"record"},
     {"task", "workers"},

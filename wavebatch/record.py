@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -10,10 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
+from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.io.publish import Draft, reporting
 from wavebatch.report import RunReport
-from wavebatch.work import Prepared, StripJob, describe_system
+from wavebatch.systemfile import format_survey
+from wavebatch.work import Prepared, StripJob
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 BATCH_SCHEMA = "wavebatch.batch-report/1"
@@ -31,25 +34,36 @@ def report_path(job: StripJob, folder: Path) -> Path:
 
 def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
     """All that decides what is written: two runs for which this is equal write the same cloud."""
+    saved = job.request.system
     return {
         "version": __version__,
         "input": {"file": job.path.name, **fingerprint},
         "options": asdict(job.options),
-        "chain": effective(job.chain),
+        "request": {
+            "chain": job.request.describe(job.chain) or effective(job.chain),
+            "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
+        },
     }
 
 
-def describe_strip(prepared: Prepared) -> dict[str, Any]:
-    """What scan and survey say of the strip."""
+def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
+    """What scan and survey say of the strip. described: from `describe_job`."""
     scan = prepared.scan
+    fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
     return {
         "direction": {
             "sign": scan.direction,
             "evidence": scan.direction_evidence,
             "vector_ratio": _finite(scan.vector_ratio),
         },
-        "system": describe_system(prepared.system),
+        **describe_survey(prepared.choice, prepared.job.request, fingerprint),
     }
+
+
+def describe_chain(prepared: Prepared) -> dict[str, Any]:
+    """The chain as it is used, and how it was chosen."""
+    chosen = describe_choice(prepared.choice, prepared.job.request)
+    return {"chain": effective(prepared.job.chain), "choice": chosen}
 
 
 def build_document(
@@ -64,6 +78,7 @@ def build_document(
     return {
         "schema": STRIP_SCHEMA,
         **described,
+        **describe_chain(prepared),
         "strip": {
             "las_version": facts.version,
             "point_format": facts.point_format,
@@ -73,7 +88,7 @@ def build_document(
                 "internal": facts.internal,
                 "bytes": facts.packet_end - facts.packet_start,
             },
-            **describe_strip(prepared),
+            **describe_strip(prepared, described),
         },
         "output": {
             "file": cloud.name,
@@ -83,8 +98,16 @@ def build_document(
         },
         **report.to_json(),
         "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
-        "timing": build_timing(report),
+        "timing": {**build_timing(report), **_tell_saving(prepared)},
     }
+
+
+def _tell_saving(prepared: Prepared) -> dict[str, Any]:
+    """What leaving parts out saves: microseconds per waveform of the survey's sample, as the preparation took them."""
+    seconds = prepared.choice.seconds
+    if not seconds:
+        return {}
+    return {"microseconds_per_waveform": {name: round(1e6 * value, 3) for name, value in seconds.items()}}
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:

@@ -90,16 +90,23 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
 
     learn: also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
     """
+    block = join_largest(blocks)
+    if block is None:
+        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+    return survey_block(block, learn=learn)
+
+
+def join_largest(blocks: Iterable[WaveformBlock]) -> WaveformBlock | None:
+    """The samples of the largest group of blocks of one spacing and length as one block, None without waveforms."""
     groups: dict[tuple[float, int], list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
             groups.setdefault((block.spacing, block.samples.shape[1]), []).append(block)
     if not groups:
-        return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+        return None
     chosen = max(groups.values(), key=lambda group: (sum(block.samples.size for block in group), group[0].spacing))
     samples = np.concatenate([block.samples for block in chosen])
-    block = WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
-    return survey_block(block, learn=learn)
+    return WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
 
 
 def measure_block(block: WaveformBlock, *, learn: bool = True) -> SystemPulse:

@@ -19,6 +19,7 @@ from wavebatch.io.writer import CloudWriter
 from wavebatch.record import (
     build_document,
     cloud_path,
+    describe_chain,
     describe_job,
     describe_strip,
     read_current,
@@ -113,7 +114,8 @@ class StripTask:
     def _open(self) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
-        provenance = {**self._described, **describe_strip(prepared)}
+        described = self._described
+        provenance = {**described, **describe_chain(prepared), **describe_strip(prepared, described)}
         self._writer = CloudWriter(
             prepared.layout,
             cloud_path(self.job, options.folder),

@@ -5,16 +5,17 @@ from __future__ import annotations
 import functools
 import pickle
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from wavebatch import survey
 from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.auto import without_columns
 from wavebatch.blocks import COLUMNS, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain
+from wavebatch.choice import Choice, Request, make_choice
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
@@ -23,9 +24,6 @@ from wavebatch.words import nearest
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""
-
-SURVEY_SAMPLES = 1 << 21
-"""Samples that the survey looks at, at most."""
 
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
@@ -52,7 +50,10 @@ class StripJob:
 
     path: Path
     chain: Chain
+    """The chain, or the widest that may be chosen."""
     options: RunOptions
+    request: Request = Request()
+    """How pulse and chain are found."""
 
     def open(self) -> StripReader:
         """A reader of the strip; raises InputError where it is not one."""
@@ -64,13 +65,19 @@ class Prepared:
     """All that the units of a strip share; picklable."""
 
     job: StripJob
+    """With the chosen chain, and the columns that it computes."""
     facts: StripFacts
     scan: StripScan
     units: int
-    system: SystemPulse
+    choice: Choice
     layout: OutputLayout
     report: RunReport
     """Timing of the preparation."""
+
+    @property
+    def system(self) -> SystemPulse:
+        """The pulse that the strip is run with."""
+        return self.choice.survey.system
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
@@ -119,23 +126,27 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
 
 
 def prepare_strip(job: StripJob) -> Prepared:
-    """Scan and survey of a strip, and the layout of its output; raises InputError where it cannot be processed."""
+    """Scan and survey of a strip, its chain, and the layout of its output.
+
+    Raises InputError where it cannot be processed, ConfigError where no chain serves.
+    """
     start = time.perf_counter()
     with job.open() as reader:
         facts = reader.facts
-        layout = plan_layout(job, facts)
+        plan_layout(job, facts)
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
-            longest = max((digitizer.n_samples for digitizer in facts.digitizers.values()), default=0)
-            number = int(np.clip(SURVEY_SAMPLES // max(longest, 1), 256, survey.SAMPLE))
-            system = survey.measure(reader.sample_blocks(scan, number))
+            choice = make_choice(reader, scan, job.chain, job.request)
+            columns = without_columns(job.options.columns, job.chain, choice.chain)
+            job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
+            layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": time.perf_counter() - scanned}
-    return Prepared(job, facts, scan, units, system, layout, RunReport(timing=timing))
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing))
 
 
 def process_unit(prepared: Prepared, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
@@ -202,20 +213,3 @@ class _Stopwatch:
             return next(self._items)
         finally:
             self.seconds += time.perf_counter() - start
-
-
-def describe_system(system: SystemPulse) -> Mapping[str, object]:
-    """The system pulse for the report and the cloud's provenance."""
-    return {
-        "sigma_ref_ns": system.sigma_ref,
-        "baseline_dn": system.baseline,
-        "baseline_spread_dn": system.baseline_spread,
-        "noise_std_dn": system.noise_std,
-        "noise_by_kind_dn": dict(system.noise_by_kind),
-        "noise_gain": system.noise_gain,
-        "kappa": system.kappa,
-        "components": [list(component) for component in system.components],
-        "ringing": system.ringing,
-        "saturation_dn": system.saturation,
-        "acceptance": system.acceptance,
-    }
