@@ -129,5 +129,5 @@ def test_no_other_dependency_at_run_time():
     import sys
 
     for path in MODULES:
-        peers = {"gdecomp"} if _part(path) == "bench" else set()
+        peers = {"gdecomp", "matplotlib"} if _part(path) == "bench" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

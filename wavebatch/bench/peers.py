@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -127,6 +128,7 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
     failures, place = 0, 0
     while place < n:
         with Worker() as worker:
+            worker.call(os.getpid)  # so that starting up does not look like hanging
             worker.submit(fit_gdecomp, signal, results, place, height)
             try:
                 _wait(worker, results, place)
@@ -144,11 +146,11 @@ def _wait(worker: Worker, results: Path, place: int) -> None:
     before = -1
     while True:
         try:
-            worker.take(PATIENCE if before >= 0 else 20 * PATIENCE)
+            worker.take(PATIENCE)
             return
         except TimeoutError:
             now = int(np.isfinite(np.load(results, mmap_mode="r")[place:, 0]).sum())
-            if now == before or before < 0 and now == 0:
+            if now == before:
                 raise WorkerDied("no progress") from None
             before = now
 
