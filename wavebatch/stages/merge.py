@@ -8,6 +8,9 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable
 
+OVERLAP = 2.0
+"""Widths of the narrower echo within which two may be one: further apart, a weak one's poor time says nothing."""
+
 
 def merge_unresolved(table: EchoTable) -> EchoTable:
     """The table with neighbours closer than the error of their distance merged, one pair after the other.
@@ -28,7 +31,8 @@ def _unresolved(table: EchoTable) -> np.ndarray:
         return np.empty(0, np.int64)
     gap = np.diff(table.time)
     error = np.hypot(table.time_err[1:], table.time_err[:-1])
-    close = (np.diff(table.waveform) == 0) & (gap < error)
+    near = gap < OVERLAP * np.minimum(table.sigma[1:], table.sigma[:-1])
+    close = (np.diff(table.waveform) == 0) & near & (gap < error)
     rows = np.flatnonzero(close)
     run = np.cumsum(np.r_[True, np.diff(rows) > 1]) if len(rows) else rows
     start = rows[np.r_[True, np.diff(rows) > 1]] if len(rows) else rows
