@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import EXIT_INTERRUPTED, debug_option, one_line, print_json, report_errors, talk
+from wavebatch.cli.common import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
 from wavebatch.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
@@ -44,7 +44,12 @@ class Size(click.ParamType):
 @click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
               help="Folder of the clouds and their reports; made if it is not there.")
 @click.option("-c", "--chain", "chain_file", type=click.Path(path_type=Path), metavar="FILE", help="Chain file (TOML).")
-@click.option("--profile", metavar="fast|balanced|accurate", help="A shipped chain.  [default: balanced]")
+@click.option("--profile", metavar="auto|fast|balanced|accurate",
+              help="A shipped chain; auto: what the strip's own survey says that it needs.  [default: auto]")
+@click.option("--tolerance", metavar="LENGTH",
+              help="The cheapest shipped chain whose predicted range error meets this, e.g. 0.02m, decides per strip.")
+@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="A saved survey (of `wavebatch survey -o`) in place of one of each strip.")
 @click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
               help="Where the packets' vectors point, seen from the target: to the sensor or away from it.")
 @click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
@@ -82,7 +87,7 @@ def run(**options: Any) -> None:
 
     \b
     Exit codes: 0 every strip is written
-                2 wrong usage or chain file, nothing was started
+                2 wrong usage or chain file, nothing was started; or no chain meets the tolerance
                 3 some strips failed, the others are written
                 4 no strip is written
                 130 interrupted; --resume goes on
@@ -106,7 +111,8 @@ def _interrupt(number: int, frame: object) -> None:
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    pairs = [("chain_file", "profile"), ("overwrite", "resume"), ("quiet", "verbose")]
+    pairs = [("chain_file", "profile"), ("chain_file", "tolerance"), ("profile", "tolerance")]
+    pairs += [("overwrite", "resume"), ("quiet", "verbose")]
     for first, second in pairs:
         if options[first] and options[second]:
             names = [f"--{name.removesuffix('_file')}" for name in (first, second)]
@@ -120,14 +126,12 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
-    from wavebatch.config import load_chain, load_profile
     from wavebatch.inputs import find_strips
     from wavebatch.plan import check_outputs, plan_memory
     from wavebatch.task import BatchOptions
     from wavebatch.work import RunOptions, StripJob, choose_columns
 
-    file = options["chain_file"]
-    chain = load_chain(file) if file else load_profile(options["profile"] or "balanced")
+    chain, request = _choose_chain(options)
     run_options = RunOptions(
         direction=options["direction"],
         headerless=options["headerless"],
@@ -148,9 +152,41 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         overwrite=options["overwrite"],
         resume=options["resume"],
     )
-    jobs = [StripJob(path, chain, run_options) for path in strips]
+    jobs = [StripJob(path, chain, run_options, request) for path in strips]
     check_outputs(jobs, batch_options)
     return jobs, batch_options
+
+
+def _choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
+    """The chain, or the widest one that a strip's survey may choose, and the request that goes with it."""
+    from wavebatch.choice import Request, widest
+    from wavebatch.config import list_profiles, load_chain, load_profile
+    from wavebatch.systemfile import load_survey
+    from wavebatch.words import nearest
+
+    profile = options["profile"] or "auto"
+    request = Request(
+        auto=profile == "auto" and not options["chain_file"] and not options["tolerance"],
+        tolerance=_read_tolerance(options["tolerance"]),
+        system=load_survey(options["system_file"]) if options["system_file"] else None,
+    )
+    if options["chain_file"]:
+        return load_chain(options["chain_file"]), request
+    if request.auto or request.tolerance is not None:
+        return widest(request), request
+    if profile not in list_profiles():
+        raise ConfigError(f"profile {profile!r} does not exist; {nearest(profile, ['auto', *list_profiles()])}")
+    return load_profile(profile), request
+
+
+def _read_tolerance(text: str | None) -> float | None:
+    """The length in m."""
+    from wavebatch.bench.pareto import parse_length
+
+    try:
+        return None if text is None else parse_length(text) / 100
+    except ConfigError as error:
+        raise ConfigError(f"--tolerance: {error}") from error
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
@@ -169,6 +205,9 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         print_json(result.to_json())
     elif options["report"]:
         write_json(Path(options["report"]), result.to_json(), overwrite=True)
+    errors = [outcome.error for outcome in result.outcomes]
+    if errors and all(isinstance(error, ConfigError) for error in errors):
+        return EXIT_USAGE
     return exit_code(result.failed, len(jobs))
 
 
@@ -196,5 +235,8 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
+    by = jobs[0].request.describe(jobs[0].chain)
+    if by is not None:
+        click.echo(f"\n# chosen per strip ({by}); the most that it can be:", nl=False)
     click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
     return exit_code(failed, len(jobs))
