@@ -90,8 +90,8 @@ def second_derivative(
     noise: Noise,
     system: SystemPulse,
     *,
-    threshold: float = 3.0,
-    scale: float = 0.9,
+    threshold: float = 2.0,
+    scale: float = 0.85,
     level: float = 4.0,
 ) -> EchoTable:
     """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
