@@ -57,10 +57,9 @@ def _decide_growth(survey: Survey) -> Decision:
     number = share * filled
     # Two standard deviations of a count above it, and no less than a few: small samples prove little.
     most = (number + 2 + 2 * math.sqrt(number + 1)) / filled
-    found = f"{100 * share:.2f} % of the {filled:.0f} waveforms with echoes hold overlapping ones, {100 * most:.2f} %"
-    if most >= LOST:
-        return Decision(GROWTH, True, f"{found} at most ({100 * LOST:g} %)")
-    return Decision(GROWTH, False, f"{found} at most, which one fit per maximum serves ({100 * LOST:g} %)")
+    found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
+    limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
+    return Decision(GROWTH, most >= LOST, f"{found}; {limit}")
 
 
 def _overlapped(survey: Survey) -> tuple[float, float]:

@@ -12,6 +12,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("wavebatch.cli.run:run", "Strips in, enriched point clouds out: the main job."),
     "info": ("wavebatch.cli.inspect:info", "What a strip holds: points, packets, descriptors, samples."),
     "check": ("wavebatch.cli.inspect:check", "Problems of strips and chain files, one line each."),
+    "survey": ("wavebatch.cli.survey:survey", "What sensor and scene of a strip are, and the chain they need."),
     "stages": ("wavebatch.cli.stages:stages", "The algorithms: all of them, or one with its parameters."),
     "simulate": ("wavebatch.cli.simulate:simulate", "A strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Two results on one strip, or a result with the truth."),

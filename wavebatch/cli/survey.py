@@ -1,0 +1,198 @@
+"""`wavebatch survey`: what sensor and scene of a strip are, and which chain they need."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+
+if TYPE_CHECKING:
+    from wavebatch.io.strip import StripReader, StripScan
+    from wavebatch.systemfile import SavedSurvey
+
+
+@click.command()
+@click.argument("strip", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), metavar="SYSTEM.toml",
+              help="Write pulse, noise and all else that was found; for `wavebatch run --system`.")
+@click.option("--chain", "chain_file", type=click.Path(dir_okay=False, path_type=Path), metavar="CHAIN.toml",
+              help="Write the cheapest chain that serves, with a comment on each part; for `wavebatch run --chain`.")
+@click.option("--waveforms", type=click.IntRange(1), metavar="N",
+              help="Waveforms to look at, spread over the strip.  [default: 8192, fewer where they are long]")
+@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
+              help="Where packet vectors point: decided from the file, or toward or away from the sensor.")
+@click.option("--headerless", is_flag=True, help="Take a .wdp that lacks its 60-byte header.")
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@debug_option
+@report_errors()
+def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: bool, **options: Any) -> None:
+    """What sensor and scene of a strip are, and what of a chain they need.
+
+    Noise, baseline, system pulse, ringing, saturation, shares of empty, single and overlapped waveforms, and every
+    part of a chain that the scene does not need, with the reason. Exit code: 0, or 1 where the strip cannot be surveyed
+    or a file not be written.
+    """  # fmt: skip
+    from wavebatch.auto import chain_text
+    from wavebatch.io.publish import refuse_existing
+    from wavebatch.systemfile import write_survey, write_text
+
+    overwrite = options["overwrite"]
+    for target in (output, chain_file):
+        if target is not None and not overwrite:
+            refuse_existing(target)
+    saved, facts = _survey(strip, options)
+    if output is not None:
+        write_survey(output, saved, overwrite=overwrite)
+    if chain_file is not None:
+        write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
+    if as_json:
+        print_json(_document(saved, facts))
+    else:
+        click.echo("\n".join(_lines(saved, facts)))
+    for target in (output, chain_file):
+        if target is not None:
+            talk(f"{target} is written")
+
+
+def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
+    """The survey, and what else is told about the strip."""
+    from wavebatch.choice import read_sample, survey_sample
+    from wavebatch.errors import InputError
+    from wavebatch.io.fingerprint import take_fingerprint
+    from wavebatch.io.strip import StripReader
+    from wavebatch.systemfile import SavedSurvey
+
+    with StripReader(strip, direction=options["direction"], headerless=options["headerless"]) as reader:
+        with reader.scan() as scan:
+            block = read_sample(reader, scan, options["waveforms"])
+            facts = _describe_strip(reader, scan)
+        packet_file = reader.facts.packet_file
+    if block is None:
+        raise InputError(f"{strip}: holds no waveform that could be surveyed; `wavebatch check` says what it holds")
+    return SavedSurvey(survey_sample(block), strip.name, take_fingerprint(strip, packet_file)), facts
+
+
+def _describe_strip(reader: StripReader, scan: StripScan) -> dict[str, Any]:
+    return {
+        "strip": str(reader.facts.path),
+        "points": scan.points,
+        "packets": scan.packets,
+        "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
+    }
+
+
+def _decisions(saved: SavedSurvey) -> list[Any]:
+    """Those of the chosen chain, then what the scene would need that no chain has without further files."""
+    from wavebatch.auto import decide
+
+    chosen = decide(saved.survey)
+    parts = {decision.part for decision in chosen}
+    return [*chosen, *(decision for decision in saved.survey.decisions if decision.part not in parts)]
+
+
+def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
+    from wavebatch.auto import chain_text
+    from wavebatch.systemfile import SYSTEM_SCHEMA, describe_system
+
+    return {
+        "schema": SYSTEM_SCHEMA,
+        "version": saved.version,
+        **facts,
+        "fingerprint": dict(saved.fingerprint),
+        "waveforms": saved.survey.waveforms,
+        "system": describe_system(saved.survey.system),
+        "figures": {name: float(value) for name, value in saved.survey.figures.items()},
+        "decisions": [
+            {"part": decision.part, "needed": bool(decision.needed), "reason": decision.reason}
+            for decision in _decisions(saved)
+        ],
+        "chain": chain_text(saved.survey),
+    }
+
+
+def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
+    figures, direction = saved.survey.figures, facts["direction"]
+    yield _line("strip", f"{facts['strip']}: {facts['points']} points, {facts['packets']} packets")
+    yield _line("surveyed", f"{saved.survey.waveforms} waveforms")
+    samples = f"{figures['n_samples']:.0f} of {figures['bits']:.0f} bits, {figures['spacing_ns']:g} ns apart"
+    yield _line("samples", samples)
+    yield _line("ADC range", f"counts {figures['least_count']:.0f} to {figures['largest_count']:.0f}")
+    yield _line("vectors", f"{direction['sign']} the sensor: {direction['evidence']}")
+    yield from _noise_lines(saved)
+    yield from _pulse_lines(saved)
+    yield from _scene_lines(saved)
+    yield "decisions"
+    for decision in _decisions(saved):
+        yield f"  {'needed' if decision.needed else 'left out':10}{decision.part:26}{decision.reason}"
+
+
+def _line(name: str, text: str) -> str:
+    return f"{name:18}{text}"
+
+
+def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
+    system, figures = saved.survey.system, saved.survey.figures
+    yield _line("baseline", f"{system.baseline:.3f} DN, +-{system.baseline_spread:.3f} DN between waveforms")
+    yield _line("noise", f"{system.noise_std:.3f} DN for thresholds and errors, chosen from")
+    for kind, value in system.noise_by_kind.items():
+        yield f"  {kind.replace('_', ' '):18}{value:.3f} DN"
+    if system.noise_gain > 0:
+        strong = figures["amplitude_99"]
+        grown = system.noise_gain * strong
+        text = f"variance grows by {system.noise_gain:.4f} DN2 per DN, {grown:.2f} DN2 at {strong:.0f} DN"
+    else:
+        text = "none"
+    yield _line("signal noise", text)
+
+
+def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
+    from wavebatch.units import FWHM_PER_SIGMA
+
+    system, figures = saved.survey.system, saved.survey.figures
+    model = "Gaussian"
+    if system.components:
+        model = f"learned, {len(system.components)} Gaussians"
+    elif system.kappa:
+        model = f"skewed, kappa {system.kappa:.4f}"
+    width = system.sigma_ref * FWHM_PER_SIGMA
+    yield _line("system pulse", f"{model}; s_ref {system.sigma_ref:.4f} ns, full width at half maximum {width:.3f} ns")
+    for weight, delay, sigma in system.components:
+        yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
+    yield _line("pulse models", f"from {figures.get('isolated_echoes', 0):.0f} isolated echoes; misfit per amplitude")
+    if "misfit_goal" not in figures:
+        yield "  too few to learn a pulse from: the Gaussian of their width is used"
+    else:
+        yield from _misfit_lines(saved)
+    yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")
+    yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
+    yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
+
+
+def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:
+    figures, system = saved.survey.figures, saved.survey.system
+    chosen = f"misfit_{len(system.components)}_gaussians"
+    if not system.components:
+        chosen = "misfit_skewed" if system.kappa else "misfit_1_gaussians"
+    tried = {name: value for name, value in figures.items() if name.startswith("misfit_") and name != "misfit_goal"}
+    for name in sorted(tried, key=lambda name: (name != "misfit_1_gaussians", name != "misfit_skewed", name)):
+        words = name.removeprefix("misfit_").replace("_", " ").replace("1 gaussians", "1 gaussian")
+        yield f"  {words:18}{tried[name]:.4f}{'  chosen' if name == chosen else ''}"
+    yield f"  {'unseen below':18}{figures['misfit_goal']:.4f}"
+
+
+def _scene_lines(saved: SavedSurvey) -> Iterator[str]:
+    system, figures = saved.survey.system, saved.survey.figures
+    clipped = "none seen"
+    if system.saturation is not None:
+        clipped = f"at {system.saturation:.0f} DN, in {100 * figures['saturated_share']:.2f} % of the waveforms"
+    yield _line("saturation", clipped)
+    shares = ", ".join(f"{100 * figures[f'{kind}_share']:.2f} % {kind}" for kind in ("empty", "single", "overlapped"))
+    yield _line("waveforms", f"{shares}; {figures['echoes_per_waveform']:.3f} echoes each")
+    yield _line("amplitudes", f"99 % below {figures['amplitude_99']:.1f} DN")
+    share = 100 * figures["system_width_share"]
+    yield _line("widths", f"{share:.1f} % of the clear echoes have the width of the system pulse")
