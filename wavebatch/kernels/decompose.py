@@ -214,41 +214,28 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         prior=prior,
     )
     finished = np.ones(len(rows), bool) if last else fit.converged | fit.hopeless
+    solution = _solution(cluster, windows, fit, begin)
+    new = np.isfinite(problem.target)
+    accepted = finished & ~fit.hopeless & (~new | ((solution.cost < problem.target) & _is_resolved(solution)))
+    proposal, parents = _propose(settings, windows, fit, accepted, begin, limits)
+    if proposal is not None:
+        proposal = proposal._replace(cluster=cluster[parents])
+        parents = np.cumsum(accepted)[parents] - 1
+    left = np.flatnonzero(~finished)
+    unfinished = Problem(cluster[left], solution.parameters[left], problem.target[left])
+    refused = rows[finished & ~accepted]
+    return _Step(solution.take(np.flatnonzero(accepted)), refused, proposal, parents, unfinished, rows[left])
+
+
+def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, begin: np.ndarray) -> Solution:
+    """What all fits of a batch found, in samples of the waveform."""
+    errors = parameter_errors(fit.parameters, windows.std, fit.rows, fit.gram)
     parameters = fit.parameters.copy()
     parameters[:, 1] += begin[:, None]
-    left = np.flatnonzero(~finished)
-    unfinished = Problem(cluster[left], parameters[left], problem.target[left])
-    done = np.flatnonzero(finished & ~fit.hopeless)
-    refused = [rows[finished & fit.hopeless]]
-
-    solution = _solution(cluster[done], windows, fit, done, begin)
-    target = problem.target[done]
-    accepted = ~np.isfinite(target) | ((solution.cost < target) & _is_resolved(solution))
-    good = np.flatnonzero(accepted)
-    refused.append(rows[done[~accepted]])
-    proposal, parents = _propose(settings, windows, fit, done[good], begin, limits)
-    if proposal is not None:
-        proposal = proposal._replace(cluster=cluster[done[good]][parents])
-    return _Step(solution.take(good), np.concatenate(refused), proposal, parents, unfinished, rows[left])
-
-
-def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, places: np.ndarray, begin: np.ndarray) -> Solution:
-    """What the fits at `places` found, in samples of the waveform."""
-    std, rows = windows.std[places], fit.rows[places]
-    parameters = fit.parameters[places]
-    errors = parameter_errors(parameters, std, rows, fit.gram[places])
-    parameters[:, 1] += begin[places][:, None]
-    used = np.maximum(np.count_nonzero(windows.x[places] >= 0, axis=1), 1)
-    residual = rows[:, -1]
-    return Solution(
-        cluster,
-        parameters,
-        errors,
-        np.sqrt(np.einsum("ml,ml->m", residual, residual) / used) / std,
-        fit.cost[places],
-        fit.converged[places],
-        fit.at_bound[places],
-    )
+    used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
+    residual = fit.rows[:, -1]
+    misfit = np.sqrt(np.einsum("ml,ml->m", residual, residual) / used) / windows.std
+    return Solution(cluster, parameters, errors, misfit, fit.cost, fit.converged, fit.at_bound)
 
 
 def _limits(work: _Work, cluster: np.ndarray, begin: np.ndarray) -> Limits:
@@ -273,19 +260,16 @@ def _is_resolved(solution: Solution) -> np.ndarray:
 
 
 def _propose(
-    settings: Settings, windows: Windows, fit: Fit, places: np.ndarray, begin: np.ndarray, limits: Limits
+    settings: Settings, windows: Windows, fit: Fit, accepted: np.ndarray, begin: np.ndarray, limits: Limits
 ) -> tuple[Problem | None, np.ndarray]:
-    """Trials with one echo more for the fits at `places` that leave something unexplained, and their rows of those."""
+    """Trials with one echo more for the accepted fits that leave something unexplained, and the rows of those."""
     none = np.empty(0, np.int64)
-    if not settings.grow or fit.parameters.shape[2] >= settings.max_echoes or not len(places):
+    if not settings.grow or fit.parameters.shape[2] >= settings.max_echoes or not accepted.any():
         return None, none
-    misfit = find_misfits(
-        windows.take(places), fit.parameters[places], fit.rows[places], settings.gate_residual, settings.gate_hermite
-    )
-    parents = np.flatnonzero(misfit)
-    if not len(parents):
+    misfit = find_misfits(windows, fit.parameters, fit.rows, settings.gate_residual, settings.gate_hermite)
+    at = np.flatnonzero(misfit & accepted)
+    if not len(at):
         return None, none
-    at = places[parents]
     start, gain = propose_echo(
         windows.take(at),
         fit.parameters[at],
@@ -295,8 +279,8 @@ def _propose(
         settings.width_ref,
     )
     hopeful = gain > 0.5 * settings.acceptance
-    parents, at, start = parents[hopeful], at[hopeful], start[hopeful]
-    if not len(parents):
+    at, start = at[hopeful], start[hopeful]
+    if not len(at):
         return None, none
     start[:, 1] += begin[at][:, None]
-    return Problem(at, start, fit.cost[at] - settings.acceptance), parents
+    return Problem(at, start, fit.cost[at] - settings.acceptance), at

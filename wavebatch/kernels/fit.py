@@ -285,7 +285,12 @@ def _store(
 
 
 def _refresh(fit: Fit, windows: Windows, shape: PulseShape) -> None:
-    """Evaluates the few problems that stopped short again where they stand: their last trial may have been refused."""
+    """Evaluates the few problems that stopped short again where they stand: their last trial may have been refused.
+
+    Those given up are nobody's business any more: nothing is in their rows.
+    """
+    fit.rows[fit.hopeless] = 0
+    fit.gram[fit.hopeless] = 0
     short = np.flatnonzero(~(fit.converged | fit.hopeless))
     if len(short):
         fit.rows[short] = evaluate_model(windows.take(short), fit.parameters[short], shape)
