@@ -15,6 +15,7 @@ OVERLAP = 2.0
 def merge_unresolved(table: EchoTable) -> EchoTable:
     """The table with neighbours closer than the error of their distance merged, one pair after the other.
 
+    Only echoes that were fitted together: what a fit of its own puts on another echo's flank says nothing of that one.
     Area, mean time and variance of the pair are kept; errors of time and width are those of the better echo, widened
     by nothing: together the pair is as well determined as one echo. The result is flagged.
     """
@@ -32,7 +33,8 @@ def _unresolved(table: EchoTable) -> np.ndarray:
     gap = np.diff(table.time)
     error = np.hypot(table.time_err[1:], table.time_err[:-1])
     near = gap < OVERLAP * np.minimum(table.sigma[1:], table.sigma[:-1])
-    close = (np.diff(table.waveform) == 0) & near & (gap < error)
+    together = (table.flags[1:] & table.flags[:-1] & np.uint16(EchoFlag.OVERLAPPED)) != 0
+    close = (np.diff(table.waveform) == 0) & together & near & (gap < error)
     rows = np.flatnonzero(close)
     run = np.cumsum(np.r_[True, np.diff(rows) > 1]) if len(rows) else rows
     start = rows[np.r_[True, np.diff(rows) > 1]] if len(rows) else rows
