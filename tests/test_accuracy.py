@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.config import load_profile
 from wavebatch.evaluate import score
 from wavebatch.kernels.bounds import crlb
 from wavebatch.simulate import Recording, find_scene, simulate_block
+from wavebatch.stages.merge import merge_unresolved
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))
 """Noise of a recorded sample: standard deviation 1, rounded to whole counts."""
@@ -250,3 +251,25 @@ def test_false_splits_over_many_waveforms(snr):
     n = 30_000
     block = record(n, (snr, phases(n, snr), SIGMA), seed=snr + 2)
     assert (decompose("adaptive", block).count(n) > 1).mean() <= 0.003
+
+
+def test_echoes_that_cannot_be_told_apart_are_merged_and_others_are_not():
+    """H1: energy and mean time are kept; weak company far away, or with a poor time, does not touch an echo."""
+    table = EchoTable.build(
+        [0, 0, 1, 1, 2, 2, 3, 3],
+        [30.0, 30.8, 30.0, 37.0, 30.0, 31.0, 30.0, 31.0],
+        [50.0, 30.0, 90.0, 3.0, 90.0, 3.0, 50.0, 50.0],
+        np.full(8, SIGMA),
+        time_err=np.array([1.0, 1.2, 0.05, 30.0, 0.05, 30.0, 0.1, 0.1]),
+        amplitude_err=np.ones(8),
+        sigma_err=np.ones(8),
+        flags=np.array([16, 16, 16, 16, 0, 0, 16, 16]),
+    )
+    merged = merge_unresolved(table)
+    assert merged.count(4).tolist() == [1, 2, 2, 2]
+    assert merged.time[0] == pytest.approx(30.3)
+    assert merged.amplitude[0] * merged.sigma[0] == pytest.approx(80 * SIGMA, rel=1e-5)
+    assert merged.sigma[0] == pytest.approx(np.hypot(SIGMA, 0.8 * np.sqrt(0.625 * 0.375)), rel=1e-5)
+    assert merged.flags[0] & EchoFlag.MERGED
+    assert not (merged.flags[1:] & EchoFlag.MERGED).any()
+    np.testing.assert_array_equal(merged.time[1:], table.time[2:])
