@@ -1,0 +1,88 @@
+"""Calibration, backscatter and reflectance against the numbers of ALGORITHMS.md 5 (T18), and their errors."""
+
+import numpy as np
+import pytest
+
+from wavebatch.kernels.radiometry import (
+    backscatter,
+    backscatter_error,
+    calibrate_echoes,
+    cross_section,
+    diffuse_reflectance,
+    energy_error,
+    reflectance_error,
+    transmit,
+)
+
+BETA = 0.5e-3
+
+
+@pytest.mark.parametrize(
+    ("attenuation", "expected"),
+    [
+        (0.0, (2.626154e-8, 5.156441e-15, 1.389761, 0.401189, 0.133711, 1.203568)),
+        (0.22, (2.496435e-8, 4.901738e-15, 1.418208, 0.409401, 0.136448, 1.228204)),
+    ],
+)
+def test_the_numbers_of_the_specification(attenuation, expected):
+    constant = float(calibrate_echoes(0.2, np.radians(10), 500.0, 60.0, 2.0, attenuation))
+    gamma = float(backscatter(constant, 700.0, 45.0, 2.4, attenuation))
+    angle = np.radians(30)
+    found = (
+        constant,
+        constant * np.pi * BETA**2 / 4,
+        gamma,
+        float(diffuse_reflectance(gamma, angle)),
+        float(cross_section(gamma, 700.0, BETA)),
+        gamma * np.cos(angle),
+    )
+    assert [f"{value:.6e}" for value in found[:2]] == [f"{value:.6e}" for value in expected[:2]]
+    assert [f"{value:.6f}" for value in found[2:]] == [f"{value:.6f}" for value in expected[2:]]
+
+
+@pytest.mark.parametrize(
+    ("attenuation", "shares"),
+    [(0.1, (0.977, 0.955, 0.871)), (0.22, (0.951, 0.904, 0.738)), (0.5, (0.891, 0.794, 0.501))],
+)
+def test_transmission(attenuation, shares):
+    assert transmit(np.array([500.0, 1000.0, 3000.0]), attenuation) == pytest.approx(shares, abs=6e-4)
+
+
+def test_what_is_not_known_is_nan():
+    distance = np.array([np.nan, 0.0, -5.0, np.inf, 700.0])
+    gamma = backscatter(2.6e-8, distance, np.full(5, 45.0), np.full(5, 2.4), 0.0)
+    assert np.isfinite(gamma).tolist() == [False] * 4 + [True]
+    assert np.isnan(cross_section(gamma, distance, BETA)[:4]).all()
+    assert np.isnan(calibrate_echoes(0.2, 0.0, 500.0, np.array([0.0, -1.0]), 2.0, 0.0)).all()
+    assert np.isnan(diffuse_reflectance(1.0, np.radians([86.0, 90.0, 120.0]))).all()
+
+
+def test_float32_input_keeps_the_fourth_power():
+    wide = cross_section(np.float32(1.0), np.float32(3000.0), BETA)
+    assert wide.dtype == np.float64 and wide == pytest.approx(np.pi / 4 * 1.5**2, rel=1e-12)
+
+
+def test_a_wrong_range_counts_four_times():
+    none = np.zeros(1)
+    section = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0, power=4)
+    gamma = backscatter_error(none, np.array([500.0]), 1.0, 0.0, 0.0)
+    assert section[0] == pytest.approx(0.008) and gamma[0] == pytest.approx(0.004)
+
+
+def test_errors_are_those_of_repeated_measurements():
+    rng = np.random.default_rng(7)
+    n, amplitude, sigma, distance, angle = 200_000, 60.0, 2.0, 500.0, np.radians(35)
+    a_err, s_err, r_err, c_err, angle_err = 0.9, 0.03, 2.0, 0.02, np.radians(1.0)
+    draw = rng.multivariate_normal(np.zeros(2), [[1, -1 / np.sqrt(3)], [-1 / np.sqrt(3), 1]], n)
+    a, s = amplitude + a_err * draw[:, 0], sigma + s_err * draw[:, 1]
+    r = distance + r_err * rng.standard_normal(n)
+    gamma = backscatter(2.6e-8 * (1 + c_err * rng.standard_normal(n)), r, a, s, 0.5)
+    rho = diffuse_reflectance(gamma, angle + angle_err * rng.standard_normal(n))
+    energy = energy_error(amplitude, sigma, a_err, s_err)
+    relative = backscatter_error(energy, distance, r_err, c_err, 0.5)
+    assert relative == pytest.approx(np.std(gamma) / np.mean(gamma), rel=0.02)
+    assert reflectance_error(relative, angle, angle_err) == pytest.approx(np.std(rho) / np.mean(rho), rel=0.02)
+    section = cross_section(gamma, r, BETA)
+    assert backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
+        np.std(section) / np.mean(section), rel=0.02
+    )
