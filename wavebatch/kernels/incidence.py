@@ -1,0 +1,173 @@
+"""From how much an echo is wider than the system pulse to the angle of the surface that the beam struck (ALGORITHMS 1.4).
+
+A plane under a Gaussian beam spreads the pulse by a Gaussian of standard deviation w tan(alpha) / c, w = R beta / 2.
+All that depends on range and beam is in that product, so that one table of measured width by spread serves every echo.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.units import FWHM_PER_SIGMA, C
+
+STEEPEST = np.radians(80.0)
+"""Angles beyond it are not known (H14)."""
+
+FWHM_PER_TAU = 3.3946780749849567
+"""Full width at half maximum of t^2 exp(-t), in tau; of the printed t exp(-t) the paper has 3.5."""
+
+PAPER_TAU = 3.5
+
+_LONGEST = 30.0
+"""Spread of the last entry of a table [tau]; beyond it variances add up exactly enough."""
+
+_PHASES = (0.0, 0.25, 0.5, 0.75)
+"""Places of the first sample, in samples, over which a table is averaged."""
+
+
+def spread_of_angle(angle: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+    """Standard deviation [ns] of the spread by a plane at `angle` [rad]; distance [m]; divergence full, 1/e^2 [rad]."""
+    return 0.5 * divergence / C * np.asarray(distance, np.float64) * np.tan(angle)
+
+
+def angle_of_spread(spread: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
+    """Angle [rad] of the plane that spreads the pulse by `spread` [ns]; the inverse of `spread_of_angle`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.arctan(np.asarray(spread, np.float64) * (2.0 * C / divergence) / distance)
+
+
+class WidthTable(NamedTuple):
+    """Width that is measured by spread of the pulse, both ascending, as standard deviations [ns]."""
+
+    spread: np.ndarray
+    width: np.ndarray
+    cut: bool
+    """Whether widths stopped growing, so that the table had to end there (H15)."""
+
+
+def build_table(spread: np.ndarray, width: np.ndarray) -> WidthTable:
+    """The part of a table up to the last width that is larger than all before it (H15)."""
+    falls = np.flatnonzero(~(np.diff(width) > 0))
+    end = falls[0] + 1 if len(falls) else len(width)
+    return WidthTable(spread[:end], width[:end], end < len(width))
+
+
+def spread_variance(table: WidthTable, width: np.ndarray) -> np.ndarray:
+    """Variance of the spread [ns2] from measured widths [ns]; negative for those below the system's.
+
+    Between entries, and beyond the last one, what the pulse itself adds to the variance is interpolated. NaN beyond
+    the end of a table that was cut.
+    """
+    width = np.asarray(width, np.float64)
+    own = table.width**2 - table.spread**2
+    variance = width * width - np.interp(width, table.width, own)
+    return np.where(width > table.width[-1], np.nan, variance) if table.cut else variance
+
+
+def angles_of_variance(
+    variance: np.ndarray, variance_err: np.ndarray, distance: np.ndarray, divergence: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and their standard deviations [rad] from the variance that the surface adds to the pulse [ns2].
+
+    A variance that is not positive has angle 0. The error is that of the variance, carried through the inverse for
+    one standard deviation up and down, because near 0 the inverse is anything but straight; for steep planes it is
+    sigma_s s c^2 / (w^2 tan sec^2). NaN beyond 80 degrees, and where anything is not known.
+    """
+    known = np.isfinite(variance) & np.isfinite(variance_err) & (np.asarray(distance) > 0)
+    variance = np.where(known, variance, np.nan)
+    upper, middle, lower = (
+        angle_of_spread(np.sqrt(np.maximum(variance + step, 0.0)), distance, divergence)
+        for step in (variance_err, 0.0, -variance_err)
+    )
+    error = np.where(variance > variance_err, 0.5 * (upper - lower), upper - np.minimum(middle, 0.5 * upper))
+    steep = middle > STEEPEST
+    return np.where(steep, np.nan, middle), np.where(steep, np.nan, error)
+
+
+@lru_cache(maxsize=16)
+def pulse_table(sigma_ref: float, spacing: float) -> WidthTable:
+    """Widths of Gaussians fitted to t^2 exp(-t) pulses, sampled every `spacing` [ns], by their spread.
+
+    The pulse's length is such that its own fit has the width `sigma_ref` [ns], which the file says of flat ground.
+    """
+    tau = sigma_ref / 1.435
+    spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)]
+    for _ in range(3):
+        found = _fit_widths(spread[:1] * tau, tau, spacing)[0]
+        tau *= sigma_ref / found
+    width = _fit_widths(spread * tau, tau, spacing)
+    return build_table(spread * tau, width * (sigma_ref / width[0]))
+
+
+@lru_cache(maxsize=16)
+def paper_table(sigma_ref: float) -> WidthTable:
+    """A quarter of the widths at e^-2 by spread, as Rhomberg-Kauert et al. 2024 print them; for comparisons only.
+
+    Pulse t exp(-t / tau) with tau = T1 / 3.5, the later half of a Gaussian, no factor for the way there and back, x0 = w.
+    """
+    tau = FWHM_PER_SIGMA * sigma_ref / PAPER_TAU
+    spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)] * tau
+    time, curves = _spread_pulse(1, spread / np.sqrt(2.0), tau, causal=True)
+    return build_table(spread, np.array([0.25 * _direct_width(time, curve, np.exp(-2.0)) for curve in curves]))
+
+
+def _spread_pulse(
+    exponent: int, spread: np.ndarray, tau: float, *, causal: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times [ns] (s,) and the pulse t^exponent exp(-t) spread by Gaussians of given standard deviations (k, s)."""
+    step = tau / 40.0
+    reach = int(2 ** np.ceil(np.log2((12.0 * spread.max(initial=0.0) + 40.0 * tau) / step)))
+    time = (np.arange(reach) - reach // 2) * step
+    late = np.maximum(time, 0.0) / tau
+    pulse = np.fft.rfft(np.fft.ifftshift(late**exponent * np.exp(-late)))
+    wide = np.maximum(spread, 1e-3 * step)[:, None]
+    response = np.exp(-0.5 * (time / wide) ** 2)
+    if causal:
+        response *= time >= 0
+    response /= response.sum(axis=1, keepdims=True)
+    curves = np.fft.irfft(np.fft.rfft(np.fft.ifftshift(response, axes=1), axis=1) * pulse, n=reach, axis=1)
+    curves = np.fft.fftshift(curves, axes=1)
+    return time, curves / curves.max(axis=1, keepdims=True)
+
+
+def _direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
+    """Width of a curve of height 1 at `level`, between the first and the last crossing beside its peak."""
+    top = int(np.argmax(curve))
+    right = top + int(np.argmax(curve[top:] < level))
+    left = top - int(np.argmax(curve[top::-1] < level))
+
+    def cross(a: int, b: int) -> float:
+        return time[a] + (time[b] - time[a]) * (level - curve[a]) / (curve[b] - curve[a])
+
+    return float(cross(right - 1, right) - cross(left + 1, left))
+
+
+def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:
+    """Standard deviations [ns] of least-squares Gaussians, mean over the phases of the samples, per spread (k,)."""
+    time, curves = _spread_pulse(2, spread, tau)
+    widths = np.zeros(len(spread))
+    for k, curve in enumerate(curves):
+        peak, half = time[np.argmax(curve)], _direct_width(time, curve, 0.5)
+        first, last = time[np.flatnonzero(curve > 1e-6)[[0, -1]]]
+        for phase in _PHASES:
+            at = np.arange(first - 3.0 * half + phase * spacing, last + spacing, spacing)
+            widths[k] += _fit_gaussian(at, np.interp(at, time, curve), peak, half / FWHM_PER_SIGMA) / len(_PHASES)
+    return widths
+
+
+def _fit_gaussian(time: np.ndarray, value: np.ndarray, centre: float, sigma: float) -> float:
+    """Width of the least-squares Gaussian, by Gauss-Newton from a near start."""
+    amplitude = 1.0
+    for _ in range(12):
+        z = (time - centre) / sigma
+        unit = np.exp(-0.5 * z * z)
+        slope = amplitude / sigma * unit * z
+        jacobian = np.stack([unit, slope, slope * z], axis=1)
+        step = np.linalg.lstsq(jacobian, value - amplitude * unit, rcond=None)[0]
+        amplitude, centre, sigma = amplitude + step[0], centre + step[1], max(sigma + step[2], 0.3 * sigma)
+    return sigma
+
+
