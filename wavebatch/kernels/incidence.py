@@ -1,4 +1,4 @@
-"""From how much an echo is wider than the system pulse to the angle of the surface that the beam struck (ALGORITHMS 1.4).
+"""From how much an echo is wider than the system pulse to the angle of the surface it came from (ALGORITHMS 1.4).
 
 A plane under a Gaussian beam spreads the pulse by a Gaussian of standard deviation w tan(alpha) / c, w = R beta / 2.
 All that depends on range and beam is in that product, so that one table of measured width by spread serves every echo.
@@ -106,7 +106,7 @@ def pulse_table(sigma_ref: float, spacing: float) -> WidthTable:
 def paper_table(sigma_ref: float) -> WidthTable:
     """A quarter of the widths at e^-2 by spread, as Rhomberg-Kauert et al. 2024 print them; for comparisons only.
 
-    Pulse t exp(-t / tau) with tau = T1 / 3.5, the later half of a Gaussian, no factor for the way there and back, x0 = w.
+    Pulse t exp(-t / tau) with tau = T1 / 3.5, the later half of a Gaussian, one-way times, x0 = w.
     """
     tau = FWHM_PER_SIGMA * sigma_ref / PAPER_TAU
     spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)] * tau
