@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.kernels.decompose import UNRESOLVED
 
 OVERLAP = 2.0
 """Widths of the narrower echo within which two may be one: further apart, a weak one's poor time says nothing."""
 
 
 def merge_unresolved(table: EchoTable) -> EchoTable:
-    """The table with neighbours closer than the error of their distance merged, one pair after the other.
+    """The table with neighbours closer than a quarter of the error of their distance merged, one pair after the other.
 
     Only echoes that were fitted together: what a fit of its own puts on another echo's flank says nothing of that one.
     Area, mean time and variance of the pair are kept; errors of time and width are those of the better echo, widened
@@ -34,7 +35,7 @@ def _unresolved(table: EchoTable) -> np.ndarray:
     error = np.hypot(table.time_err[1:], table.time_err[:-1])
     near = gap < OVERLAP * np.minimum(table.sigma[1:], table.sigma[:-1])
     together = (table.flags[1:] & table.flags[:-1] & np.uint16(EchoFlag.OVERLAPPED)) != 0
-    close = (np.diff(table.waveform) == 0) & together & near & (gap < error)
+    close = (np.diff(table.waveform) == 0) & together & near & (gap < UNRESOLVED * error)
     rows = np.flatnonzero(close)
     run = np.cumsum(np.r_[True, np.diff(rows) > 1]) if len(rows) else rows
     start = rows[np.r_[True, np.diff(rows) > 1]] if len(rows) else rows
