@@ -105,7 +105,7 @@ def test_close_pairs_are_found_at_the_bound(apart, least):
 
 @pytest.mark.parametrize(
     ("snr", "ratio", "apart", "least"),
-    [(20, 1.0, 2.0, 0.8), (50, 0.5, 1.5, 0.75), (50, 0.2, 1.75, 0.8), (100, 1.0, 1.25, 0.88)],
+    [(20, 1.0, 2.0, 0.84), (50, 0.5, 1.5, 0.88), (50, 0.2, 1.75, 0.93), (100, 1.0, 1.25, 0.87)],
 )
 def test_unequal_and_weak_pairs_are_found(snr, ratio, apart, least):
     n = 1500
@@ -209,7 +209,7 @@ def run_scene(scene, profile, n=8192):
         ("mixed", "balanced", 0.82, 0.86, 0.958),
         ("mixed", "fast", 0.79, 0.82, 0.95),
         ("urban", "accurate", 0.955, 0.955, 0.99),
-        ("forest", "accurate", 0.56, 0.73, 0.97),
+        ("forest", "accurate", 0.60, 0.76, 0.97),
     ],
 )
 def test_scenes_are_decomposed_as_well_as_measured(scene, profile, exact, completeness, correctness):
@@ -260,7 +260,7 @@ def test_echoes_that_cannot_be_told_apart_are_merged_and_others_are_not():
         [30.0, 30.8, 30.0, 37.0, 30.0, 31.0, 30.0, 31.0],
         [50.0, 30.0, 90.0, 3.0, 90.0, 3.0, 50.0, 50.0],
         np.full(8, SIGMA),
-        time_err=np.array([1.0, 1.2, 0.05, 30.0, 0.05, 30.0, 0.1, 0.1]),
+        time_err=np.array([5.0, 6.0, 0.05, 30.0, 0.05, 30.0, 0.1, 0.1]),
         amplitude_err=np.ones(8),
         sigma_err=np.ones(8),
         flags=np.array([16, 16, 16, 16, 0, 0, 16, 16]),

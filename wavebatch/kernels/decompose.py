@@ -155,8 +155,8 @@ LAST_LENGTHS = np.array([48, 96, 192, 512, 1024, 4096, 65536])
 """Window lengths of the stragglers."""
 
 UNRESOLVED = 0.25
-"""Distance, in its errors, below which two echoes are one. Larger values lose pairs that chi2 proves: at 1, a quarter of
-those 1.5 widths apart with a ratio of 0.5."""
+"""Distance, in its errors, below which two echoes are one. Larger values lose pairs that chi2 proves: at 1, a quarter
+of those 1.5 widths apart with a ratio of 0.5."""
 
 PATIENCE = 5
 """Iterations of the first attempt; what has not converged then goes on together with others of any length."""
