@@ -157,3 +157,23 @@ def closed_form(y, fraction):
     part = y[low : high + 1]
     c2, c1, c0 = np.polyfit(x, np.log(part), 2, w=part)
     return np.exp(c0 - c1 * c1 / (4 * c2)), -c1 / (2 * c2), np.sqrt(-1 / (2 * c2))
+
+
+def correlate_antisymmetric(waveform, taps):
+    """One waveform correlated with taps ahead and their negatives behind, zero outside."""
+    s = len(waveform)
+    total = np.zeros(s)
+    for i in range(s):
+        for lag in range(1, len(taps)):
+            total[i] += taps[lag] * ((waveform[i + lag] if i + lag < s else 0) - (waveform[i - lag] if i >= lag else 0))
+    return total
+
+
+def walk_down(waveform, sample, level, step):
+    """Where one waveform falls to the level from a peak; a rise or the end stops the walk."""
+    here = sample
+    while 0 <= here + step < len(waveform) and waveform[here + step] <= waveform[here]:
+        if waveform[here + step] <= level and waveform[here + step] < waveform[here]:
+            return here + step * (waveform[here] - level) / (waveform[here] - waveform[here + step])
+        here += step
+    return here

@@ -1,0 +1,37 @@
+"""What detectors share: the signal they look at and the table they make."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.signal import transpose_samples
+
+
+def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
+    """Signal above the baseline, float32 (s, n)."""
+    signal = transpose_samples(block.samples)
+    signal -= noise.baseline
+    return signal
+
+
+def candidate_table(
+    block: WaveformBlock,
+    system: SystemPulse,
+    waveform: np.ndarray,
+    time: np.ndarray,
+    amplitude: np.ndarray,
+    width: np.ndarray,
+) -> EchoTable:
+    """Candidates in samples as a table in ns.
+
+    Widths are brought within 0.7 and 4 system widths, times within the waveform, amplitudes to at least 0.
+    """
+    ref = system.sigma_ref / block.spacing
+    last = block.samples.shape[1] - 1
+    return EchoTable.build(
+        waveform,
+        np.clip(time, 0.0, last) * block.spacing,
+        np.maximum(amplitude, 0.0),
+        np.clip(width, 0.7 * ref, 4.0 * ref) * block.spacing,
+    )
