@@ -179,7 +179,7 @@ def test_strip_too_short_to_resample(tmp_path):
 
 def test_groups_differ_and_are_surveyed():
     groups = make_groups(find_bench_scene("flat"), 1600, 3)
-    assert [len(group.block) for group in groups] == [400] * 4
+    assert [len(group.block) for group in groups] == [200] * 8
     assert not np.array_equal(groups[0].block.samples, groups[1].block.samples)
     assert all(group.system.sigma_ref == pytest.approx(2.0, rel=0.05) for group in groups)
 

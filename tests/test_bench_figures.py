@@ -17,10 +17,10 @@ from wavebatch.simulate.render import paint_echoes
 
 
 def draw_share(rng, by_group=0.0):
-    """A share of 0.7 among 4 groups of 200 waveforms with one or two echoes each; groups differ by `by_group`."""
-    group = np.repeat(np.arange(4), 200)
+    """A share of 0.7 among 8 groups of 100 waveforms with one or two echoes each; groups differ by `by_group`."""
+    group = np.repeat(np.arange(8), 100)
     whole = rng.integers(1, 3, 800)
-    chance = 0.7 + by_group * rng.standard_normal(4)[group]
+    chance = 0.7 + by_group * rng.standard_normal(8)[group]
     return share(rng.binomial(whole, np.clip(chance, 0, 1)), whole, group)
 
 
@@ -28,14 +28,14 @@ def test_error_of_a_share_is_what_repetitions_show(rng):
     figures = [draw_share(rng) for _ in range(400)]
     scatter = np.sqrt(2) * np.std([figure.value for figure in figures])
     stated = np.mean([figure.error for figure in figures])
-    assert scatter < 1.05 * stated and stated < 1.45 * scatter
+    assert scatter < 1.05 * stated and stated < 1.6 * scatter
     assert abs(np.mean([figure.value for figure in figures]) - 0.7) < 0.01
 
 
 def test_error_of_a_share_sees_what_groups_have_in_common(rng):
     figures = [draw_share(rng, by_group=0.1) for _ in range(300)]
     scatter = np.sqrt(2) * np.std([figure.value for figure in figures])
-    assert 0.8 * scatter < np.mean([figure.error for figure in figures]) < 1.3 * scatter
+    assert 0.8 * scatter < np.mean([figure.error for figure in figures]) < 1.5 * scatter
 
 
 def test_shares_of_nothing_keep_an_error():
@@ -48,15 +48,17 @@ def test_shares_of_nothing_keep_an_error():
 
 
 def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):
-    waveform, group = np.arange(1000) // 2, np.arange(1000) // 250
+    waveform, group = np.arange(1000) // 2, np.arange(1000) // 125
     drawn = [
         root_mean_square(3 * np.repeat(rng.standard_normal(500), 2), waveform, group) for _ in range(300)
     ]  # both echoes of a waveform err alike
     scatter = np.sqrt(2) * np.std([figure.value for figure in drawn])
     stated = np.mean([figure.error for figure in drawn])
-    assert scatter < 1.07 * stated and stated < 1.5 * scatter
+    assert scatter < 1.07 * stated and stated < 1.6 * scatter
     assert np.mean([figure.value for figure in drawn]) == pytest.approx(3, rel=0.01)
     assert root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == Figure(0.0, 0.0)
+    steady = root_mean_square(np.ones(100), np.arange(100), np.zeros(100, int), worst=10.0)
+    assert steady.value == 1 and steady.error == pytest.approx(np.sqrt(2) - 1)  # one of 100 may be off by 10
     assert np.isnan(root_mean_square(np.ones(1), np.zeros(1, int), np.zeros(1, int)).value)
 
 

@@ -12,7 +12,6 @@ from wavebatch.bench.truth import describe_truth, find_bounds
 from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
 from wavebatch.evaluate import QUANTITIES, find_isolated, match_echoes
 from wavebatch.simulate import Scene, simulate_blocks
-from wavebatch.simulate.blocks import SEED_BLOCK
 from wavebatch.survey import Survey, survey_block
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 
@@ -22,8 +21,8 @@ CLEAR = 10.0
 GROSS = 10.0
 """An error of more bounds than this is a gross one: counted, but left out of error/bound."""
 
-GROUPS = (4, 8)
-"""Least and most groups; each is surveyed anew, as the strips of a project are."""
+GROUPS = 8
+"""Groups of a scene; each is surveyed anew, as the strips of a project are."""
 
 CM_PER_NS = 100 * HALF_C
 
@@ -59,11 +58,10 @@ def make_groups(
     scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
 ) -> list[Group]:
     """`waveforms` waveforms of the scene in groups with a seed and a survey of their own."""
-    number = int(np.clip(round(waveforms / SEED_BLOCK), *GROUPS))
-    size = max(waveforms // number, 1)
+    size = max(waveforms // GROUPS, 1)
     groups = []
-    for place in range(number):
-        progress(f"{scene.name}: simulating and surveying, group {place + 1} of {number}")
+    for place in range(GROUPS):
+        progress(f"{scene.name}: simulating and surveying, group {place + 1} of {GROUPS}")
         ((block, truth),) = simulate_blocks(scene, size, seed=derive_seed(seed, place), size=size)
         groups.append(make_group(scene, place, block, truth, survey_block(block)))
     return groups
@@ -175,14 +173,14 @@ class Tally:
             gross = np.abs(ratios).max(axis=0) > GROSS
             figures[f"gross_{kind}"] = share(clear & gross, clear, e["group"])
             for name in QUANTITIES:
-                figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
+                figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross, GROSS)
                 known = np.isfinite(e[f"{name}_scaled"])
                 figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
         return figures
 
 
-def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
-    return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])
+def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray, worst: float = 0.0) -> Figure:
+    return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows], worst)
 
 
 def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

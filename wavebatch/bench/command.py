@@ -34,6 +34,9 @@ SCHEMA = "wavebatch.bench/1"
 PROFILES = ("fast", "balanced", "accurate")
 """Shipped chains that are always measured, cheapest first."""
 
+PEER_GROUPS = 6
+"""Groups that peers get a part of: they are slow."""
+
 Progress = Callable[[str], None]
 
 
@@ -48,7 +51,7 @@ class BenchOptions:
     chains: tuple[Path, ...] = ()
     """Chain files, besides the shipped chains."""
     seed: int = 0
-    waveforms: int = 32_768
+    waveforms: int = 65_536
     """Simulated waveforms per scene."""
     repeats: int = 3
     """Turns of the timing."""
@@ -142,7 +145,7 @@ def _measure_scene(
     if twin:
         rows.append({**next(row for row in rows if row["name"] == twin), "name": AUTO, "same_as": twin})
     if options.peers:
-        rows += _measure_peers(scene, groups[0], options, progress)
+        rows += _measure_peers(scene, groups[:PEER_GROUPS], options, progress)
     _mark_front(rows)
     section = {"scene": scene.name, "meaning": scene.meaning, "survey": _describe(groups), "rows": rows}
     if options.tolerance_cm is not None:
@@ -169,17 +172,21 @@ def _make_block(scene: Scene, options: BenchOptions, seed: int) -> WaveformBlock
     return next(simulate_blocks(scene, n, seed=seed, size=n))[0]
 
 
-def _measure_peers(scene: Scene, group: Group, options: BenchOptions, progress: Progress) -> list[dict[str, Any]]:
-    n = min(options.peer_waveforms, len(group.block))
-    part = cut_group(group, n)
+def _measure_peers(
+    scene: Scene, groups: list[Group], options: BenchOptions, progress: Progress
+) -> list[dict[str, Any]]:
+    n = min(max(options.peer_waveforms // len(groups), 1), len(groups[0].block))
+    parts = [cut_group(group, n) for group in groups]
     rows = []
     for name in list_peers():
-        progress(f"{scene.name}: {name} on {n} waveforms")
-        result = run_peer(name, part.block, part.system)
-        tally = Tally()
-        tally.add(part, result.found)
-        laps = Laps(kernels=[1e6 * result.seconds / max(result.waveforms, 1)]).to_json()
-        rows.append({**_row(name, "peer", tally, laps), "crashed_or_hung": result.failures})
+        progress(f"{scene.name}: {name} on {n * len(parts)} waveforms")
+        tally, times, failures = Tally(), [], 0
+        for part in parts:
+            result = run_peer(name, part.block, part.system)
+            tally.add(part, result.found)
+            times.append(1e6 * result.seconds / max(result.waveforms, 1))
+            failures += result.failures
+        rows.append({**_row(name, "peer", tally, Laps(kernels=times).to_json()), "crashed_or_hung": failures})
     return rows
 
 

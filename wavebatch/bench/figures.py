@@ -44,8 +44,11 @@ def share(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
     return Figure(value, float(np.sqrt(2) * max(error, np.sqrt(drawn * (1 - drawn) / (total + 4)))))
 
 
-def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Figure:
-    """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure."""
+def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray, worst: float = 0.0) -> Figure:
+    """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure.
+
+    worst: largest value that there may be; the error allows for one more echo as bad as that.
+    """
     if len(values) < 2:
         return Figure()
     squares = np.square(values.astype(np.float64))
@@ -55,16 +58,20 @@ def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray
     influence = (squares - mean) / (2 * np.sqrt(mean) * len(squares))
     _, place, where = np.unique(waveform, return_index=True, return_inverse=True)
     per_waveform = np.bincount(where, influence)
-    return Figure(float(np.sqrt(mean)), float(np.sqrt(2) * _standard_error(per_waveform, group[place])))
+    error = _standard_error(per_waveform, group[place])
+    rare = np.sqrt(mean + worst**2 / len(squares)) - np.sqrt(mean)
+    return Figure(float(np.sqrt(mean)), float(np.hypot(np.sqrt(2) * error, rare)))
 
 
 def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
     """Standard error of an estimate from what each independent waveform (n,) contributed to it."""
     single = float(np.sqrt(np.square(influence).sum()))
     sums = np.bincount(group, influence)[np.unique(group)]
-    if len(sums) < 2:
+    g = len(sums)
+    if g < 4:
         return single
-    return max(single, float(np.sqrt(len(sums) / (len(sums) - 1) * np.square(sums).sum())))
+    # The scatter of few groups is itself uncertain: the standard deviation of Student's t with g - 1 degrees.
+    return max(single, float(np.sqrt(g / (g - 3) * np.square(sums).sum())))
 
 
 def median_range(values: list[float]) -> dict[str, Any]:

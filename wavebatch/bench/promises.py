@@ -20,7 +20,8 @@ def measure_system(
 ) -> dict[str, Any]:
     """Start-up, memory over the length of a strip, and speed over jobs, as plain values.
 
-    pulses: of the strip for memory; that for jobs is twice as long. large: also measure memory with 100 times as many.
+    pulses: of the strip for memory; that for jobs is five times as long.
+    large: also measure memory with 100 times as many.
     """
     chain, scene = load_profile("accurate"), find_bench_scene("open")
     progress("timing wavebatch --help")
@@ -33,7 +34,7 @@ def measure_system(
             peak, waveforms = measure_memory(chain, strip, folder / "memory")
             told["memory"].append({"waveforms": waveforms, "peak_bytes": peak})
         progress("speed with 1 and 2 jobs")
-        strip = make_strip(scene, folder / "jobs.laz", 2 * pulses, seed)
+        strip = make_strip(scene, folder / "jobs.laz", 5 * pulses, seed)
         times = time_jobs(chain, strip, folder / "jobs", (1, 2), 2)
         told["jobs"] = {str(number): seconds for number, seconds in times.items()}
     return told

@@ -17,7 +17,7 @@ from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for bench.json, bench.txt and the plots.")
 @click.option("--seed", default=0, show_default=True, help="Of the simulated waveforms.")
-@click.option("--waveforms", default=32_768, show_default=True, help="Simulated waveforms per scene.")
+@click.option("--waveforms", default=65_536, show_default=True, help="Simulated waveforms per scene.")
 @click.option("--pulses", default=50_000, show_default=True, help="Pulses from file to file; 0 for kernels only.")
 @click.option("--repeat", "repeats", default=3, show_default=True, help="Turns of the timing.")
 @click.option(
