@@ -9,7 +9,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.kernels.noise import PooledNoise, estimate_noise
+from wavebatch.kernels.noise import estimate_noise
 from wavebatch.kernels.render import render_echoes
 from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples
 from wavebatch.stages.decompose import adaptive, closed_form
@@ -20,6 +20,12 @@ from wavebatch.units import FWHM_PER_SIGMA, MAD_TO_STD, QUANTISATION_STD
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
+
+MOST_ROUNDS = 12
+"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+
+SETTLED = 0.01
+"""Change of the width, as a share of it, below which it stays."""
 
 FIRST_LOOK = 2048
 """Waveforms from which the noise and the width to begin with are found."""
@@ -50,6 +56,9 @@ NEAR_BEST = 1.25
 
 ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
 """Thresholds tried for one more echo, in chi2."""
+
+USEFUL = 0.75
+"""Share of the split echoes that must be left for a raised threshold to have been of no use."""
 
 SPLIT_SHARE = 0.015
 """Share of the strip's narrowest isolated echoes that may be split."""
@@ -134,17 +143,17 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
 
 
 def _measure_gaussian(block: WaveformBlock) -> SystemPulse:
-    """Noise and the width of isolated echoes, each from the other, three times."""
+    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all."""
     saturation = find_saturation(block.samples, block.digitizer.max_count)
-    width = FIRST_WIDTH
     few = _thin(block, FIRST_LOOK)
-    for part in (few, few, block):
-        noise = estimate_noise(transpose_samples(part.samples), int(np.ceil(3 * width)))
-        system = _gaussian_system(block.spacing, noise, width, saturation)
-        found = _isolated_widths(part, system)
-        if len(found) >= FEW:
-            width = float(np.clip(_mode_of_narrow(found), 0.5, 50.0))
-    return replace(system, sigma_ref=width * block.spacing)
+    width, last = FIRST_WIDTH, 0.0
+    for _ in range(MOST_ROUNDS):
+        if abs(width - last) <= SETTLED * width:
+            break
+        system, last = _gaussian_system(few, width, saturation), width
+        width = _isolated_width(few, system)
+    system = _gaussian_system(block, width, saturation)
+    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
 
 
 def _thin(block: WaveformBlock, number: int) -> WaveformBlock:
@@ -152,9 +161,11 @@ def _thin(block: WaveformBlock, number: int) -> WaveformBlock:
     return block.rows(slice(None, None, max(len(block) // number, 1)))
 
 
-def _gaussian_system(spacing: float, noise: PooledNoise, width: float, saturation: float | None) -> SystemPulse:
+def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
+    """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
+    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)))
     return SystemPulse(
-        sigma_ref=width * spacing,
+        sigma_ref=width * block.spacing,
         baseline=noise.level,
         baseline_spread=noise.spread,
         noise_std=max(noise.std, noise.smoothed_std, QUANTISATION_STD),
@@ -163,17 +174,26 @@ def _gaussian_system(spacing: float, noise: PooledNoise, width: float, saturatio
     )
 
 
-def _isolated_widths(block: WaveformBlock, system: SystemPulse) -> np.ndarray:
-    """Widths [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped."""
+def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
+    """Width [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped.
+
+    Where most of them are at the edge of the widths that `system` allows it is that edge, so that the next round can
+    go beyond it; with too few of them the system's width stays.
+    """
     n = len(block)
     noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
     echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
     strongest, second = _strongest(echoes, n)
     echoes = echoes.take(strongest)
-    bad = EchoFlag.NEAR_EDGE | EchoFlag.SATURATED | EchoFlag.AT_BOUND
     good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
-    good &= (echoes.flags & int(bad)) == 0
-    return echoes.sigma[good] / block.spacing
+    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    free = (echoes.flags[good] & int(EchoFlag.AT_BOUND)) == 0
+    widths = echoes.sigma[good] / block.spacing
+    if 2 * free.sum() > len(free):
+        widths = widths[free]
+    if len(widths) < FEW:
+        return system.sigma_ref / block.spacing
+    return float(np.clip(_mode_of_narrow(widths), 0.5, 50.0))
 
 
 def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -308,7 +328,7 @@ def _measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTa
     learned = bool(system.components) or system.kappa != 0
     used = [value for kind, value in kinds.items() if not (learned and kind == "quiet_smoothed")]
     std = max([QUANTISATION_STD, *used])
-    gain = _noise_gain(residual, model, lag, std)
+    gain = _noise_gain(residual, model, lag, width, std)
     return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
 
 
@@ -321,10 +341,22 @@ def _robust_std(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
 
 
-def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, std: float) -> float:
+def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Share of a sample's variance that the fit of amplitude, time and width takes away.
+
+    lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span the
+    first three Hermite functions, whose squares add up to the leverage of a sample.
+    """
+    z = lag.astype(np.float64) ** 2
+    leverage = np.exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
+    return np.minimum(leverage, 0.9)
+
+
+def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
     core = np.abs(lag) < 1.5
     signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
+    squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
     if len(signal) < 2000:
         return 0.0
     edges = np.quantile(signal, np.linspace(0, 1, 11))
@@ -341,7 +373,7 @@ def _choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTabl
     """The system with the least threshold at which its clearest single echoes stay whole (R3).
 
     main: the echoes that the pulse was learned from. The threshold is raised until at most 1.5 % of them are split,
-    or until raising it further hardly changes their number: what is left then are two targets.
+    or until raising it hardly changes their number: what is split then are two targets.
     """
     if len(main) < ENOUGH_TO_LEARN:
         return system
@@ -355,8 +387,9 @@ def _choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTabl
         shares.append(len(rows) / len(main))
         if shares[-1] <= SPLIT_SHARE:
             return replace(system, acceptance=acceptance)
-    useful = [i for i in range(1, len(shares)) if shares[i] < 0.75 * shares[i - 1]]
-    return replace(system, acceptance=ACCEPTANCES[useful[-1] if useful else 0])
+        if len(shares) > 1 and shares[-1] > USEFUL * shares[-2]:
+            return replace(system, acceptance=ACCEPTANCES[len(shares) - 2])
+    return replace(system, acceptance=ACCEPTANCES[-1])
 
 
 def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> dict[str, float]:
