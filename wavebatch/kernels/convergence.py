@@ -1,0 +1,238 @@
+"""Where the sensor was, from where its rays come together: points and directions of a short window (ALGORITHMS.md 5.1).
+
+The position is a polynomial of time, P = c0 + c1 tau + c2 tau^2, tau = (t - centre) / half. Without a model of motion
+the error is metres; with noisy directions the linear solution is pulled to the ground, the angular one is not.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.units import MAD_TO_STD
+
+LARGEST_CONDITION = 1e5
+"""Of a single position from all directions: above it they are too much alike to say where they meet."""
+
+LARGEST_ERROR = 0.01
+"""Of the distance, relative, that a window may be expected to have."""
+
+LEAST_SPREAD = np.radians(2.0)
+"""Angle that the directions of a window must cover at least."""
+
+LEAST_PULSES = 20
+"""Of a window; fewer agree with too much."""
+
+SPEED, ACCELERATION = 80.0, 1.0
+"""What a sensor may do that a model of too low an order does not know [m/s, m/s2]."""
+
+_CLIP = 4.0 * MAD_TO_STD
+_ROUNDS = 3
+_STEPS = 6
+
+
+class SensorFit(NamedTuple):
+    """The sensor's path in a window."""
+
+    centre: float
+    """Time at which tau is 0 [s]."""
+    half: float
+    """Half of the window [s]."""
+    coefficients: np.ndarray
+    """c0, c1, c2 [m], f8 (order + 1, 3)."""
+    covariance: np.ndarray
+    """Of the coefficients as one vector [m2], f8 (3 order + 3, 3 order + 3)."""
+    condition: float
+    """Of the normal equations of a sensor at rest: what the directions alone can tell."""
+    distance: float
+    """Median distance to the points [m]."""
+    spread: float
+    """Angle that the directions cover [rad]."""
+    residual: float
+    """Root mean square of the angular residuals per component, at weight 1 [rad]."""
+    flipped: float
+    """Share of the directions that pointed to the sensor; they were turned."""
+    pulses: int
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the directions can say where they meet."""
+        good = np.isfinite(self.coefficients).all() and np.isfinite(self.covariance).all()
+        return bool(good and self.condition < LARGEST_CONDITION and self.spread > LEAST_SPREAD)
+
+
+def sensor_at(fit: SensorFit, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Position [m] and velocity [m/s] of the sensor at times [s] (n,), each (n, 3)."""
+    tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
+    order = len(fit.coefficients) - 1
+    slope = np.stack([k * tau ** max(k - 1, 0) / fit.half for k in range(order + 1)], axis=1)
+    return _powers(tau, order) @ fit.coefficients, slope @ fit.coefficients
+
+
+def range_error(fit: SensorFit, time: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Standard deviation of the distance to the sensor at times [s] (n,) along unit directions (n, 3) [m].
+
+    It holds what the fit says of itself, and what a sensor may do that the order of its model cannot follow.
+    """
+    order = len(fit.coefficients) - 1
+    tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
+    along = (_powers(tau, order)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
+    variance = np.einsum("ni,ij,nj->n", along, fit.covariance, along)
+    return np.sqrt(np.maximum(variance, 0.0) + _unknown_motion(fit) ** 2)
+
+
+def _unknown_motion(fit: SensorFit) -> float:
+    """What a sensor may stray from a path of the fit's order within its window [m], as weak directions enlarge it."""
+    stray = (SPEED * fit.half / 3**0.5, ACCELERATION * fit.half**2 / 6, 0.0)[len(fit.coefficients) - 1]
+    return float(stray * np.sqrt(fit.condition))
+
+
+def fit_sensor(
+    time: np.ndarray, point: np.ndarray, direction: np.ndarray, weight: np.ndarray | None = None, order: int = 2
+) -> SensorFit:
+    """The sensor's path from pulses of one window: where the lines through their points meet.
+
+    time [s] (n,); point: a return of each pulse [m] (n, 3); direction: along the ray, either way (n, 3); weight:
+    inverse variance of the directions (n,), 1 without. A fit that is not sound (`is_sound`) says nothing.
+    """
+    lengths = np.sqrt(np.einsum("ni,ni->n", direction, direction))
+    used = np.flatnonzero(np.isfinite(lengths) & (lengths > 0) & np.isfinite(point).all(axis=1) & np.isfinite(time))
+    unit = direction[used] / lengths[used, None]
+    weight = np.ones(len(used)) if weight is None else np.asarray(weight, np.float64)[used]
+    time, origin = np.asarray(time, np.float64)[used], np.zeros(3)
+    centre, half = 0.0, 1.0
+    if len(used):
+        centre = 0.5 * float(time.min() + time.max())
+        half = max(0.5 * float(time.max() - time.min()), 1e-9)
+        origin = np.median(point[used], axis=0)
+    ground = point[used] - origin
+    powers = _powers((time - centre) / half, order)
+    if len(used) < LEAST_PULSES:
+        return _nothing(centre, half, order, len(used))
+    with np.errstate(all="ignore"):
+        start = _solve_lines(powers, ground, unit, weight)
+        ahead = ground - powers @ start
+        reverse = np.einsum("ni,ni->n", unit, ahead) < 0
+        unit = np.where(reverse[:, None], -unit, unit)
+        found, normal, residual = _solve_angles(powers, ground, unit, weight, start)
+        ahead = ground - powers @ found
+        distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
+    found[0] += origin
+    covariance = np.full(normal.shape, np.nan)
+    if _condition(normal) < 1e14:
+        covariance = residual**2 * np.linalg.inv(normal)
+    condition, share = _condition(normal[:3, :3]), float(reverse.mean())
+    return SensorFit(
+        centre, half, found, covariance, condition, distance, _extent(unit), residual, share, len(used)
+    )
+
+
+def fit_best(
+    time: np.ndarray, point: np.ndarray, direction: np.ndarray, weight: np.ndarray | None = None
+) -> SensorFit | None:
+    """The fit of the order with the least expected error of the range; None where none is sound."""
+    best, least = None, np.inf
+    for order in (2, 1, 0):
+        fit = fit_sensor(time, point, direction, weight, order)
+        if not fit.is_sound:
+            continue
+        at = np.linspace(fit.centre - fit.half, fit.centre + fit.half, 9)
+        down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), (9, 3))
+        expected = float(np.sqrt(np.mean(range_error(fit, at, down) ** 2)))
+        if expected < least:
+            best, least = fit, expected
+    return best if best is not None and least < LARGEST_ERROR * best.distance else None
+
+
+def pairs_of_returns(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Point, direction and weight of pulses with two returns (n, 3): the farther they are apart, the better.
+
+    The point is the middle, whose errors do not go with those of the direction.
+    """
+    apart = last - first
+    return 0.5 * (first + last), apart, np.einsum("ni,ni->n", apart, apart)
+
+
+def _powers(tau: np.ndarray, order: int) -> np.ndarray:
+    return np.stack([tau**k for k in range(order + 1)], axis=1)
+
+
+def _nothing(centre: float, half: float, order: int, pulses: int) -> SensorFit:
+    size = 3 * (order + 1)
+    empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
+    return SensorFit(centre, half, *empty, np.inf, np.nan, 0.0, np.nan, 0.0, pulses)
+
+
+def _condition(normal: np.ndarray) -> float:
+    values = np.linalg.eigvalsh(normal) if np.isfinite(normal).all() else np.zeros(1)
+    return float(values[-1] / values[0]) if values[0] > 0 else np.inf
+
+
+def _extent(unit: np.ndarray) -> float:
+    """Twice the angle from the mean direction within which 98 % of the directions lie [rad]."""
+    mean = unit.mean(axis=0)
+    mean /= max(float(np.sqrt(mean @ mean)), 1e-12)
+    off = unit - mean
+    return float(4.0 * np.arcsin(np.clip(0.5 * np.quantile(np.sqrt(np.einsum("ni,ni->n", off, off)), 0.98), 0, 1)))
+
+
+def _normal(powers: np.ndarray, across: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the coefficients: across, the projector of each pulse times the root of its weight (n, 3, 3),
+    and the right side of its position (n, 3)."""
+    size = 3 * powers.shape[1]
+    rows = (across[:, :, None, :] * powers[:, None, :, None]).reshape(-1, size)
+    return rows.T @ rows, (powers.T @ right).reshape(size)
+
+
+def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+    if not np.isfinite(normal).all():
+        return np.full(len(right), np.nan)
+    return np.linalg.lstsq(normal, right, rcond=None)[0]
+
+
+def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Weights without what lies beyond four robust standard deviations."""
+    limit = _CLIP * max(float(np.median(error)), 1e-12)
+    return np.where(error <= limit, weight, 0.0)
+
+
+def _solve_lines(powers: np.ndarray, ground: np.ndarray, unit: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Coefficients that minimise the distances of the position from the lines, weighted by 1/R^2, outliers left out."""
+    across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+    w = weight
+    found = np.zeros((powers.shape[1], 3))
+    for _ in range(_ROUNDS):
+        right = np.einsum("nij,nj->ni", across, ground) * w[:, None]
+        normal, right = _normal(powers, across * np.sqrt(w)[:, None, None], right)
+        found = _solve(normal, right).reshape(found.shape)
+        ahead = ground - powers @ found
+        distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
+        off = np.einsum("nij,nj->ni", across, ahead)
+        error = np.sqrt(np.einsum("ni,ni->n", off, off) * weight) / distance
+        w = _keep(error, weight / distance**2)
+    return found
+
+
+def _solve_angles(
+    powers: np.ndarray, ground: np.ndarray, unit: np.ndarray, weight: np.ndarray, found: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Angular Gauss-Newton from `found`: coefficients, normal equations, residual of a component at weight 1."""
+    found = found.copy()
+    for _ in range(_STEPS):
+        ahead = ground - powers @ found
+        distance = np.sqrt(np.einsum("ni,ni->n", ahead, ahead))
+        q = ahead / distance[:, None]
+        r = unit - q
+        error = np.einsum("ni,ni->n", r, r) * weight
+        w = _keep(np.sqrt(error), weight)
+        across = (np.eye(3) - q[:, :, None] * q[:, None, :]) * (np.sqrt(w) / distance)[:, None, None]
+        side = r - q * np.einsum("ni,ni->n", q, r)[:, None]
+        normal, right = _normal(powers, across, -side * (w / distance)[:, None])
+        step = _solve(normal, right)
+        found += step.reshape(found.shape)
+        if not np.abs(step).max() > 1e-7 * distance.max():
+            break
+    kept = w > 0
+    freedom = max(2 * int(kept.sum()) - found.size, 1)
+    return found, normal, float(np.sqrt(error[kept].sum() / freedom))
