@@ -10,7 +10,18 @@ import click
 from tqdm import tqdm
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
-from wavebatch.simulate import PULSES, SCENES, Scene, StripOptions, find_scene, shape_pulse, simulate_strip
+from wavebatch.simulate import (
+    CANOPIES,
+    PULSES,
+    SCENES,
+    DiscreteReceiver,
+    Scene,
+    StripOptions,
+    find_scene,
+    shape_pulse,
+    simulate_returns,
+    simulate_strip,
+)
 
 _STORAGE = ("point_format", "internal", "scale", "without_waveform", "keep_empty", "toward")
 _RECORDING = {
@@ -23,7 +34,11 @@ _RECORDING = {
     "noise_gain": "noise_gain",
     "saturation": "saturation",
 }
-_SCENE_LINES = "\n\n".join(f"{name}: {scene.meaning}." for name, scene in SCENES.items())
+_RECEIVER = {"dead_zone": "dead_zone", "threshold": "threshold", "most_returns": "most"}
+_SCENE_LINES = "\n\n".join(
+    [f"{name}: {scene.meaning}." for name, scene in SCENES.items()]
+    + [f"canopy.{name}: {meaning}." for name, (meaning, _) in CANOPIES.items()]
+)
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
@@ -53,6 +68,16 @@ _SCENE_LINES = "\n\n".join(f"{name}: {scene.meaning}." for name, scene in SCENES
 @click.option("--without-waveform", default=0.01, show_default=True, help="Share of the pulses without a packet.")
 @click.option("--keep-empty/--drop-empty", default=True, help="Keep or leave out pulses without echo.  [default: keep]")
 @click.option("--toward/--away", default=True, help="Where the stored vectors point.  [default: toward the sensor]")
+@click.option(
+    "--sensor",
+    type=click.Choice(["waveform", "discrete"]),
+    default="waveform",
+    show_default=True,
+    help="What records: every waveform, or a receiver of discrete returns with a dead zone (no packets).",
+)
+@click.option("--dead-zone", type=float, help="Discrete: least distance of two returns [m].  [default: 0.65]")
+@click.option("--threshold", type=float, help="Discrete: amplitude that fires a return [DN].  [default: 12]")
+@click.option("--most-returns", type=int, help="Discrete: returns per pulse.  [default: 4]")
 @click.option("--overwrite", is_flag=True, help="Replace what exists.")
 @click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
@@ -63,28 +88,41 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
 
     The points are what a vendor would deliver: a return per distinguishable echo, sharing packets, placed rightly but
     with a return location that is up to half a sample off. --truth keeps every true echo for `wavebatch compare`.
+    --sensor discrete writes the returns of a receiver with a dead zone instead, in point format 1, 3, 6 or 8.
     """
+    receiver = _build_receiver(truth, options)
     shaped = _shape_scene(find_scene(scene), options)
     storage = {name: options[name] for name in _STORAGE} | {"point_format": int(options["point_format"])}
     bar = tqdm(total=pulses, unit=" pulses", disable=options["quiet"] or not sys.stderr.isatty(), leave=False)
+    common = {
+        "pulses": pulses,
+        "seed": seed,
+        "options": StripOptions(version=options["version"], **storage),
+        "overwrite": options["overwrite"],
+        "progress": bar.update,
+    }
     with bar:
-        summary = simulate_strip(
-            shaped,
-            output,
-            pulses=pulses,
-            seed=seed,
-            options=StripOptions(version=options["version"], **storage),
-            truth=truth,
-            overwrite=options["overwrite"],
-            progress=bar.update,
-        )
+        if receiver:
+            summary = simulate_returns(shaped, output, receiver=receiver, **common)
+        else:
+            summary = simulate_strip(shaped, output, truth=truth, **common)
     if options["as_json"]:
         print_json(asdict(summary))
     elif not options["quiet"]:
-        talk(
-            f"{output}: {summary.points} points of {summary.pulses} pulses, {summary.packets} packets with "
-            f"{summary.echoes} echoes"
-        )
+        rest = f"{summary.empty} without any" if receiver else f"{summary.packets} packets with {summary.echoes} echoes"
+        talk(f"{output}: {summary.points} points of {summary.pulses} pulses, {rest}")
+
+
+def _build_receiver(truth: Path | None, options: dict) -> DiscreteReceiver | None:
+    """The discrete receiver that the options ask for, None for a sensor of waveforms."""
+    given = {field: options[name] for name, field in _RECEIVER.items() if options[name] is not None}
+    if options["sensor"] == "discrete":
+        if truth:
+            raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
+        return DiscreteReceiver(**given)
+    if given:
+        raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")
+    return None
 
 
 def _shape_scene(scene: Scene, options: dict) -> Scene:

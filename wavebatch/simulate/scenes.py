@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from wavebatch.errors import ConfigError
+from wavebatch.simulate.canopy import CANOPIES, Canopy
 from wavebatch.simulate.draws import (
     Drawn,
     FoldedWidth,
@@ -43,12 +44,16 @@ class Scene:
     """1/e^2 radius of the footprint [m]; above 0, slopes widen the echoes."""
     hazards: tuple[str, ...] = ()
     """Names of hazards that replace all of the above."""
+    canopy: Canopy | None = None
+    """A stand of plants that replaces counts, amplitude, width and times."""
     recording: Recording = field(default_factory=Recording)
 
     def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
         """Echoes of n waveforms; incidence: angle between ray and ground's normal [rad], (n,)."""
         if self.hazards:
             return draw_hazards(rng, n, self.recording, self.hazards)
+        if self.canopy:
+            return self.canopy.draw(rng, n, self.recording)
         count = draw_counts(rng, n, self.counts)
         waveform = np.repeat(np.arange(n), count)
         time = self.times(rng, count, self.recording)
@@ -127,14 +132,19 @@ SCENES: dict[str, Scene] = _scenes(
 
 
 def find_scene(name: str) -> Scene:
-    """The scene called `name`, also `stiff.<hazard>`; ConfigError with the nearest name when there is none."""
+    """The scene called `name`, also `stiff.<hazard>` and `canopy.<stand>`; ConfigError with the nearest name when there
+    is none."""
     if name in SCENES:
         return SCENES[name]
     head, _, hazard = name.partition(".")
     if head == "stiff" and hazard in HAZARDS:
         doc = (HAZARDS[hazard].__doc__ or "").strip()
         return replace(SCENES["stiff"], name=name, meaning=doc, hazards=(hazard,))
-    names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS)]
+    if head == "canopy" and hazard in CANOPIES:
+        meaning, canopy = CANOPIES[hazard]
+        window = Recording(n_samples=8 * -(-int(canopy.duration + 48.0) // 8))
+        return Scene(name, meaning, canopy=canopy, recording=window)
+    names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
     raise ConfigError(f"scene {name!r} is unknown; {nearest(name, names)}")
 
 

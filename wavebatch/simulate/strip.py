@@ -100,7 +100,7 @@ def simulate_strip(
             summary = StripSummary(0, 0, 0, 0)
             for number in range(-(-pulses // SEED_BLOCK)):
                 n = min(SEED_BLOCK, pulses - number * SEED_BLOCK)
-                simulated = _cut(simulate_seed_block(scene, seed, number, flight), n)
+                simulated = cut_pulses(simulate_seed_block(scene, seed, number, flight), n)
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
                 summary = _write_block(writer, notes, simulated, scene, options, rng, summary)
                 if progress:
@@ -139,7 +139,8 @@ def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: b
     )
 
 
-def _cut(simulated: Simulated, n: int) -> Simulated:
+def cut_pulses(simulated: Simulated, n: int) -> Simulated:
+    """The first n pulses."""
     if n == len(simulated.block):
         return simulated
     rays = simulated.rays
@@ -189,12 +190,12 @@ def _fill_points(
     """Point records of the returns, every field set."""
     block, pulse = simulated.block, returns.pulse
     points = np.zeros(len(pulse), dtype)
-    _place_points(points, locate(block, pulse, returns.time), options)
+    place_points(points, locate(block, pulse, returns.time), options)
     points["intensity"] = np.clip(np.rint(10 * returns.amplitude), 0, 65535)
     points["gps_time"] = block.gps_time[pulse]
     points["point_source_id"] = 1
     last = returns.number == returns.total
-    _set_returns(points, returns, np.where(last, 2, 5), simulated.rays.scan_angle[pulse])
+    set_returns(points, returns, np.where(last, 2, 5), simulated.rays.scan_angle[pulse])
     for number, name in enumerate(("red", "green", "blue", "nir")):
         if name in dtype.names:
             points[name] = 20_000 + 9_000 * number + 20 * (pulse % 256)
@@ -214,7 +215,8 @@ def locate(block: WaveformBlock, pulse: np.ndarray, time: np.ndarray) -> np.ndar
     return block.origin[pulse] + time[:, None] * block.direction[pulse]
 
 
-def _place_points(points: np.ndarray, xyz: np.ndarray, options: StripOptions) -> None:
+def place_points(points: np.ndarray, xyz: np.ndarray, options: StripOptions) -> None:
+    """Coordinates as the file stores them."""
     for axis, (name, origin) in enumerate((("X", EAST), ("Y", NORTH), ("Z", 0.0))):
         values = np.rint((xyz[:, axis] - origin) / options.scale)
         if len(values) and np.abs(values).max() >= 2**31:
@@ -222,7 +224,7 @@ def _place_points(points: np.ndarray, xyz: np.ndarray, options: StripOptions) ->
         points[name] = values
 
 
-def _set_returns(points: np.ndarray, returns: Returns, kind: np.ndarray, scan_angle: np.ndarray) -> None:
+def set_returns(points: np.ndarray, returns: Returns, kind: np.ndarray, scan_angle: np.ndarray) -> None:
     """Return numbers, class, scan angle and flags in the fields of the point format."""
     if "classification_flags" in points.dtype.names:
         points["bit_fields"] = returns.number | returns.total << 4
