@@ -169,5 +169,3 @@ def _fit_gaussian(time: np.ndarray, value: np.ndarray, centre: float, sigma: flo
         step = np.linalg.lstsq(jacobian, value - amplitude * unit, rcond=None)[0]
         amplitude, centre, sigma = amplitude + step[0], centre + step[1], max(sigma + step[2], 0.3 * sigma)
     return sigma
-
-
