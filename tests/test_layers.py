@@ -10,7 +10,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
     {"errors", "units", "words", "allocator"},
-    {"kernels", "blocks"},
+    {"kernels", "blocks", "trajectory"},
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
     {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
@@ -131,4 +131,5 @@ def test_no_other_dependency_at_run_time():
 
     for path in MODULES:
         peers = {"gdecomp", "matplotlib"} if _part(path) == "bench" else set()
+        peers |= {"pyproj"} if path.name == "trajectoryfile.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

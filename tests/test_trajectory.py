@@ -1,0 +1,196 @@
+"""Trajectories: files of every kind, the clock, gaps, interpolation, lever arm; every refusal in one line."""
+
+import numpy as np
+import pytest
+
+from wavebatch.errors import InputError
+from wavebatch.io.trajectoryfile import SBET_RECORD, read_trajectory
+from wavebatch.trajectory import ADJUSTED, WEEK, Trajectory, apply_lever_arm, solve_offset
+
+
+def flight(rate=20.0, seconds=20.0, start=300_000_000.0):
+    """Times and positions of a banked turn of 60 m/s, 2 m/s2."""
+    time = start + np.arange(0.0, seconds, 1.0 / rate)
+    turn = 0.03 * (time - start)
+    xyz = np.stack([5e5 + 2000 * np.sin(turn), 5.4e6 + 2000 * np.cos(turn), 1000 + 3 * np.sin(turn * 5)], axis=1)
+    return time, xyz
+
+
+@pytest.mark.parametrize(("rate", "limit"), [(200.0, 1e-5), (20.0, 1e-5), (1.0, 0.01)])
+def test_interpolation(rate, limit):
+    path = Trajectory.build(*flight(rate))
+    time, xyz = flight(997.0, 18.0, 300_000_000.0)
+    inside = (time > path.time[2]) & (time < path.time[-3])
+    assert np.abs(path.at(time[inside]) - xyz[inside]).max() < limit
+    given = path.at(path.time)
+    assert given == pytest.approx(path.xyz, abs=1e-9)
+
+
+def test_nothing_is_said_outside_and_in_gaps():
+    time, xyz = flight()
+    keep = (time < 300_000_005.0) | (time > 300_000_009.0)
+    path = Trajectory.build(time[keep], xyz[keep])
+    asked = 300_000_000.0 + np.array([-0.1, 2.0, 7.0, 12.0, 30.0])
+    assert np.isfinite(path.at(asked)[:, 0]).tolist() == [False, True, False, True, False]
+    (a, b), (c, d) = path.gaps(300_000_001.0, 300_000_030.0)
+    assert (a, c, d) == pytest.approx((300_000_004.95, 300_000_019.95, 300_000_030.0))
+    assert b == pytest.approx(300_000_009.0, abs=0.051)
+    assert path.share_known(300_000_001.0, 300_000_004.0) == 1.0
+    assert path.share_known(300_000_005.0, 300_000_009.0) == pytest.approx(0.0, abs=0.02)
+
+
+def test_order_and_doubles_do_not_matter():
+    time, xyz = flight()
+    mixed = np.random.default_rng(1).permutation(np.r_[np.arange(len(time)), 5, 6])
+    one, other = Trajectory.build(time, xyz), Trajectory.build(time[mixed], xyz[mixed])
+    np.testing.assert_array_equal(one.xyz, other.xyz)
+    np.testing.assert_array_equal(one.velocity, other.velocity)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_too_few_positions(number):
+    with pytest.raises(InputError, match="at least two are needed"):
+        Trajectory.build(np.arange(number), np.zeros((number, 3)))
+    with pytest.raises(InputError, match="at least two are needed"):
+        Trajectory.build(np.array([1.0, np.nan]), np.zeros((2, 3)))
+
+
+ADJUSTED_START = 300_000_000.0
+WEEK_START = (ADJUSTED_START + ADJUSTED) % WEEK
+
+
+@pytest.mark.parametrize(
+    ("own", "strip", "clocks"),
+    [
+        (ADJUSTED_START, ADJUSTED_START, "the same clock"),
+        (ADJUSTED_START + ADJUSTED, ADJUSTED_START, "standard to adjusted"),
+        (ADJUSTED_START, ADJUSTED_START + ADJUSTED, "adjusted to standard"),
+        (WEEK_START, ADJUSTED_START, "seconds of the week to adjusted"),
+        (WEEK_START, ADJUSTED_START + ADJUSTED, "seconds of the week to standard"),
+        (ADJUSTED_START, WEEK_START, "GPS time to seconds of the week"),
+        (ADJUSTED_START + ADJUSTED, WEEK_START, "GPS time to seconds of the week"),
+    ],
+)
+def test_the_clock_is_solved_from_the_data(own, strip, clocks):
+    path = Trajectory.build(*flight(start=own))
+    offset, said = solve_offset(path, strip + 2.0, strip + 12.0)
+    assert clocks in said
+    assert own + offset == pytest.approx(strip, abs=1e-3)
+
+
+def test_a_trajectory_of_another_day_is_refused():
+    path = Trajectory.build(*flight())
+    with pytest.raises(InputError, match="do not overlap on any clock"):
+        solve_offset(path, 300_086_400.0, 300_086_500.0)
+
+
+def test_lever_arm():
+    level = np.zeros((1, 3))
+    xyz = np.array([[10.0, 20.0, 30.0]])
+    arm = (1.0, 2.0, 3.0)
+    assert apply_lever_arm(xyz, level, arm)[0] == pytest.approx([12.0, 21.0, 27.0])
+    east = np.array([[0.0, 0.0, np.pi / 2]])
+    assert apply_lever_arm(xyz, east, arm)[0] == pytest.approx([11.0, 18.0, 27.0])
+    nose_up = np.array([[0.0, np.pi / 2, 0.0]])
+    assert apply_lever_arm(xyz, nose_up, (1.0, 0.0, 0.0))[0] == pytest.approx([10.0, 20.0, 31.0])
+    right_wing_down = np.array([[np.pi / 2, 0.0, 0.0]])
+    assert apply_lever_arm(xyz, right_wing_down, (0.0, 1.0, 0.0))[0] == pytest.approx([10.0, 20.0, 29.0])
+
+
+def write_text(path, head, mark, order, time, xyz, extra=()):
+    columns = {"t": time, "x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **dict(extra)}
+    rows = np.stack([columns[name] for name in order], axis=1)
+    path.write_text(head + "\n" + "\n".join(mark.join(f"{value:.6f}" for value in row) for row in rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("head", "mark", "order"),
+    [
+        ("time,x,y,z", ",", "txyz"),
+        ("GPSTime[s];Easting[m];Northing[m];Altitude[m]", ";", "txyz"),
+        ("# made by someone\n#gps_time x y z", " ", "txyz"),
+        ("z\ty\tx\tGPS Time (s)", "\t", "zyxt"),
+        ('"H (m)","N (m)","E (m)","sow"\n(m),(m),(m),(s)', ",", "zyxt"),
+        ("time,status,x,y,z", ",", "tzxyz"),
+    ],
+)
+def test_text_with_headers(tmp_path, head, mark, order):
+    time, xyz = flight(seconds=3.0)
+    found = read_trajectory(write_text(tmp_path / "t.txt", head, mark, order, time, xyz))
+    np.testing.assert_allclose(found.time, time, atol=1e-6)
+    np.testing.assert_allclose(found.xyz, xyz, atol=1e-6)
+
+
+def test_text_with_a_lever_arm(tmp_path):
+    time, xyz = flight(seconds=3.0)
+    turned = {"r": np.zeros(len(time)), "p": np.zeros(len(time)), "h": np.full(len(time), 90.0)}
+    path = write_text(tmp_path / "t.csv", "time,x,y,z,roll,pitch,heading", ",", "txyzrph", time, xyz, turned.items())
+    found = read_trajectory(path, lever_arm=(2.0, 0.0, 0.0))
+    np.testing.assert_allclose(found.xyz, xyz + [2.0, 0.0, 0.0], atol=1e-6)
+    with pytest.raises(InputError, match="has no roll, pitch, heading"):
+        read_trajectory(write_text(tmp_path / "u.csv", "time,x,y,z", ",", "txyz", time, xyz), lever_arm=(1, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2,3,4\n5,6,7,8\n", "no line names the columns"),
+        ("time,x,y\n1,2,3\n", "no line names the columns"),
+        ("time,x,y,z\nonly,words,here,now\n", "no line of numbers follows the header in line 1"),
+        ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
+        ("\n\n", "neither text nor SBET"),
+        ("\0\1\2", "neither text nor SBET"),
+        ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees and the strip does not say its CRS"),
+    ],
+)
+def test_refusals_are_one_line(tmp_path, text, message):
+    path = tmp_path / "t.txt"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_trajectory(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(InputError, match="No such file"):
+        read_trajectory(tmp_path / "none.txt")
+
+
+def write_sbet(path, latitude=48.0, number=400):
+    records = np.zeros(number, SBET_RECORD)
+    records["time"] = 259_200.0 + 0.005 * np.arange(number)
+    records["latitude"] = np.radians(latitude) + 1e-7 * np.arange(number)
+    records["longitude"] = np.radians(11.0)
+    records["height"] = 1500.0
+    records.tofile(path)
+    return path
+
+
+def test_sbet_without_pyproj_or_crs_is_refused(tmp_path, monkeypatch):
+    path = write_sbet(tmp_path / "s.sbet")
+    with pytest.raises(InputError, match="does not say its CRS"):
+        read_trajectory(path)
+    monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
+    with pytest.raises(InputError, match=r"pip install 'wavebatch\[crs\]'"):
+        read_trajectory(path, crs="EPSG:32632")
+
+
+def test_bytes_that_are_no_sbet(tmp_path):
+    path = tmp_path / "s.out"
+    np.random.default_rng(1).normal(0, 1e6, 17 * 50).astype("<f8").tofile(path)
+    with pytest.raises(InputError, match="not an SBET"):
+        read_trajectory(path, crs="EPSG:32632")
+
+
+def test_sbet_is_projected(tmp_path):
+    pytest.importorskip("pyproj")
+    found = read_trajectory(write_sbet(tmp_path / "s.sbet"), crs="EPSG:32632")
+    # UTM zone 32: 11 E, 48 N by Snyder's series.
+    assert found.xyz[0] == pytest.approx([649_168.5, 5_318_366.0, 1500.0], abs=200.0)
+    assert found.velocity[200, 1] == pytest.approx(127.0, abs=2.0)
+    with pytest.raises(InputError, match="needs metres"):
+        read_trajectory(tmp_path / "s.sbet", crs="EPSG:4326")
+    with pytest.raises(InputError, match="CRS is not understood"):
+        read_trajectory(tmp_path / "s.sbet", crs="nonsense")

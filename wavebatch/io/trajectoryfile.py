@@ -1,0 +1,155 @@
+"""Trajectory files: text with named columns, and SBET, into the coordinates of the strip."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.errors import InputError
+from wavebatch.trajectory import Trajectory, apply_lever_arm
+
+SBET_RECORD = np.dtype([(name, "<f8") for name in (
+    "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",
+    "wander", "x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate")])  # fmt: skip
+
+MOST_RECORDS = 400_000
+"""Positions of an SBET that are kept: 5 hours at 20 Hz."""
+
+MOST_TEXT = 1 << 30
+"""Bytes of a text file."""
+
+COLUMN_NAMES: dict[str, tuple[str, ...]] = {
+    "time": ("time", "gpstime", "gps", "t", "sow", "gpsseconds", "gpssow", "secondsofweek", "weekseconds", "timestamp"),
+    "x": ("x", "easting", "east", "e", "utmeasting", "projx"),
+    "y": ("y", "northing", "north", "n", "utmnorthing", "projy"),
+    "z": ("z", "height", "altitude", "alt", "h", "elevation", "ellipsoidalheight", "ellheight", "hell", "up"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "long", "lng"),
+    "roll": ("roll",),
+    "pitch": ("pitch",),
+    "heading": ("heading", "yaw", "azimuth"),
+}
+"""Names of columns in text files, without case, blanks, units and punctuation."""
+
+_ATTITUDE = ("roll", "pitch", "heading")
+
+
+def read_trajectory(
+    path: Path | str, *, crs: str | None = None, lever_arm: tuple[float, float, float] | None = None
+) -> Trajectory:
+    """The positions of a file, in its own clock and the strip's coordinates.
+
+    crs: of the strip, as WKT or an EPSG code; needed where the file has degrees. lever_arm: from the file's position to
+    the scanner, forward, right, down [m]; needs roll, pitch and heading. Raises InputError in one line.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with open(path, "rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise InputError(f"{path}: trajectory cannot be read: {error.strerror or error}") from error
+    if size and size % SBET_RECORD.itemsize == 0 and b"\0" in head:
+        columns = _read_sbet(path, size)
+    elif b"\0" in head or not head.strip():
+        raise InputError(f"{path}: trajectory is neither text nor SBET (records of {SBET_RECORD.itemsize} bytes)")
+    else:
+        columns = _read_text(path, size)
+    xyz = _project(path, columns, crs)
+    if lever_arm is not None:
+        missing = [name for name in _ATTITUDE if name not in columns]
+        if missing:
+            raise InputError(f"{path}: a lever arm needs {', '.join(_ATTITUDE)}; the file has no {', '.join(missing)}")
+        xyz = apply_lever_arm(xyz, np.stack([columns[name] for name in _ATTITUDE], axis=1), lever_arm)
+    try:
+        return Trajectory.build(columns["time"], xyz)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
+    records = np.memmap(path, SBET_RECORD, "r")
+    step = max(1, -(-len(records) // MOST_RECORDS))
+    some = np.array(records[::step])
+    columns = {name: some[name] for name in ("time", "latitude", "longitude", "height", *_ATTITUDE)}
+    columns["z"] = columns.pop("height")
+    inside = (np.abs(some["latitude"]) <= np.pi / 2) & (np.abs(some["longitude"]) <= 2 * np.pi)
+    if not (inside & np.isfinite(some["time"])).mean() > 0.99:
+        raise InputError(f"{path}: not an SBET: its latitudes and longitudes are no radians; give text with headers")
+    # The platform's heading is counted from the wander frame, whose north the wander angle turns.
+    columns["heading"] = some["heading"] - some["wander"]
+    columns["latitude"], columns["longitude"] = np.degrees(some["latitude"]), np.degrees(some["longitude"])
+    return columns
+
+
+def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:
+    if size > MOST_TEXT:
+        raise InputError(f"{path}: trajectory of {size / 1e9:.1f} GB of text; thin it to 20 positions a second")
+    lines = path.read_text("utf-8", "replace").splitlines()
+    place, names = _find_header(path, lines)
+    body = (_split(line) for line in lines[place + 1 :])
+    rows = [row for row in (_numbers(fields, len(names)) for fields in body) if row is not None]
+    if not rows:
+        raise InputError(f"{path}: no line of numbers follows the header in line {place + 1}")
+    table = np.array(rows)
+    columns = {name: table[:, i] for i, name in enumerate(names) if name}
+    return {name: np.radians(values) if name in _ATTITUDE else values for name, values in columns.items()}
+
+
+def _split(line: str) -> list[str]:
+    text = line.strip().lstrip("#").strip()
+    for mark in ("\t", ";", ","):
+        if mark in text:
+            return [field.strip() for field in text.split(mark)]
+    return text.split()
+
+
+def _numbers(fields: list[str], number: int) -> list[float] | None:
+    try:
+        return [float(field) if field else np.nan for field in fields[:number]] if len(fields) >= number else None
+    except ValueError:
+        return None
+
+
+def _find_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
+    """Number of the header line, and the meaning of each of its columns, empty where there is none."""
+    for place, line in enumerate(lines[:200]):
+        names = [_meaning(field) for field in _split(line)]
+        if "time" in names and ({"x", "y", "z"} <= set(names) or {"latitude", "longitude", "z"} <= set(names)):
+            return place, [name if name not in names[:i] else "" for i, name in enumerate(names)]
+    raise InputError(
+        f"{path}: no line names the columns of the trajectory; the first line must hold time, x, y, z "
+        "(or time, latitude, longitude, height)"
+    )
+
+
+def _meaning(field: str) -> str:
+    bare = re.sub(r"[\[(].*?[\])]", "", field.strip().strip('"').lower())
+    bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
+    return next((name for name, known in COLUMN_NAMES.items() if bare in known), "")
+
+
+def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.ndarray:
+    """Coordinates (n, 3) as the strip has them."""
+    if "x" in columns:
+        return np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
+    if crs is None:
+        raise InputError(f"{path}: the trajectory is in degrees and the strip does not say its CRS; give one in metres")
+    try:
+        import pyproj
+    except ImportError as error:
+        raise InputError(
+            f"{path}: the trajectory is in degrees: pip install 'wavebatch[crs]' (pyproj), or give x, y, z in the "
+            "strip's CRS"
+        ) from error
+    try:
+        target = pyproj.CRS.from_user_input(crs)
+        if target.is_geographic:
+            raise InputError(f"{path}: the strip's coordinates are degrees; wavebatch needs metres: project the strip")
+        transformer = pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True)
+        placed = transformer.transform(columns["longitude"], columns["latitude"], columns["z"])
+    except pyproj.exceptions.ProjError as error:
+        raise InputError(f"{path}: the strip's CRS is not understood ({error}); give x, y, z") from error
+    return np.stack([np.asarray(values, np.float64) for values in placed], axis=1)
