@@ -160,17 +160,19 @@ def _decompose(
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
     ref = system.sigma_ref / block.spacing
     candidates, tail = _explain_tails(candidates, noise, settings)
-    signal = transpose_samples(block.samples)
-    signal -= noise.baseline
+    present, row = np.unique(candidates.waveform, return_inverse=True)
+    signal = transpose_samples(block.samples[present])
+    signal -= noise.baseline[present]
     clusters = cluster_candidates(
-        candidates,
+        candidates._replace(waveform=row),
         smooth_121(signal),
-        noise.std,
+        noise.std[present],
         margin=int(np.ceil(MARGIN * ref)),
         reach=int(np.ceil(REACH * ref)),
         most=most,
         tail=tail,
     )
+    clusters = clusters._replace(waveform=present[clusters.waveform])
     del signal
     solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
     return _table(block, noise, system, clusters, list(solutions), settings, significance)
