@@ -177,3 +177,31 @@ def walk_down(waveform, sample, level, step):
             return here + step * (waveform[here] - level) / (waveform[here] - waveform[here + step])
         here += step
     return here
+
+
+def square_differences(waveform, reference):
+    """ASDF of one waveform and one reference by its definition, for every lag at which they touch."""
+    n, m = len(reference), len(waveform)
+    around = np.concatenate([np.zeros(n - 1), waveform, np.zeros(n - 1)])
+    return np.array([np.sum((reference - around[lag : lag + n]) ** 2) for lag in range(m + n - 1)])
+
+
+def find_minima(values):
+    """Rows of one function at which it is below the value before and not above the one behind."""
+    return [i for i in range(1, len(values) - 1) if values[i] < values[i - 1] and values[i] <= values[i + 1]]
+
+
+def keep_prominent(values, minima, least):
+    """Minima of one function after the least prominent one has been removed again and again while it is below least."""
+    minima = list(minima)
+    while minima:
+        borders = [0, *minima, len(values) - 1]
+        prominence = [
+            min(max(values[borders[j] : row + 1]), max(values[row : borders[j + 2] + 1])) - values[row]
+            for j, row in enumerate(minima)
+        ]
+        lowest = int(np.argmin(prominence))
+        if prominence[lowest] >= least:
+            break
+        del minima[lowest]
+    return minima
