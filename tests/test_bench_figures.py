@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.bench.figures import Figure, median_range, root_mean_square, share
+from wavebatch.bench.figures import SURVEY_SCATTER, Figure, median_range, root_mean_square, share
 from wavebatch.bench.pareto import choose_cheapest, find_front, parse_length
 from wavebatch.bench.promises import format_promises, judge
 from wavebatch.bench.truth import describe_truth, effective_noise, find_bounds
@@ -57,8 +57,9 @@ def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):
     assert scatter < 1.07 * stated and stated < 1.6 * scatter
     assert np.mean([figure.value for figure in drawn]) == pytest.approx(3, rel=0.01)
     assert root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == Figure(0.0, 0.0)
-    steady = root_mean_square(np.ones(100), np.arange(100), np.zeros(100, int), worst=10.0)
-    assert steady.value == 1 and steady.error == pytest.approx(np.sqrt(2) - 1)  # one of 100 may be off by 10
+    steady = root_mean_square(np.ones(100), np.arange(100), np.arange(100) % 8, worst=10.0)
+    one_off_by_ten, surveys = np.sqrt(2) - 1, np.sqrt(2 / 8) * SURVEY_SCATTER
+    assert steady.value == 1 and steady.error == pytest.approx(np.hypot(one_off_by_ten, surveys))
     assert np.isnan(root_mean_square(np.ones(1), np.zeros(1, int), np.zeros(1, int)).value)
 
 

@@ -25,7 +25,6 @@ from wavebatch.chain import Chain
 from wavebatch.config import load_chain, load_profile
 from wavebatch.errors import ConfigError
 from wavebatch.simulate import Scene, simulate_blocks
-from wavebatch.simulate.blocks import SEED_BLOCK
 from wavebatch.survey import Survey
 from wavebatch.work import BLOCK_SAMPLES
 
@@ -36,6 +35,9 @@ PROFILES = ("fast", "balanced", "accurate")
 
 PEER_GROUPS = 6
 """Groups that peers get a part of: they are slow."""
+
+STABILITY_SURVEY = 3072
+"""Waveforms that each survey of the stability section sees: every receiver is surveyed several times."""
 
 Progress = Callable[[str], None]
 
@@ -97,7 +99,7 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
         document["stability"] = measure_stability(
             lambda survey: choose_chains(chains, survey),
             options.stability_waveforms,
-            min(SEED_BLOCK // 2, options.waveforms),
+            min(STABILITY_SURVEY, options.waveforms),
             options.seed,
             cases=cases,
             progress=progress,

@@ -23,7 +23,7 @@ from wavebatch.words import nearest
 AUTO = "auto"
 """Name of the chain that a survey chooses."""
 
-GROUPS = 6
+GROUPS = 5
 """Groups of every case, each with a survey of its own of an ordinary scene with the same receiver."""
 
 NARROWEST = 0.7
