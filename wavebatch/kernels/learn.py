@@ -17,6 +17,9 @@ MOST_COMPONENTS = 5
 GAIN = 0.10
 """Share by which the residual must fall for one more component."""
 
+TRIAL_EVALUATIONS = 25
+"""Evaluations after which the starts of one more component are compared."""
+
 LEAST_BIN = 5
 """Samples that a bin of the stack needs."""
 
@@ -117,7 +120,8 @@ def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
 
 
-def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200) -> np.ndarray:
+    """The sum of Gaussians fitted from a start, in at most `most` evaluations."""
     width = abs(start[2])
     low = np.tile([-1.0, stack.lag[0], 0.35 * width], len(start) // 3)
     high = np.tile([2.0, stack.lag[-1], 12.0 * width], len(start) // 3)
@@ -126,20 +130,20 @@ def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray) -> np.ndarray:
         np.clip(start, low, high),
         jac=lambda p: _slopes(p, stack.lag) * weight[:, None],
         bounds=(low, high),
-        max_nfev=200,
+        max_nfev=most,
     )
     return result.x
 
 
 def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """The best of several starts with one more Gaussian, refined."""
+    """The best of several starts with one more Gaussian, on its way to where it will settle."""
     width = parameters[2]
     best, best_cost = parameters, np.inf
     smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
     for place in {int(np.argmax(smooth)), int(np.argmin(smooth))}:
         for factor in (0.7, 1.5, 4.0):
             start = np.r_[parameters, smooth[place], stack.lag[place], factor * width]
-            tried = _refine(stack, weight, start)
+            tried = _refine(stack, weight, start, TRIAL_EVALUATIONS)
             cost = float(np.sum(((_sum(tried, stack.lag) - stack.value) * weight) ** 2))
             if cost < best_cost:
                 best, best_cost = tried, cost
