@@ -84,6 +84,9 @@ COLUMNS: dict[str, Column] = _columns(
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
     Column("echo_width_err", "f4", "ns", "one standard deviation of echo_width, from the fit"),
     Column("incidence_angle_err", "f4", "deg", "one standard deviation of incidence_angle"),
+    Column("cross_section_err", "f4", "m2", "one standard deviation of cross_section"),
+    Column("backscatter_coefficient_err", "f4", "-", "one standard deviation of gamma"),
+    Column("reflectance_err", "f4", "-", "one standard deviation of reflectance"),
     Column("pulse_deviation", "f4", "-", "Gauss-Hermite deviation from the system pulse, sqrt(h3^2 + h4^2)"),
     Column("echo_flags", "u2", "bits", "see the table of flags", no_data=None),
     Column("x", "f8", "m", "easting of the echo", extra_bytes=False),
@@ -247,9 +250,19 @@ class SystemPulse:
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
     saturation: float | None = None
-    """Count at which the digitizer clips; None when nothing clips."""
+    """Count at which the survey saw samples clipped; None: only the digitizer's largest count is."""
     acceptance: float = 15.0
     """Least fall of chi2 for which an echo is added."""
+    divergence: float | None = None
+    """Full angle of the beam between the 1/e^2 points [mrad]; None where nobody knows it."""
+    calibration: float | None = None
+    """C' of kernels/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
+    calibration_err: float = 0.0
+    """Standard deviation of the calibration, relative."""
+    attenuation: float = 0.22
+    """Of the light on its way through the air, one way [dB/km]."""
+    sensor_error: float = 0.0
+    """Standard deviation of the distance to the sensor's position [m]."""
 
     def __post_init__(self) -> None:
         if not self.sigma_ref > 0:
