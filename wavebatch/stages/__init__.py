@@ -1,5 +1,21 @@
 """The algorithms, each a plain function; importing this package fills `wavebatch.chain.STAGES`."""
 
-from wavebatch.stages import attributes, decompose, detect, detect_correlation, detect_edges, noise
+from wavebatch.stages import (
+    attributes,
+    decompose,
+    detect,
+    detect_correlation,
+    detect_edges,
+    noise,
+    physics,
+)
 
-__all__ = ["attributes", "decompose", "detect", "detect_correlation", "detect_edges", "noise"]
+__all__ = [
+    "attributes",
+    "decompose",
+    "detect",
+    "detect_correlation",
+    "detect_edges",
+    "noise",
+    "physics",
+]

@@ -1,0 +1,184 @@
+"""Range, backscatter, reflectance and angle of echoes: recovered, with errors that hold; no-data, never zeros."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wavebatch import stages  # noqa: F401 - registers them
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import STAGES
+from wavebatch.kernels.bounds import crlb
+from wavebatch.kernels.incidence import spread_of_angle
+from wavebatch.units import HALF_C
+
+SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
+NAMES = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+COLUMNS = [name for stage in NAMES for name in STAGES[f"attribute.{stage}"].makes]
+
+
+def run(block, echoes, system, *names, **parameters):
+    noise = Noise(np.full(len(block), 12, np.float32), np.ones(len(block), np.float32))
+    for name in names:
+        echoes = STAGES[f"attribute.{name}"].function(block, noise, system, echoes, **parameters.get(name, {}))
+    return echoes
+
+
+def make(degrees, snr=100.0, height=640.0, per_waveform=1, seed=1):
+    """Block and fitted echoes on planes that the ray strikes at `degrees` (n,), with errors at the bound."""
+    rng = np.random.default_rng(seed)
+    n = len(degrees)
+    sigma = np.hypot(SYSTEM.sigma_ref, spread_of_angle(np.radians(degrees), height, 1e-3 * SYSTEM.divergence))
+    amplitude = np.full(n, snr) * np.cos(np.radians(degrees)) * SYSTEM.sigma_ref / sigma
+    errors = crlb(amplitude, sigma, 1.0, 1.0)
+    block = WaveformBlock.from_samples(np.zeros((n // per_waveform, 8), np.uint8))
+    sensor = np.array([5e5, 5.4e6, 120.0]) + rng.uniform(-100, 100, (len(block), 3)) * [1, 1, 0] + [0, 0, height]
+    block = replace(block, sensor=sensor)
+    draw = rng.multivariate_normal(np.zeros(2), [[1, -1 / np.sqrt(3)], [-1 / np.sqrt(3), 1]], n).T
+    waveform = np.arange(n) // per_waveform
+    echoes = EchoTable.build(
+        waveform, np.arange(n) % per_waveform * 20.0, amplitude + errors[1] * draw[0], sigma + errors[2] * draw[1],
+        time_err=errors[0], amplitude_err=errors[1], sigma_err=errors[2],
+    )  # fmt: skip
+    xyz = sensor[waveform] - [0, 0, height]
+    echoes = echoes.with_attributes(x=xyz[:, 0], y=xyz[:, 1], z=xyz[:, 2], range_err=(errors[0] * HALF_C).astype("f4"))
+    return block, echoes, amplitude * sigma
+
+
+def test_backscatter_and_range():
+    block, echoes, energy = make(np.full(4000, 20.0))
+    done = run(block, echoes, SYSTEM, "range", "backscatter_coefficient", "cross_section").attributes
+    assert done["range"] == pytest.approx(640.0, abs=1e-4)
+    gamma = 2.6e-8 * 640.0**2 * energy / 10 ** (-2 * 640 * 0.22 / 10_000)
+    off = done["backscatter_coefficient"] - gamma
+    assert np.median(np.abs(off) / gamma) < 0.03
+    assert np.mean(np.abs(off) < done["backscatter_coefficient_err"]) == pytest.approx(0.683, abs=0.03)
+    section = gamma * np.pi / 4 * (1.1e-3 * 640) ** 2
+    assert np.median(done["cross_section"] / section) == pytest.approx(1.0, abs=0.003)
+
+
+def test_a_wrong_position_is_in_the_error():
+    block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
+    done = run(block, echoes, replace(SYSTEM, sensor_error=6.4, attenuation=0.0), "backscatter_coefficient", "cross_section").attributes
+    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.04, rel=0.01)
+    assert done["backscatter_coefficient_err"] / done["backscatter_coefficient"] == pytest.approx(0.02, rel=0.02)
+    calibrated = replace(SYSTEM, attenuation=0.0, calibration_err=0.03)
+    done = run(block, echoes, calibrated, "cross_section").attributes
+    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.03, rel=0.01)
+
+
+@pytest.mark.parametrize(("surface", "factor"), [("level", 1.0), ("facing", 1.0), ("echo", 1.0 / np.cos(np.pi / 6))])
+def test_reflectance(surface, factor):
+    block, echoes, energy = make(np.full(500, 30.0), snr=3000.0)
+    done = run(block, echoes, SYSTEM, "incidence_angle", "backscatter_coefficient", "reflectance",
+               reflectance={"surface": surface}).attributes  # fmt: skip
+    assert np.median(done["reflectance"] / done["backscatter_coefficient"]) * 4 == pytest.approx(factor, rel=0.002)
+    assert (done["reflectance_err"] > 0).all()
+
+
+def test_level_ground_is_struck_at_the_angle_of_the_ray():
+    block, echoes, _ = make(np.full(4, 30.0))
+    slanted = np.tile([0.0, np.sin(np.pi / 3), -np.cos(np.pi / 3)], (4, 1)) * HALF_C
+    done = run(replace(block, direction=slanted), echoes, SYSTEM, "backscatter_coefficient", "reflectance").attributes
+    assert done["reflectance"] == pytest.approx(done["backscatter_coefficient"] / 2, rel=1e-5)
+
+
+def test_only_echoes_alone_have_a_reflectance_and_an_angle():
+    block, echoes, _ = make(np.full(40, 30.0), per_waveform=2)
+    done = run(block, echoes, SYSTEM, *NAMES).attributes
+    assert np.isnan(done["reflectance"]).all() and np.isnan(done["reflectance_err"]).all()
+    assert np.isnan(done["incidence_angle"]).all()
+    assert np.isfinite(done["cross_section"]).all()
+    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"alone": False}).attributes
+    assert np.isfinite(done["incidence_angle"]).all()
+
+
+@pytest.mark.parametrize(
+    ("system", "known"),
+    [
+        (replace(SYSTEM, calibration=None), {"range", "incidence_angle", "incidence_angle_err"}),
+        (
+            replace(SYSTEM, divergence=None),
+            {"range", "backscatter_coefficient", "backscatter_coefficient_err", "reflectance", "reflectance_err"},
+        ),
+        (replace(SYSTEM, sigma_ref=0.64), set(COLUMNS) - {"incidence_angle", "incidence_angle_err"}),
+        (SYSTEM, set(COLUMNS)),
+    ],
+    ids=["no calibration", "no divergence", "pulse too short for the sampling", "everything"],
+)
+def test_what_is_not_known_is_no_data(system, known):
+    block, echoes, _ = make(np.full(50, 30.0), snr=500.0)
+    done = run(block, echoes, system, *NAMES).attributes
+    for name in COLUMNS:
+        assert done[name].dtype == np.float32
+        assert np.isfinite(done[name]).all() if name in known else np.isnan(done[name]).all(), name
+
+
+def test_without_a_sensor_nothing_is_known():
+    block, echoes, _ = make(np.full(50, 30.0))
+    for sensor in (None, np.full((50, 3), np.nan)):
+        done = run(replace(block, sensor=sensor), echoes, SYSTEM, *NAMES).attributes
+        assert all(np.isnan(done[name]).all() for name in COLUMNS)
+
+
+def test_amplitudes_that_are_guesses_say_nothing():
+    block, echoes, _ = make(np.full(3, 30.0))
+    echoes = echoes.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE | EchoFlag.SATURATED, np.array([True, False, False]))
+    done = run(block, echoes, SYSTEM, "cross_section", "reflectance").attributes
+    assert np.isnan(done["cross_section"]).tolist() == np.isnan(done["reflectance"]).tolist() == [True, False, False]
+
+
+def test_angles_of_a_village_and_their_errors():
+    rng = np.random.default_rng(5)
+    true = rng.choice([10.0, 20, 30, 40, 50, 60], 20_000)
+    block, echoes, _ = make(true, snr=100.0)
+    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"max_error": 90.0}).attributes
+    off, error = done["incidence_angle"] - true, done["incidence_angle_err"]
+    assert np.median(np.abs(off)) == pytest.approx(np.median(0.6745 * error), rel=0.2)
+    assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
+
+
+def test_an_infrared_beam_has_no_angles():
+    system = replace(SYSTEM, sigma_ref=1.7, divergence=0.4)
+    block, echoes, _ = make(np.linspace(0, 40, 500), snr=50.0)
+    narrow = replace(echoes, sigma=np.full(500, 1.7, np.float32))
+    done = run(block, narrow, system, "incidence_angle").attributes
+    assert np.isnan(done["incidence_angle"]).all() and np.isnan(done["incidence_angle_err"]).all()
+
+
+def test_modes_agree_where_they_should():
+    block, echoes, _ = make(np.full(400, 45.0), snr=2000.0)
+    angle = {
+        mode: np.median(run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"mode": mode})
+                        .attributes["incidence_angle"])
+        for mode in ("system", "pulse", "paper")
+    }  # fmt: skip
+    assert angle["system"] == pytest.approx(45.0, abs=0.2)
+    assert angle["pulse"] == pytest.approx(45.0, abs=3.0)
+    assert angle["paper"] > 60.0
+
+
+def test_a_learned_pulse_has_its_own_width():
+    components = ((1.0, 0.0, 1.2), (0.2, 2.5, 1.8))
+    from wavebatch.stages.shapes import describe_echoes, pulse_shape, shape_limits
+
+    system = replace(SYSTEM, components=components)
+    shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
+    block, echoes, _ = make(np.full(50, 40.0), snr=1000.0)
+    wide = np.hypot(1.2, spread_of_angle(np.radians(40.0), 640.0, 1.1e-3))
+    whole, _ = describe_echoes(shape, limits, np.tile([100.0, 20.0, wide], (50, 1)), np.ones((50, 3)))
+    echoes = replace(echoes, sigma=whole[:, 2].astype(np.float32), sigma_err=np.full(50, 0.01, np.float32))
+    done = run(block, echoes, system, "incidence_angle").attributes
+    assert done["incidence_angle"] == pytest.approx(40.0, abs=0.3)
+
+
+def test_blocks_cut_anywhere_give_the_same_bits():
+    block, echoes, _ = make(np.linspace(0, 70, 301))
+    whole = run(block, echoes, SYSTEM, *NAMES).attributes
+    for start, stop in [(0, 1), (1, 8), (8, 301)]:
+        rows = np.arange(start, stop)
+        part = echoes.take(rows)
+        part = replace(part, waveform=(part.waveform - start).astype(np.int32))
+        done = run(block.rows(slice(start, stop)), part, SYSTEM, *NAMES).attributes
+        for name in COLUMNS:
+            np.testing.assert_array_equal(done[name], whole[name][rows])
