@@ -14,7 +14,7 @@ RANKS = [
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
     {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
-     "returns"},
+     "returns", "slices"},
     {"auto", "trial", "choice"},
     {"work"},
     {"record"},

@@ -1,0 +1,208 @@
+"""Straight lines in a slice of intensities: weighted Hough transform, refined by weighted total least squares
+(ALGORITHMS.md 1.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+THETA_STEP = 0.5
+"""Step of the accumulator [deg]; that of rho is one pixel."""
+BAND = 3.0
+"""Half width of the band around a line whose pixels are the line's, in sigma of the pulse."""
+CROWD = 1.4
+"""Largest spread of a line's pixels about it, in sigma: a pulse's is 1, that of noise within the band 1.73."""
+ROUNDS = 5
+_FAILURES = 5
+_CHUNK = 16_384
+
+
+@dataclass(frozen=True, slots=True)
+class HoughLine:
+    """A segment of the line x cos(theta) + y sin(theta) = rho, in pixels."""
+
+    theta: float
+    """[deg], in [-90, 90)."""
+    rho: float
+    start: tuple[float, float]
+    """End of the segment with the smaller x (of a vertical one, the smaller y)."""
+    end: tuple[float, float]
+    weight: float
+    """Sum of the intensities of its pixels."""
+    rows: np.ndarray
+    """Its pixels: indices into what was given, i8 (k,), ascending."""
+
+    @property
+    def length(self) -> float:
+        """Distance of the ends [pixels]."""
+        return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
+
+
+def find_lines(
+    x: np.ndarray,
+    y: np.ndarray,
+    weight: np.ndarray,
+    *,
+    sigma: float,
+    gap: float = 10.0,
+    shortest: float = 20.0,
+    most: int = 20,
+) -> list[HoughLine]:
+    """Segments among pixels at x, y (n,) [pixels] with intensities `weight` (n,) > 0, the strongest first.
+
+    sigma: standard deviation of the pulse [pixels]. A line is the largest sum in the accumulator of intensities,
+    refined by weighted total least squares of the pixels within BAND sigma; a segment is its longest run without a gap
+    of more than `gap`, at least `shortest` long, whose pixels crowd about it. Its pixels are taken off, and so on until
+    `most` are found or the largest sums belong to no segment. Coordinates may be fractions of pixels.
+    """
+    if len(x) < 2:
+        return []
+    centre = np.array([x.mean(), y.mean()])
+    points = np.stack([x, y], axis=1) - centre
+    sheet = _Accumulator(points)
+    sheet.vote(np.arange(len(x)), weight)
+    left = np.ones(len(x), bool)
+    lines: list[HoughLine] = []
+    failures = 0
+    while len(lines) < most and failures < _FAILURES:
+        rows = np.flatnonzero(left)
+        start = sheet.strongest()
+        if start is None or len(rows) < 2:
+            break
+        found, used = _settle(points, weight, rows, start, BAND * sigma, gap, shortest)
+        if found is None:
+            failures += 1
+        else:
+            lines.append(_describe(found, centre, weight))
+        if not len(used):
+            break
+        left[used] = False
+        sheet.vote(used, -weight[used])
+    return lines
+
+
+class _Accumulator:
+    """Sums of intensities over theta and rho; votes are split linearly between the two nearest rho."""
+
+    def __init__(self, points: np.ndarray) -> None:
+        self._points = points
+        self._angles = np.radians(np.arange(-90.0, 90.0, THETA_STEP))
+        self._reach = int(np.ceil(np.hypot(*np.abs(points).max(axis=0)))) + 1
+        self._width = 2 * self._reach + 2
+        self._sums = np.zeros((len(self._angles), self._width))
+        self._whole = 0.0
+
+    def vote(self, rows: np.ndarray, weight: np.ndarray) -> None:
+        """Adds the intensities (negative ones take votes back) of pixels `rows`."""
+        self._whole += float(weight.sum())
+        for begin in range(0, len(rows), _CHUNK):
+            x, y = self._points[rows[begin : begin + _CHUNK]].T
+            part = weight[begin : begin + _CHUNK]
+            for number, angle in enumerate(self._angles):
+                rho = x * np.cos(angle) + y * np.sin(angle) + self._reach
+                bin_ = rho.astype(np.int64)
+                above = (rho - bin_) * part
+                low = int(bin_.min())
+                bin_ -= low
+                sums = np.bincount(bin_, part - above)
+                self._sums[number, low : low + len(sums)] += sums
+                self._sums[number, low + 1 : low + 1 + len(sums)] += np.bincount(bin_, above)
+
+    def strongest(self) -> tuple[float, float] | None:
+        """Angle [rad] and rho of the largest sum; None when nothing is left."""
+        if self._whole <= 0:
+            return None
+        number, bin_ = np.unravel_index(int(np.argmax(self._sums)), self._sums.shape)
+        return float(self._angles[number]), float(bin_) - self._reach
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """A refined segment, in centred pixels."""
+
+    middle: np.ndarray
+    along: np.ndarray
+    ends: tuple[float, float]
+    rows: np.ndarray
+
+
+def _settle(
+    points: np.ndarray,
+    weight: np.ndarray,
+    rows: np.ndarray,
+    start: tuple[float, float],
+    band: float,
+    gap: float,
+    shortest: float,
+) -> tuple[_Run | None, np.ndarray]:
+    """The segment near the line `start`, or None, and the pixels to take off."""
+    angle, rho = start
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    middle, along = rho * normal, np.array([-normal[1], normal[0]])
+    first = tried = rows[np.abs((points[rows] - middle) @ normal) <= band]
+    ends = (0.0, 0.0)
+    for _ in range(ROUNDS):
+        inside = rows[np.abs((points[rows] - middle) @ np.array([-along[1], along[0]])) <= band]
+        inside, ends = _longest_run(inside, (points[inside] - middle) @ along, gap)
+        if len(inside) < 2:
+            return None, first
+        tried = inside
+        old = middle
+        middle, along = _fit(points[inside], weight[inside])
+        shift = float((old - middle) @ along)
+        ends = (ends[0] + shift, ends[1] + shift)
+    spread = _measure_spread(points[tried] - middle, weight[tried], along)
+    if ends[1] - ends[0] < shortest or spread > CROWD * band / BAND:
+        return None, np.union1d(first, tried)
+    return _Run(middle, along, ends, tried), tried
+
+
+def _measure_spread(apart: np.ndarray, weight: np.ndarray, along: np.ndarray) -> float:
+    """Spread of pixels about their line: the median of its quarters', so that one bright spot does not count."""
+    place, off = apart @ along, apart @ np.array([-along[1], along[0]])
+    low, high = place.min(), place.max()
+    part = np.minimum(4 * (place - low) / max(high - low, 1e-12), 3).astype(np.int64)
+    sums = np.bincount(part, weight, 4)
+    return float(np.sqrt(np.median(np.bincount(part, weight * off**2, 4)[sums > 0] / sums[sums > 0])))
+
+
+def _fit(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted centre and main axis: the line of least weighted squared distances."""
+    total = weight.sum()
+    middle = weight @ points / total
+    apart = points - middle
+    _, axes = np.linalg.eigh((apart * weight[:, None]).T @ apart)
+    along = axes[:, 1]
+    sign = along[0] if abs(along[0]) > 1e-12 else along[1]
+    return middle, along if sign > 0 else -along
+
+
+def _longest_run(rows: np.ndarray, place: np.ndarray, gap: float) -> tuple[np.ndarray, tuple[float, float]]:
+    """The rows, ascending, of the longest run of places without a larger gap, and the places of its ends."""
+    if not len(rows):
+        return rows, (0.0, 0.0)
+    order = np.argsort(place, kind="stable")
+    sorted_ = place[order]
+    breaks = np.flatnonzero(np.diff(sorted_) > gap) + 1
+    first, last = np.concatenate([[0], breaks]), np.concatenate([breaks, [len(rows)]]) - 1
+    best = int(np.argmax(sorted_[last] - sorted_[first]))
+    a, b = int(first[best]), int(last[best])
+    return np.sort(rows[order[a : b + 1]]), (float(sorted_[a]), float(sorted_[b]))
+
+
+def _describe(run: _Run, centre: np.ndarray, weight: np.ndarray) -> HoughLine:
+    middle = run.middle + centre
+    normal = np.array([-run.along[1], run.along[0]])
+    theta = np.degrees(np.arctan2(normal[1], normal[0]))
+    if not -90 <= theta < 90:
+        normal, theta = -normal, (theta + 270) % 180 - 90
+    ends = [middle + place * run.along for place in run.ends]
+    return HoughLine(
+        float(theta),
+        float(middle @ normal),
+        (float(ends[0][0]), float(ends[0][1])),
+        (float(ends[1][0]), float(ends[1][1])),
+        float(weight[run.rows].sum()),
+        run.rows,
+    )
