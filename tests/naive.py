@@ -205,3 +205,51 @@ def keep_prominent(values, minima, least):
             break
         del minima[lowest]
     return minima
+
+
+def b3_detail(waveform, level):
+    """Detail of one waveform: the taps with holes, sample by sample, the ends repeated."""
+    last = len(waveform) - 1
+    before = list(waveform)
+    for j in range(level):
+        step = 2**j
+        after = []
+        for i in range(last + 1):
+            at = [min(max(i + k * step, 0), last) for k in (-2, -1, 0, 1, 2)]
+            after.append(sum(h * before[a] for h, a in zip((1, 4, 6, 4, 1), at, strict=True)) / 16)
+        before, smooth = after, before
+    return np.array(smooth) - np.array(before)
+
+
+def pulse_matrix(s, taps):
+    """(s, s): column i is the pulse put at sample i, cut off at the ends."""
+    matrix = np.zeros((s, s))
+    for i in range(s):
+        for k, tap in enumerate(taps):
+            if 0 <= i + k - len(taps) // 2 < s:
+                matrix[i + k - len(taps) // 2, i] = tap
+    return matrix
+
+
+def richardson_lucy(waveform, taps, background, iterations):
+    """Plain Richardson-Lucy of one waveform with matrices."""
+    pulse = pulse_matrix(len(waveform), taps)
+    weight = pulse.sum(axis=0)
+    data = np.maximum(waveform + background, 0)
+    estimate = np.full(len(waveform), data.mean()) / weight
+    for _ in range(iterations):
+        estimate = estimate * (pulse.T @ (data / (pulse @ estimate + background))) / weight
+    return estimate
+
+
+def gold(waveform, taps, iterations, rounds, boost):
+    """Gold's deconvolution of one waveform with matrices."""
+    pulse = pulse_matrix(len(waveform), taps)
+    data = np.maximum(waveform, 0)
+    estimate = data
+    for number in range(rounds):
+        if number:
+            estimate = estimate.max() * (estimate / estimate.max()) ** boost
+        for _ in range(iterations):
+            estimate = estimate * (pulse.T @ data) / (pulse.T @ pulse @ estimate)
+    return estimate

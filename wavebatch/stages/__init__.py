@@ -6,6 +6,7 @@ from wavebatch.stages import (
     detect,
     detect_correlation,
     detect_edges,
+    detect_wavelet,
     noise,
     physics,
 )
@@ -16,6 +17,7 @@ __all__ = [
     "detect",
     "detect_correlation",
     "detect_edges",
+    "detect_wavelet",
     "noise",
     "physics",
 ]
