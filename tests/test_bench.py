@@ -85,7 +85,9 @@ def test_stiff_cases_count_failures_by_kind(document):
     assert any(row["is_auto"] for row in cases)
     for row in cases:
         assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 90
-        assert row["figures"]["completeness"]["value"] is None
+        for name in ("completeness", "correctness", "wrong"):
+            assert row["figures"][name]["value"] is None
+        assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
 
 
 def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say():

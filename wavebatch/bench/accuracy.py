@@ -151,13 +151,13 @@ class Tally:
         one, none = true == 1, true == 0
         return {
             "completeness": share(w["matched"], true, group),
-            "correctness": share(w["matched"], found, group),
+            "correctness": share(w["matched"], found * true.any(), group),
             "exact_count": share(found == true, np.ones(len(true)), group),
             "false_splits": share(one & (found > 1), one, group),
             "false_alarms": share(none & (found > 0), none, group),
             "found_isolated": share(w["isolated_matched"], w["isolated"], group),
             "found_overlapped": share(w["overlapped_matched"], w["overlapped"], group),
-            "wrong": share(true + found - 2 * w["matched"], true + found, group),
+            "wrong": share(true + found - 2 * w["matched"], (true + found) * true.any(), group),
         }
 
     def _errors(self) -> dict[str, Figure]:
