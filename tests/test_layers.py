@@ -13,7 +13,7 @@ RANKS = [
     {"kernels", "blocks", "trajectory"},
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
-    {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
+    {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
      "returns", "slices"},
     {"auto", "trial", "choice"},
     {"work"},
@@ -130,6 +130,6 @@ def test_no_other_dependency_at_run_time():
     import sys
 
     for path in MODULES:
-        peers = {"gdecomp", "matplotlib"} if _part(path) == "bench" else set()
+        peers = {"bench": {"gdecomp", "matplotlib"}, "slices": {"matplotlib"}}.get(_part(path), set())
         peers |= {"pyproj"} if path.name == "trajectoryfile.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path
