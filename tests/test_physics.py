@@ -59,7 +59,8 @@ def test_backscatter_and_range():
 
 def test_a_wrong_position_is_in_the_error():
     block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
-    done = run(block, echoes, replace(SYSTEM, sensor_error=6.4, attenuation=0.0), "backscatter_coefficient", "cross_section").attributes
+    system = replace(SYSTEM, sensor_error=6.4, attenuation=0.0)
+    done = run(block, echoes, system, "backscatter_coefficient", "cross_section").attributes
     assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.04, rel=0.01)
     assert done["backscatter_coefficient_err"] / done["backscatter_coefficient"] == pytest.approx(0.02, rel=0.02)
     calibrated = replace(SYSTEM, attenuation=0.0, calibration_err=0.03)
