@@ -16,7 +16,14 @@ from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, t
 from wavebatch.kernels.signal import smooth_121, transpose_samples
 from wavebatch.stages.flags import drop_unproven, flag_echoes
 from wavebatch.stages.merge import merge_unresolved
-from wavebatch.stages.shapes import ShapeLimits, describe_echoes, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.shapes import (
+    ShapeLimits,
+    clip_level,
+    describe_echoes,
+    model_parameters,
+    pulse_shape,
+    shape_limits,
+)
 from wavebatch.units import SQRT_PI
 
 MARGIN = 1.2
@@ -138,7 +145,7 @@ def adaptive(
 
 def _settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
     limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
-    return Settings(*limits, shape=shape, clip=system.saturation, noise_gain=system.noise_gain, **options)
+    return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
 
 
 def _decompose(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.stages.shapes import clip_level
 
 NEIGHBOURS = 5
 """Echoes before and behind that one is compared with."""
@@ -34,9 +35,7 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
         limit = RINGING_FACTOR * system.ringing
         suspect = _faint_beside(table, limit, 2.0 * system.sigma_ref, RINGING_REACH * system.sigma_ref, before=False)
         table = table.with_flags(EchoFlag.RINGING_SUSPECT, suspect & (table.amplitude > 0))
-    if system.saturation is None:
-        return table
-    return _flag_saturated(block, noise, system.saturation, table)
+    return _flag_saturated(block, noise, clip_level(block, system), table)
 
 
 def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
 from wavebatch.units import FWHM_PER_SIGMA
 
@@ -22,6 +22,14 @@ def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
         )
         return PulseShape(components=rest)
     return PulseShape(kappa=system.kappa) if abs(system.kappa) >= NO_SKEW else GAUSSIAN
+
+
+def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
+    """Count at which samples are clipped: what the survey found, or the largest count of the digitizer.
+
+    A survey looks at a sample of the strip: the few clipped echoes of a strip may lie outside it.
+    """
+    return float(block.digitizer.max_count) if system.saturation is None else system.saturation
 
 
 class ShapeLimits(NamedTuple):

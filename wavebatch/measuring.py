@@ -1,0 +1,315 @@
+"""The parts of a survey: noise, width and shape of the system pulse, residuals and threshold, from isolated echoes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.noise import estimate_noise
+from wavebatch.kernels.render import render_echoes
+from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples
+from wavebatch.stages.decompose import adaptive, closed_form
+from wavebatch.stages.detect import matched_filter, maximum
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.shapes import model_parameters, pulse_measures, pulse_shape, shape_limits
+from wavebatch.units import FWHM_PER_SIGMA, MAD_TO_STD, QUANTISATION_STD
+
+MOST_ROUNDS = 12
+"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+
+SETTLED = 0.01
+"""Change of the width, as a share of it, below which it stays."""
+
+FIRST_LOOK = 2048
+"""Waveforms from which the noise and the width to begin with are found."""
+
+RESIDUAL_LOOK = 4096
+"""Waveforms whose residuals are looked at."""
+
+FEW = 20
+"""Isolated echoes below which the width of the system pulse is a guess."""
+
+ENOUGH_TO_LEARN = 50
+"""Isolated echoes from which a pulse can be learned (R2)."""
+
+MOST_STACKED = 3000
+"""Isolated echoes that a stack takes; more do not make it better."""
+
+FIRST_WIDTH = 2.0
+"""First guess of the system pulse's width [samples]."""
+
+BEFORE, AFTER = 9.0, 25.0
+"""Samples before and behind an echo that its stack covers."""
+
+REACHED = 0.3
+"""Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
+
+NEAR_BEST = 1.25
+"""Misfit, over that of the best model, at which a simpler one is taken."""
+
+ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
+"""Thresholds tried for one more echo, in chi2."""
+
+USEFUL = 0.75
+"""Share of the split echoes that must be left for a raised threshold to have been of no use."""
+
+SPLIT_SHARE = 0.015
+"""Share of the strip's narrowest isolated echoes that may be split."""
+
+NEAR = 3.0
+"""Widths of the system pulse around an echo within which a second one is a split of it."""
+
+MIN_SNR = 20.0
+
+
+def measure_gaussian(block: WaveformBlock) -> SystemPulse:
+    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all."""
+    saturation = find_saturation(block.samples, block.digitizer.max_count)
+    few = thin_block(block, FIRST_LOOK)
+    width, last = FIRST_WIDTH, 0.0
+    for _ in range(MOST_ROUNDS):
+        if abs(width - last) <= SETTLED * width:
+            break
+        system, last = _gaussian_system(few, width, saturation), width
+        width = _isolated_width(few, system)
+    system = _gaussian_system(block, width, saturation)
+    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
+
+
+def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
+    """About `number` waveforms spread over the block, at least as many where it has them."""
+    return block.rows(slice(None, None, max(len(block) // number, 1)))
+
+
+def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
+    """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
+    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)))
+    return SystemPulse(
+        sigma_ref=width * block.spacing,
+        baseline=noise.level,
+        baseline_spread=noise.spread,
+        noise_std=max(noise.std, noise.smoothed_std, QUANTISATION_STD),
+        noise_by_kind={"quiet": noise.std, "quiet_smoothed": noise.smoothed_std},
+        saturation=saturation,
+    )
+
+
+def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
+    """Width [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped.
+
+    Where most of them are at the edge of the widths that `system` allows it is that edge, so that the next round can
+    go beyond it; with too few of them the system's width stays.
+    """
+    n = len(block)
+    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
+    echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
+    strongest, second = _strongest(echoes, n)
+    echoes = echoes.take(strongest)
+    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    free = (echoes.flags[good] & int(EchoFlag.AT_BOUND)) == 0
+    widths = echoes.sigma[good] / block.spacing
+    if 2 * free.sum() > len(free):
+        widths = widths[free]
+    if len(widths) < FEW:
+        return system.sigma_ref / block.spacing
+    return float(np.clip(_mode_of_narrow(widths), 0.5, 50.0))
+
+
+def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the strongest echo of each waveform that has any, and the amplitude of the second strongest there."""
+    order = np.lexsort((-echoes.amplitude, echoes.waveform))
+    waveform = echoes.waveform[order]
+    first = np.r_[True, waveform[1:] != waveform[:-1]] if len(order) else np.empty(0, bool)
+    second = np.zeros(n)
+    runner = np.flatnonzero(~first)
+    runner = runner[first[runner - 1]]
+    second[waveform[runner]] = echoes.amplitude[order[runner]]
+    return order[first], second[waveform[first]]
+
+
+def _mode_of_narrow(widths: np.ndarray) -> float:
+    """Width of the system pulse: centre of the shortest interval that holds a third of the widths.
+
+    Flat targets give the system width again and again, slopes and vegetation scatter above it; a mode is not moved by
+    them, as a median would be.
+    """
+    ordered = np.sort(widths.astype(np.float64))
+    hold = max(len(ordered) // 3, 2)
+    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
+    first = int(np.argmin(span))
+    return float(np.median(ordered[first : first + hold]))
+
+
+def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
+    """Count at which the digitizer clips: its maximum, or a maximum that many waveforms share on flat tops (H6)."""
+    top = int(samples.max(initial=0))
+    if top == 0:
+        return None
+    at_top = samples == top
+    flat = (at_top[:, 1:] & at_top[:, :-1]).any(axis=1)
+    if top == max_count:
+        return float(top)
+    reached = at_top.any(axis=1).sum()
+    return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
+
+
+def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, of the most common width (R2).
+
+    The half of them nearest to the mode of the widths: flat targets, whose echoes slopes do not widen.
+    """
+    n = len(block)
+    noise = pooled_noise(block, system)
+    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
+    strongest, second = _strongest(echoes, n)
+    echoes = echoes.take(strongest)
+    top = system.saturation or float(block.samples.max())
+    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
+    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    echoes = echoes.take(np.flatnonzero(good))
+    distance = np.abs(echoes.sigma - _mode_of_narrow(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
+    order = np.argsort(distance, kind="stable")[: max(len(echoes) // 2, ENOUGH_TO_LEARN)]
+    return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
+
+
+def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
+    """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
+    noise = pooled_noise(block, system)
+    width = system.sigma_ref / block.spacing
+    signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
+    before, after = BEFORE * max(width / 2, 1), AFTER * max(width / 2, 1)
+    stack = stack_pulse(signal, main.amplitude.astype(np.float64), main.time / block.spacing, before, after)
+    strongest = float(np.quantile(main.amplitude, 0.99))
+    goal = max(REACHED * system.noise_std / strongest, 1.5 * float(np.sqrt(np.mean(stack.error**2))))
+    sums = fit_gaussians(stack, width)
+    skewed = fit_skewed(stack, width)
+    figures["misfit_goal"] = goal
+    figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
+    for fit in sums:
+        figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
+    best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    return _with_pulse(system, best, stack, block.spacing)
+
+
+def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
+    """The first fit that reaches the goal, or comes near the best of all."""
+    enough = max(goal, NEAR_BEST * min(fit.rms for fit in fits))
+    return next(fit for fit in fits if fit.rms <= enough)
+
+
+def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
+    """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
+
+    A Gaussian keeps the width that the echoes themselves had: aligning them for the stack widens it a little.
+    """
+    width = system.sigma_ref / spacing
+    far = np.abs(stack.lag - fit.datum) > 4 * width
+    system = replace(system, ringing=float(np.abs(stack.value[far]).max(initial=0.0)), kappa=fit.kappa)
+    if len(fit.components) > 1:
+        components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
+        system = replace(system, components=components)
+        limits = shape_limits(system, spacing)
+        table = pulse_measures(pulse_shape(system, spacing), limits)
+        half_width = float(np.interp(limits.ref, table.width, table.half_width))
+        return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)
+    if fit.kappa:
+        return replace(system, sigma_ref=float(fit.components[0, 2]) * spacing)
+    return system
+
+
+def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    noise = pooled_noise(block, system)
+    return adaptive(block, noise, system, matched_filter(block, noise, system))
+
+
+def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with noise from the residuals around isolated echoes (R3) and its growth with the signal (H12)."""
+    n, s = block.samples.shape
+    noise = pooled_noise(block, system)
+    alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
+    alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
+    if len(alone) < ENOUGH_TO_LEARN:
+        return system
+    spacing = block.spacing
+    time, width = alone.time / spacing, alone.sigma / spacing
+    rows = np.arange(len(alone))
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    main = model_parameters(shape, limits, np.stack([alone.amplitude, time, width], axis=1).astype(np.float64))
+    model = render_echoes(shape, len(alone), s, rows, main[:, 1], main[:, 0], main[:, 2])
+    residual = block.samples[alone.waveform] - noise.baseline[alone.waveform][:, None] - model
+    lag = (np.arange(s) - time[:, None]) / width[:, None]
+    kinds = dict(system.noise_by_kind)
+    smoothed = 0.25 * (residual[:, :-2] + 2 * residual[:, 1:-1] + residual[:, 2:]) / SMOOTH_GAIN
+    for kind, where in (("core", np.abs(lag) < 2.5), ("tail", (lag > 3) & (lag < 12))):
+        kinds[kind] = _robust_std(residual[where])
+        kinds[f"{kind}_smoothed"] = _robust_std(smoothed[where[:, 1:-1]])
+    learned = bool(system.components) or system.kappa != 0
+    used = [value for kind, value in kinds.items() if not (learned and kind == "quiet_smoothed")]
+    std = max([QUANTISATION_STD, *used])
+    gain = _noise_gain(residual, model, lag, width, std)
+    return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+
+
+def _robust_std(values: np.ndarray) -> float:
+    """Standard deviation from the central two thirds of the values, which rounding to whole counts does not spoil."""
+    if len(values) < 100:
+        return 0.0
+    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    kept = values[np.abs(values - middle) < 4 * max(0.5 * (high - low), QUANTISATION_STD)]
+    return float(np.sqrt(np.mean((kept.astype(np.float64) - np.mean(kept, dtype=np.float64)) ** 2)))
+
+
+def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Share of a sample's variance that the fit of amplitude, time and width takes away.
+
+    lag: after the echo's centre, in widths. width: of the echo [samples]. The three derivatives of a Gaussian span the
+    first three Hermite functions, whose squares add up to the leverage of a sample.
+    """
+    z = lag.astype(np.float64) ** 2
+    leverage = np.exp(-z) / np.sqrt(np.pi) * (1 + 2 * z + 0.5 * (2 * z - 1) ** 2) / width
+    return np.minimum(leverage, 0.9)
+
+
+def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float) -> float:
+    """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
+    core = np.abs(lag) < 1.5
+    signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
+    squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
+    if len(signal) < 2000:
+        return 0.0
+    edges = np.quantile(signal, np.linspace(0, 1, 11))
+    place = np.clip(np.searchsorted(edges, signal) - 1, 0, 9)
+    level = np.array([np.median(signal[place == i]) for i in range(10) if (place == i).any()])
+    variance = np.array([np.median(squared[place == i]) for i in range(10) if (place == i).any()]) * MAD_TO_STD**2
+    slope, constant = np.polyfit(level, variance, 1)
+    scatter = np.std(variance - (constant + slope * level)) / max(np.std(level) * np.sqrt(len(level)), 1e-9)
+    matters = slope * edges[-2] > 0.3 * std**2 and slope > 4 * scatter
+    return float(slope) if matters else 0.0
+
+
+def choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTable) -> SystemPulse:
+    """The system with the least threshold at which its clearest single echoes stay whole (R3).
+
+    main: the echoes that the pulse was learned from. The threshold is raised until at most 1.5 % of them are split,
+    or until raising it hardly changes their number: what is split then are two targets.
+    """
+    if len(main) < ENOUGH_TO_LEARN:
+        return system
+    rows, shares = np.arange(len(main)), []
+    for acceptance in ACCEPTANCES:
+        # What a threshold leaves whole, a higher one does too: only the split ones are tried again.
+        part, time = block.rows(main.waveform[rows]), main.time[rows]
+        found = decompose_sample(part, replace(system, acceptance=acceptance))
+        near = np.abs(found.time - time[found.waveform]) < NEAR * system.sigma_ref
+        rows = rows[np.bincount(found.waveform[near], minlength=len(part)) > 1]
+        shares.append(len(rows) / len(main))
+        if shares[-1] <= SPLIT_SHARE:
+            return replace(system, acceptance=acceptance)
+        if len(shares) > 1 and shares[-1] > USEFUL * shares[-2]:
+            return replace(system, acceptance=ACCEPTANCES[len(shares) - 2])
+    return replace(system, acceptance=ACCEPTANCES[-1])
