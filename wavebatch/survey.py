@@ -162,9 +162,10 @@ def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
     if "misfit_1_gaussians" not in figures:
         return f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
     one = figures["misfit_1_gaussians"]
-    if len(system.components) > 1:
-        best = figures.get(f"misfit_{len(system.components)}_gaussians", 0.0)
-        return f"{len(system.components)} Gaussians miss the stacked echoes by {best:.4f} of the amplitude, 1 by {one:.4f}"
+    number = len(system.components)
+    if number > 1:
+        best = figures.get(f"misfit_{number}_gaussians", 0.0)
+        return f"{number} Gaussians miss the stacked echoes by {best:.4f} of the amplitude, one by {one:.4f}"
     return f"one Gaussian misses the stacked echoes by {one:.4f} of the amplitude; a simple pulse is enough"
 
 
