@@ -15,7 +15,7 @@ RANKS = [
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
      "returns", "slices"},
-    {"auto", "trial", "choice"},
+    {"auto", "trial", "choice", "sensor", "calibration"},
     {"work"},
     {"record"},
     {"task", "workers"},
