@@ -14,7 +14,7 @@ RANKS = [
     {"chain", "io", "report", "inputs"},
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
-     "returns", "slices"},
+     "returns", "slices", "synthesize"},
     {"auto", "trial", "choice", "sensor", "calibration"},
     {"work"},
     {"record"},

@@ -17,6 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("wavebatch.cli.simulate:simulate", "A strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Two results on one strip, or a result with the truth."),
     "stats": ("wavebatch.cli.stats:stats", "Return numbers, separations and flags of point clouds."),
+    "synthesize": ("wavebatch.cli.synthesize:synthesize", "Waveforms modelled from discrete returns."),
     "slice": ("wavebatch.cli.slice:slice_", "Straight surface lines in the scan lines of a strip."),
     "bench": ("wavebatch.cli.bench:bench", "Error against run time of chains on simulated truth."),
 }

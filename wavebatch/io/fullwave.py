@@ -37,8 +37,9 @@ class FullwaveWriter:
     target: its suffix says LAS or LAZ. version: "1.3", "1.4" or "1.5". point_format: 4, 5, 9 or 10 (9, 10 from 1.4 on).
     internal: packets in the file itself (spooled beside it until commit), else in a .wdp of its name.
     digitizers: with 8, 16 or 32 bits; the index of one is what its points carry. wkt: CRS, or None.
-    extra_bytes: one ExtraRecord per extra dimension. toward: how the vectors x_t, y_t, z_t are stored; points are
-    always handed in with vectors toward the sensor, and turned round here when this is False.
+    extra_bytes: one ExtraRecord per extra dimension. records: further VLRs, as they are. toward: how the vectors
+    x_t, y_t, z_t are stored; points are always handed in with vectors toward the sensor, and turned round here when
+    this is False.
     As a context manager it aborts itself unless committed. Raises ConfigError and InputError as CloudWriter does.
     """
 
@@ -54,6 +55,7 @@ class FullwaveWriter:
         offsets: Sequence[float] = (0.0, 0.0, 0.0),
         wkt: str | None = None,
         extra_bytes: Sequence[ExtraRecord] = (),
+        records: Sequence[Vlr] = (),
         toward: bool = True,
         overwrite: bool = False,
     ) -> None:
@@ -63,6 +65,7 @@ class FullwaveWriter:
         self.dtype = build_dtype(point_format, extra_bytes)
         self._internal, self._toward = internal, toward
         header = _build_header(numbers, point_format, internal, digitizers, wkt)
+        header.vlrs += records
         header.scales, header.offsets = tuple(map(float, scales)), tuple(map(float, offsets))
         self._file = PointFile(self.target, header, self.dtype, extra_bytes, overwrite=overwrite)
         beside = self.target.with_suffix(".wdp")
