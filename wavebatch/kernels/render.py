@@ -22,8 +22,10 @@ def render_echoes(
     """Signal (n, s), float32, of echoes sorted by waveform; times and widths in samples (m,)."""
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
-    for begin in range(0, len(waveform), ROWS):
-        part = slice(begin, begin + ROWS)
+    # Parts end with a waveform: so the order in which its echoes are added does not depend on the others.
+    borders = np.append(np.unique(np.searchsorted(waveform, waveform[::ROWS])), len(waveform))
+    for begin, end in zip(borders[:-1], borders[1:], strict=True):
+        part = slice(begin, end)
         t, w = (values[part].astype(np.float32)[:, None] for values in (time, width))
         pulse = evaluate_pulse(shape, x, t, w)[0] * amplitude[part].astype(np.float32)[:, None]
         owner = waveform[part]

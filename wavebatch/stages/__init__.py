@@ -3,6 +3,7 @@
 from wavebatch.stages import (
     attributes,
     decompose,
+    decompose_loops,
     detect,
     detect_correlation,
     detect_edges,
@@ -14,6 +15,7 @@ from wavebatch.stages import (
 __all__ = [
     "attributes",
     "decompose",
+    "decompose_loops",
     "detect",
     "detect_correlation",
     "detect_edges",
