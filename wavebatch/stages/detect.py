@@ -78,10 +78,12 @@ def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, t
     ref = system.sigma_ref / block.spacing
     taps = gaussian_taps(ref)
     energy = filter_energy(taps)
-    correlation = filter_symmetric(_signal(block, noise), taps)
+    signal = _signal(block, noise)
+    correlation = filter_symmetric(signal, taps)
     waveform, sample = find_peaks(correlation, np.float32(threshold * np.sqrt(energy)) * noise.std)
     time, height = refine_peaks(correlation, waveform, sample)
-    return _table(block, waveform, time, height / energy, np.full(len(waveform), ref))
+    _, _, width = estimate_starts(smooth_121(signal), waveform, sample, ref)
+    return _table(block, waveform, time, height / energy, np.clip(width, 0.8 * ref, 2.0 * ref))
 
 
 @stage("detect")
@@ -113,5 +115,5 @@ def second_derivative(
     high = smoothed.reshape(-1)[sample * n + waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
     waveform, sample = waveform[high], sample[high]
     time, _ = refine_peaks(curvature, waveform, sample)
-    amplitude = smoothed.reshape(-1)[sample * n + waveform]
-    return _table(block, waveform, time, amplitude, np.full(len(waveform), ref))
+    amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)
+    return _table(block, waveform, time, amplitude, np.clip(width, 0.8 * ref, 2.0 * ref))
