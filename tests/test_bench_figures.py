@@ -57,7 +57,7 @@ def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):
     assert scatter < 1.07 * stated and stated < 1.6 * scatter
     assert np.mean([figure.value for figure in drawn]) == pytest.approx(3, rel=0.01)
     assert root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == Figure(0.0, 0.0)
-    steady = root_mean_square(np.ones(100), np.arange(100), np.arange(100) % 8, worst=10.0)
+    steady = root_mean_square(np.ones(100), np.arange(100), np.arange(100) % 8)
     one_off_by_ten, surveys = np.sqrt(2) - 1, np.sqrt(2 / 8) * SURVEY_SCATTER
     assert steady.value == 1 and steady.error == pytest.approx(np.hypot(one_off_by_ten, surveys))
     assert np.isnan(root_mean_square(np.ones(1), np.zeros(1, int), np.zeros(1, int)).value)

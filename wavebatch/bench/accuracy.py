@@ -173,14 +173,14 @@ class Tally:
             gross = np.abs(ratios).max(axis=0) > GROSS
             figures[f"gross_{kind}"] = share(clear & gross, clear, e["group"])
             for name in QUANTITIES:
-                figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross, GROSS)
+                figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
                 known = np.isfinite(e[f"{name}_scaled"])
                 figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
         return figures
 
 
-def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray, worst: float = 0.0) -> Figure:
-    return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows], worst)
+def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
+    return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])
 
 
 def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

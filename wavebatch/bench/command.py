@@ -212,9 +212,14 @@ def _row(name: str, kind: str, tally: Tally, laps: Mapping[str, Any]) -> dict[st
 
 
 def _mark_front(rows: list[dict[str, Any]]) -> None:
-    """Adds to every row whether no other is as good in time, error and wrong echoes, and better in one."""
+    """Adds to every row whether no other chain is as good in time, error and wrong echoes, and better in one.
+
+    Peers saw other waveforms, and fewer: they are never on the front.
+    """
     costs = [
         [row["kernels"]["median"], row["figures"]["rmse_all_cm"]["value"], row["figures"]["wrong"]["value"]]
+        if row["kind"] == "chain"
+        else [None] * 3
         for row in rows
     ]
     front = find_front(np.array([[np.nan if cost is None else cost for cost in line] for line in costs]))

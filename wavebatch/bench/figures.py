@@ -13,6 +13,9 @@ SURVEY_SCATTER = 0.05
 """Relative scatter of an rms error between strips that differ in their survey alone, as measured on 16 strips with a
 learned pulse: a few groups may happen not to show it."""
 
+OUTLIER = 10.0
+"""How much worse than the root mean square the worst echo of another run may be."""
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -48,10 +51,10 @@ def share(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
     return Figure(value, float(np.sqrt(2) * max(error, np.sqrt(drawn * (1 - drawn) / (total + 4)))))
 
 
-def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray, worst: float = 0.0) -> Figure:
+def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Figure:
     """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure.
 
-    worst: largest value that there may be; the error allows for one more echo as bad as that.
+    The error allows for surveys that differ and for one more echo OUTLIER times as bad as the others.
     """
     if len(values) < 2:
         return Figure()
@@ -63,7 +66,7 @@ def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray
     _, place, where = np.unique(waveform, return_index=True, return_inverse=True)
     per_waveform = np.bincount(where, influence)
     error = _standard_error(per_waveform, group[place])
-    rare = np.sqrt(mean + worst**2 / len(squares)) - np.sqrt(mean)
+    rare = np.sqrt(mean) * (np.sqrt(1 + OUTLIER**2 / len(squares)) - 1)
     surveys = SURVEY_SCATTER * np.sqrt(mean / len(np.unique(group)))
     return Figure(float(np.sqrt(mean)), float(np.hypot(np.sqrt(2) * max(error, surveys), rare)))
 

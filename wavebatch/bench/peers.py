@@ -6,6 +6,7 @@ import importlib.util
 import os
 import tempfile
 import time
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -93,7 +94,8 @@ def _solve(leastsq, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarr
 
     if len(start) > len(x):
         return start.reshape(-1, 3)
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         return leastsq(residual, start, Dfun=jacobian, col_deriv=True)[0].reshape(-1, 3)
 
 

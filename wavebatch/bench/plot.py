@@ -51,7 +51,8 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
     axes.grid(alpha=0.3)
     if not known:
         return
-    front = find_front(np.stack([time, value], axis=1))
+    chains = np.array([row["kind"] == "chain" for row in known])
+    front = find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
     order = np.flatnonzero(front)[np.argsort(time[front])]
     axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
     for i, row in enumerate(known):
