@@ -89,6 +89,19 @@ def test_votes_are_split_between_bins_and_can_be_taken_back(rng):
     assert np.abs(sheet._sums).max() < 1e-9
 
 
+def test_wide_slices_have_coarse_steps_and_the_same_lines(rng):
+    image = paint(rng, [(200, 0.1, 0, 320)])
+    roi = image > 2 * image.std()
+    row, column = np.nonzero(roi)
+    far_x, far_y = np.append(column, 90_000.0), np.append(row, 0.0)
+    weight = np.append(image[roi], 0.1)
+    assert _Accumulator(np.stack([far_x, far_y], axis=1))._sums.nbytes < 200e6
+    (line,) = find_lines(far_x, far_y, weight, sigma=8.0)
+    (near,) = detect(image)
+    assert line.theta == pytest.approx(near.theta, abs=0.02)
+    assert line.start == pytest.approx(near.start, abs=0.1)
+
+
 def zigzag(lines, pulses):
     up = np.linspace(-0.4, 0.4, pulses)
     return np.concatenate([up if number % 2 == 0 else up[::-1] for number in range(lines)])

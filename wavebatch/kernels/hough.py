@@ -15,7 +15,9 @@ CROWD = 1.4
 """Largest spread of a line's pixels about it, in sigma: a pulse's is 1, that of noise within the band 1.73."""
 ROUNDS = 5
 _FAILURES = 5
-_CHUNK = 16_384
+_CHUNK = 65_536
+_REACH = 16_384
+"""Steps of rho to each side at most: slices that reach further have coarser steps, so that memory is bounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +88,11 @@ class _Accumulator:
     """Sums of intensities over theta and rho; votes are split linearly between the two nearest rho."""
 
     def __init__(self, points: np.ndarray) -> None:
-        self._points = points
+        reach = float(np.hypot(*np.abs(points).max(axis=0)))
+        self._step = max(1.0, reach / _REACH)
+        self._points = points / self._step
         self._angles = np.radians(np.arange(-90.0, 90.0, THETA_STEP))
-        self._reach = int(np.ceil(np.hypot(*np.abs(points).max(axis=0)))) + 1
+        self._reach = int(np.ceil(reach / self._step)) + 1
         self._width = 2 * self._reach + 2
         self._sums = np.zeros((len(self._angles), self._width))
         self._whole = 0.0
@@ -96,25 +100,29 @@ class _Accumulator:
     def vote(self, rows: np.ndarray, weight: np.ndarray) -> None:
         """Adds the intensities (negative ones take votes back) of pixels `rows`."""
         self._whole += float(weight.sum())
-        for begin in range(0, len(rows), _CHUNK):
-            x, y = self._points[rows[begin : begin + _CHUNK]].T
-            part = weight[begin : begin + _CHUNK]
-            for number, angle in enumerate(self._angles):
-                rho = x * np.cos(angle) + y * np.sin(angle) + self._reach
-                bin_ = rho.astype(np.int64)
-                above = (rho - bin_) * part
-                low = int(bin_.min())
-                bin_ -= low
-                sums = np.bincount(bin_, part - above)
-                self._sums[number, low : low + len(sums)] += sums
-                self._sums[number, low + 1 : low + 1 + len(sums)] += np.bincount(bin_, above)
+        cells = self._sums.reshape(-1)
+        step = max(_CHUNK // max(len(rows), 1), 1)
+        x, y = self._points[rows].T
+        for first in range(0, len(self._angles), step):
+            angles = self._angles[first : first + step, None]
+            rho = np.cos(angles) * x
+            rho += np.sin(angles) * y
+            rho += self._reach
+            cell = rho.astype(np.int64)
+            rho -= cell
+            rho *= weight
+            cell += self._width * np.arange(first, first + len(angles))[:, None]
+            cell, above = cell.reshape(-1), rho.reshape(-1)
+            np.add.at(cells, cell, (weight - rho).reshape(-1))
+            cell += 1
+            np.add.at(cells, cell, above)
 
     def strongest(self) -> tuple[float, float] | None:
         """Angle [rad] and rho of the largest sum; None when nothing is left."""
         if self._whole <= 0:
             return None
         number, bin_ = np.unravel_index(int(np.argmax(self._sums)), self._sums.shape)
-        return float(self._angles[number]), float(bin_) - self._reach
+        return float(self._angles[number]), self._step * (float(bin_) - self._reach)
 
 
 @dataclass(frozen=True, slots=True)
