@@ -54,7 +54,7 @@ def test_error_of_a_root_mean_square_is_what_repetitions_show(rng):
     ]  # both echoes of a waveform err alike
     scatter = np.sqrt(2) * np.std([figure.value for figure in drawn])
     stated = np.mean([figure.error for figure in drawn])
-    assert scatter < 1.07 * stated and stated < 1.6 * scatter
+    assert scatter < 1.07 * stated and stated < 2.0 * scatter
     assert np.mean([figure.value for figure in drawn]) == pytest.approx(3, rel=0.01)
     assert root_mean_square(np.zeros(9), np.arange(9), np.zeros(9, int)) == Figure(0.0, 0.0)
     steady = root_mean_square(np.ones(100), np.arange(100), np.arange(100) % 8)

@@ -38,6 +38,8 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
 def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str) -> None:
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
+    twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
+    rows = [row for row in rows if "same_as" not in row]
     known = [row for row in rows if row["kernels"]["median"] and row["figures"][name]["value"] is not None]
     time = np.array([row["kernels"]["median"] for row in known])
     value = np.array([row["figures"][name]["value"] * factor for row in known])
@@ -59,7 +61,8 @@ def _draw_panel(axes: Any, rows: list[Mapping[str, Any]], name: str, factor: flo
         marker = "o" if row["kind"] == "chain" else "s"
         color = "tab:red" if front[i] else "tab:gray"
         axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2)
-        axes.annotate(row["name"], (time[i], value[i]), textcoords="offset points", xytext=(6, 5))
+        label = " = ".join([row["name"], *filter(None, [twins.get(row["name"])])])
+        axes.annotate(label, (time[i], value[i]), textcoords="offset points", xytext=(6, 5))
+    axes.margins(x=0.25, y=0.15)
     axes.set_ylim(bottom=0)
-    axes.margins(x=0.2)
     axes.legend()
