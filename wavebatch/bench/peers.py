@@ -20,7 +20,7 @@ from wavebatch.stages.noise import pooled
 MOST = 12
 """Echoes of a waveform that a peer may report."""
 
-PATIENCE = 1.0
+PATIENCE = 2.0
 """Seconds after which a peer that still works on one waveform is stopped."""
 
 HEIGHT = 5.5
