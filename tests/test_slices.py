@@ -12,7 +12,7 @@ from wavebatch.errors import ConfigError
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import EAST, GROUND, NORTH, Flight
-from wavebatch.slices import SliceOptions, cut_slice, find_segments, lines, read_scan_lines
+from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments, lines, read_scan_lines
 
 FLIGHT = Flight(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000
@@ -90,15 +90,23 @@ def test_facets_are_found_with_their_slope_and_place(strip):
         assert line.point[segment.first_pulse] == segment.first_point
 
 
-def test_time_geometry_places_the_same_ground(tmp_path):
-    path = tmp_path / "flat.las"
-    simulate_strip("flat", path, pulses=1000, seed=1, flight=Flight(pulse_rate=50_000, half_angle=1.0, look_ahead=0.0))
-    options = SliceOptions(geometry="time", shortest=60)
-    (line,) = read_all(path)
-    piece = cut_slice(line, options)
-    assert piece.x.max() == 79 and piece.y.max() == len(line) - 1
-    for segment in find_segments(piece, options):
-        assert segment.ends[0][0] == pytest.approx(piece.x[0] + 40, abs=40)
+def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
+    n, count, spacing = 200, 80, 0.5
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 50 * np.exp(-0.5 * ((sample * spacing - 10 - 0.05 * row) / 2.0) ** 2)
+    origin = np.stack([0.6 * np.arange(n), np.zeros(n), np.full(n, 100.0)], axis=1)
+    line = ScanLine(
+        *(4, np.arange(n), np.arange(n) * 1e-5, origin, np.tile([0, 0, -0.15], (n, 1)), spacing, row),
+        *(sample * spacing, value.astype(np.float32)),
+    )
+    options = SliceOptions(geometry="time")
+    (segment,) = find_segments(cut_slice(line, options), options)
+    assert (segment.line, segment.first_pulse, segment.last_pulse) == (4, 0, 199)
+    for time, pulse in segment.ends:
+        assert time == pytest.approx(10 + 0.05 * pulse, abs=0.05)
+    for place, (time, pulse) in zip((segment.start, segment.end), segment.ends, strict=True):
+        assert place == pytest.approx((0.6 * np.clip(pulse, 0, n - 1), 0, 100 - 0.15 * time), abs=1e-6)
+    assert segment.residual < 0.1
 
 
 @pytest.mark.parametrize("wrong", [{"geometry": "polar"}, {"std": 0}, {"sigma": -1.0}, {"shortest": 0}, {"most": 0}])
