@@ -13,6 +13,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
+from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.publish import Draft, reporting
 from wavebatch.report import RunReport
 from wavebatch.systemfile import format_survey
@@ -34,7 +35,8 @@ def report_path(job: StripJob, folder: Path) -> Path:
 
 def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
     """All that decides what is written: two runs for which this is equal write the same cloud."""
-    saved = job.request.system
+    saved, sensor = job.request.system, job.sensor
+    trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
     return {
         "version": __version__,
         "input": {"file": job.path.name, **fingerprint},
@@ -42,6 +44,13 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         "request": {
             "chain": job.request.describe(job.chain) or effective(job.chain),
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
+            "sensor": {
+                "trajectory": trajectory,
+                "crs": sensor.crs,
+                "lever_arm": None if sensor.lever_arm is None else list(sensor.lever_arm),
+                "height": sensor.height,
+            },
+            "calibration": None if job.calibration is None else job.calibration.describe(),
         },
     }
 
@@ -56,6 +65,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
             "evidence": scan.direction_evidence,
             "vector_ratio": _finite(scan.vector_ratio),
         },
+        "sensor": prepared.sensor.describe(),
         **describe_survey(prepared.choice, prepared.job.request, fingerprint),
     }
 

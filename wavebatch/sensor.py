@@ -30,6 +30,9 @@ MOST_NODES = 20_000
 BEYOND = 0.25
 """Time for which a path goes straight on where its rays end [s]: not every point of a strip is looked at."""
 
+MARGIN = 30.0
+"""Of a trajectory that is kept before and after the strip [s]."""
+
 LARGEST_ANGLE = np.radians(2.0)
 """Between the packets' rays and those from a trajectory: above it the trajectory is of another strip, clock or CRS."""
 
@@ -109,7 +112,7 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     start, stop = float(rays.time[0]), float(rays.time[-1])
     try:
         offset, clocks = solve_offset(known, start, stop)
-        known = known.shifted(offset)
+        known = known.shifted(offset).between(start - MARGIN, stop + MARGIN)
         angle = _disagreement(known, rays)
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error

@@ -43,6 +43,7 @@ QUANTITIES: dict[str, Quantity] = {
     "ringing": Quantity("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
     "saturation_dn": Quantity("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
     "acceptance": Quantity("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
+    "divergence_mrad": Quantity("divergence", 1e-3, 100.0, "full angle of the beam, 1/e^2, from its data sheet", True),
 }
 """Keys of the table [system] that are plain numbers."""
 

@@ -58,6 +58,16 @@ class Trajectory:
         """The same positions `seconds` later."""
         return replace(self, time=self.time + seconds)
 
+    def between(self, start: float, stop: float, step: float = 0.04) -> Trajectory:
+        """The part within [start, stop] and one position beyond either end, no denser than about `step` [s]."""
+        first = max(int(np.searchsorted(self.time, start, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(self.time, stop)) + 1, len(self.time))
+        first = max(min(first, last - 2), 0)
+        usual = float(np.median(np.diff(self.time[first:last]))) if last - first > 1 else step
+        every = max(1, int(step / usual))
+        rows = np.unique(np.r_[np.arange(first, max(last, first + 2), every), max(last, first + 2) - 1])
+        return replace(self, time=self.time[rows], xyz=self.xyz[rows], velocity=self.velocity[rows])
+
     def at(self, time: np.ndarray) -> np.ndarray:
         """Positions at times (n,) by cubic Hermite interpolation, f8 (n, 3); NaN outside and in gaps."""
         time = np.asarray(time, np.float64)

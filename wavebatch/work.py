@@ -14,12 +14,14 @@ import numpy as np
 from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.auto import without_columns
 from wavebatch.blocks import COLUMNS, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.chain import STAGES, Chain
 from wavebatch.choice import Choice, Request, make_choice
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
 from wavebatch.report import RunReport
+from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
 from wavebatch.words import nearest
 
 BLOCK_SAMPLES = 1 << 22
@@ -54,6 +56,17 @@ class StripJob:
     options: RunOptions
     request: Request = Request()
     """How pulse and chain are found."""
+    sensor: SensorRequest = SensorRequest()
+    """Where the sensor's positions come from; asked for only if the chain needs them."""
+    calibration: Calibration | None = None
+
+    def extend(self, chain: Chain) -> Chain:
+        """The chain with what trajectory, calibration and divergence allow; a chain that the user wrote stays."""
+        saved = self.request.system
+        divergence = self.calibration is not None and self.calibration.divergence is not None
+        divergence |= saved is not None and saved.survey.system.divergence is not None
+        given = self.sensor != SensorRequest()
+        return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
 
     def open(self) -> StripReader:
         """A reader of the strip; raises InputError where it is not one."""
@@ -73,11 +86,13 @@ class Prepared:
     layout: OutputLayout
     report: RunReport
     """Timing of the preparation."""
+    sensor: SensorSource = NOBODY
 
     @property
     def system(self) -> SystemPulse:
-        """The pulse that the strip is run with."""
-        return self.choice.survey.system
+        """The pulse that the strip is run with, its calibration, and the error of the sensor's position."""
+        system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
+        return system if self.job.calibration is None else self.job.calibration.apply(system)
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
@@ -138,15 +153,19 @@ def prepare_strip(job: StripJob) -> Prepared:
         try:
             scanned = time.perf_counter()
             choice = make_choice(reader, scan, job.chain, job.request)
+            if job.request.describe(job.chain) is not None:
+                choice = replace(choice, chain=job.extend(choice.chain))
             columns = without_columns(job.options.columns, job.chain, choice.chain)
             job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
+            surveyed = time.perf_counter()
+            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else NOBODY
             layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
-    timing = {"scan": scanned - start, "survey": time.perf_counter() - scanned}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing))
+    timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor)
 
 
 def process_unit(prepared: Prepared, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
@@ -193,8 +212,9 @@ def _block_size(unit: Unit) -> int:
 def _run_blocks(
     prepared: Prepared, blocks: Iterator[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
 ) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
+    system = prepared.system
     for block, index in blocks:
-        yield block, index, prepared.job.chain.run(block, prepared.system, timing)
+        yield block, index, prepared.job.chain.run(prepared.sensor.fill(block), system, timing)
 
 
 class _Stopwatch:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,14 @@ class Size(click.ParamType):
               help="The cheapest shipped chain whose predicted range error meets this, e.g. 0.02m, decides per strip.")
 @click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
               help="A saved survey (of `wavebatch survey -o`) in place of one of each strip.")
+@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
+              help="Where the sensor was: text with time, x, y, z, or SBET. Without it the packets' own vectors say.")
+@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
+@click.option("--crs", metavar="CRS", help="Of the strip, e.g. EPSG:32632, for a trajectory in degrees.")
+@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
+              help="Above the ground, where neither a trajectory nor vectors say where the sensor was.")
+@click.option("--calibration", "calibration_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="Of `wavebatch calibrate`: adds backscatter and reflectance, with a divergence the cross section.")
 @click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
               help="Where the packets' vectors point, seen from the target: to the sensor or away from it.")
 @click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
@@ -126,12 +135,21 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
+    from wavebatch.calibration import load_calibration
     from wavebatch.inputs import find_strips
     from wavebatch.plan import check_outputs, plan_memory
+    from wavebatch.sensor import SensorRequest
     from wavebatch.task import BatchOptions
     from wavebatch.work import RunOptions, StripJob, choose_columns
 
     chain, request = _choose_chain(options)
+    calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
+    sensor = SensorRequest(
+        options["trajectory"], options["crs"], _read_lever_arm(options["lever_arm"]), options["flight_height"]
+    )
+    template = StripJob(Path(), chain, RunOptions(), request, sensor, calibration)
+    chain = chain if options["chain_file"] else template.extend(chain)
+    _check_use(chain, options)
     run_options = RunOptions(
         direction=options["direction"],
         headerless=options["headerless"],
@@ -152,7 +170,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         overwrite=options["overwrite"],
         resume=options["resume"],
     )
-    jobs = [StripJob(path, chain, run_options, request) for path in strips]
+    jobs = [replace(template, path=path, chain=chain, options=run_options) for path in strips]
     check_outputs(jobs, batch_options)
     return jobs, batch_options
 
@@ -177,6 +195,30 @@ def _choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
     if profile not in list_profiles():
         raise ConfigError(f"profile {profile!r} does not exist; {nearest(profile, ['auto', *list_profiles()])}")
     return load_profile(profile), request
+
+
+def _check_use(chain: Any, options: dict[str, Any]) -> None:
+    """Raises ConfigError for options that the chain would ignore."""
+    from wavebatch.calibration import needs_sensor
+
+    given = [name for name in ("trajectory", "flight_height", "calibration_file") if options[name] is not None]
+    if given and not needs_sensor(chain):
+        option = f"--{given[0].removesuffix('_file').replace('_', '-')}"
+        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage attribute.range")
+    for name in ("lever_arm", "crs"):
+        if options[name] is not None and options["trajectory"] is None:
+            raise ConfigError(f"--{name.replace('_', '-')} is of no use without --trajectory; give that too")
+
+
+def _read_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Forward, right, down [m]."""
+    if text is None:
+        return None
+    try:
+        forward, right, down = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ConfigError(f"--lever-arm: {text!r} must be three numbers in metres, e.g. 0.1,-0.2,0.5") from error
+    return forward, right, down
 
 
 def _read_tolerance(text: str | None) -> float | None:

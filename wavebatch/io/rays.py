@@ -18,7 +18,7 @@ MOST_SLICES = 4096
 SLICE_POINTS, RAYS_PER_SLICE = 2048, 256
 """Points read at a place, and rays kept of them."""
 
-SLICE_SECONDS = 0.1
+SLICE_SECONDS = 0.5
 """Time after which another place of the same unit is looked at."""
 
 _SLICES_PER_UNIT = 4
@@ -42,38 +42,39 @@ class Rays(NamedTuple):
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
     """Rays of a strip from its packets' vectors, and from pulses with two returns; the same ones every time.
 
-    No more than a few hundred rays at no more than MOST_SLICES places: bounded memory whatever the strip's size.
+    No more than a few hundred rays at no more than about MOST_SLICES places: bounded memory whatever the strip's size.
     """
     kept, pairs = [], []
-    for start, stop in _places(reader, scan):
+
+    def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop)
         xyz, time = locate(points, reader.facts), widen(points["gps_time"])
         pairs.append(_pair_returns(xyz, time))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
+        return float(time[0])
+
+    units = _choose_units(scan)
+    starts = [take(start, min(start + SLICE_POINTS, stop)) for start, stop in units]
+    if units:
+        end = units[-1][1]
+        starts.append(take(max(units[-1][0], end - SLICE_POINTS), end))
+    share = min(_SLICES_PER_UNIT, MOST_SLICES // max(len(units), 1))
+    for (start, stop), begin, until in zip(units, starts, starts[1:], strict=False):
+        seconds = abs(until - begin)
+        number = int(np.clip(np.ceil(seconds / SLICE_SECONDS), 1, share)) if np.isfinite(seconds) else share
+        for edge in (start + np.arange(1, number) * ((stop - start) // number)).tolist():
+            take(edge, min(edge + SLICE_POINTS, stop))
     return _join(kept), _join(pairs)
 
 
-def _places(reader: StripReader, scan: StripScan) -> list[tuple[int, int]]:
-    """Stretches of points [start, stop): one per unit and more where a unit takes long, all over the strip."""
+def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
+    """Stretches of points [start, stop) all over the strip: its units, or as many of them as may be looked at."""
     borders = scan.borders
-    units = np.unique(np.linspace(0, len(borders) - 2, min(len(borders) - 1, MOST_SLICES)).round().astype(int))
-    if not scan.points or not len(units):
+    if not scan.points:
         return []
-    share = max(1, min(_SLICES_PER_UNIT, MOST_SLICES // len(units)))
-    places = []
-    for unit in units.tolist():
-        start, stop = int(borders[unit]), int(borders[unit + 1])
-        if stop <= start:
-            continue
-        first = widen(reader.read_points(start, start + 1)["gps_time"])[0]
-        last = widen(reader.read_points(stop - 1, stop)["gps_time"])[0] if share > 1 else first
-        seconds = abs(last - first)
-        number = int(np.clip(np.ceil(seconds / SLICE_SECONDS), 1, share)) if np.isfinite(seconds) else share
-        edges = start + np.arange(number) * ((stop - start) // number)
-        places += [(int(edge), min(int(edge) + SLICE_POINTS, stop)) for edge in edges]
-    end = int(borders[-1])
-    return [*places, (max(places[-1][1], end - SLICE_POINTS), end)] if places and places[-1][1] < end else places
+    chosen = np.unique(np.linspace(0, len(borders) - 2, min(len(borders) - 1, MOST_SLICES)).round().astype(int))
+    return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
 
 
 def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> Rays:

@@ -1,0 +1,143 @@
+"""CAL.toml: the calibration constant of a sensor, where it comes from, and the stages that it and the sensor allow."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from wavebatch import __version__
+from wavebatch.blocks import SystemPulse
+from wavebatch.chain import STAGES, Chain, Step
+from wavebatch.errors import ConfigError
+from wavebatch.words import nearest
+
+CALIBRATION_SCHEMA = "wavebatch.calibration/1"
+
+NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+"""Columns that need the sensor's position."""
+
+_NUMBERS = {
+    "constant": (1e-30, 1e30, None, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"),
+    "relative_error": (0.0, 10.0, None, "standard deviation of the constant, relative"),
+    "attenuation_db_km": (0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
+    "divergence_mrad": (1e-3, 100.0, math.nan, "full angle of the beam between the 1/e^2 points; needed for m2"),
+}
+_TEXTS = ("schema", "version", "strip", "date", "conditions")
+_TABLES = ("fingerprint", "target")
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What turns amplitudes into backscatter; picklable."""
+
+    constant: float
+    relative_error: float
+    attenuation: float = 0.22
+    """[dB/km]."""
+    divergence: float | None = None
+    """[mrad]; None where nobody gave it."""
+    strip: str = ""
+    date: str = ""
+    conditions: str = ""
+    fingerprint: Mapping[str, Any] = field(default_factory=dict)
+    targets: tuple[Mapping[str, Any], ...] = ()
+    """What each reference target gave: name, reflectance, echoes, constant, spread."""
+
+    def apply(self, system: SystemPulse) -> SystemPulse:
+        """The system with this calibration; a divergence of its own stays."""
+        return replace(
+            system,
+            calibration=self.constant,
+            calibration_err=self.relative_error,
+            attenuation=self.attenuation,
+            divergence=self.divergence if system.divergence is None else system.divergence,
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """For reports."""
+        return {
+            "constant": self.constant,
+            "relative_error": self.relative_error,
+            "attenuation_db_km": self.attenuation,
+            "divergence_mrad": self.divergence,
+            "strip": self.strip,
+            "date": self.date,
+        }
+
+
+def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:
+    """The chain with the stages that what is known allows, behind those it has; as it is where it has them."""
+    names = ["attribute.range"] if sensor or calibrated or divergence else []
+    names += ["attribute.incidence_angle"] if divergence else []
+    names += ["attribute.backscatter_coefficient"] if calibrated else []
+    names += ["attribute.cross_section"] if calibrated and divergence else []
+    names += ["attribute.reflectance"] if calibrated else []
+    have = {step.stage.name for step in chain.steps}
+    added = tuple(Step(STAGES[name]) for name in names if name not in have)
+    return replace(chain, steps=(*chain.steps, *added)) if added else chain
+
+
+def needs_sensor(chain: Chain) -> bool:
+    """Whether a chain computes anything that needs the sensor's position."""
+    return any(name in NEEDS_SENSOR for name in chain.makes)
+
+
+def format_calibration(found: Calibration) -> str:
+    """TOML text; `parse_calibration` gives the same calibration again."""
+    lines = ["# A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."]
+    texts = (CALIBRATION_SCHEMA, __version__, found.strip, found.date, found.conditions)
+    lines += [f"{key} = {json.dumps(value)}" for key, value in zip(_TEXTS, texts, strict=True)]
+    values = (found.constant, found.relative_error, found.attenuation, found.divergence)
+    for (key, (*_, meaning)), value in zip(_NUMBERS.items(), values, strict=True):
+        if value is not None:
+            lines.append(f"{key} = {float(value)!r}  # {meaning}")
+    for target in found.targets:
+        lines += ["", "[[target]]", *(f"{key} = {json.dumps(value)}" for key, value in target.items())]
+    plain = {key: value for key, value in found.fingerprint.items() if not isinstance(value, Mapping)}
+    if plain:
+        lines += ["", "[fingerprint]", *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
+    return "\n".join(lines) + "\n"
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """The calibration of a file; ConfigError in one line that names file and key."""
+    try:
+        text = Path(path).read_text("utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: calibration file cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: calibration file is not UTF-8 text (byte {error.start})") from error
+    return parse_calibration(text, str(path))
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """The calibration that TOML text describes; `name` stands in front of every error message."""
+    try:
+        document = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{name}: not valid TOML: {error}") from error
+    for key in document:
+        if key not in (*_TEXTS, *_NUMBERS, *_TABLES):
+            raise ConfigError(f"{name}: unknown key {key!r}; {nearest(key, (*_TEXTS, *_NUMBERS, *_TABLES))}")
+    if document.get("schema") != CALIBRATION_SCHEMA:
+        raise ConfigError(f"{name}: schema is {document.get('schema')!r}, this version reads {CALIBRATION_SCHEMA!r}")
+    constant, error, attenuation, divergence = (_read_number(document, key, name) for key in _NUMBERS)
+    texts = {key: str(document.get(key, "")) for key in ("strip", "date", "conditions")}
+    return Calibration(constant, error, attenuation, None if math.isnan(divergence) else divergence, **texts)
+
+
+def _read_number(document: Mapping[str, Any], key: str, name: str) -> float:
+    low, high, default, meaning = _NUMBERS[key]
+    value = document.get(key, default)
+    if value is None:
+        raise ConfigError(f"{name}: key {key!r} is missing: {meaning}")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f"{name}: {key} must be a number, it is {value!r}")
+    if key in document and not low <= value <= high:
+        raise ConfigError(f"{name}: {key} must lie between {low:g} and {high:g}, it is {value!r}")
+    return float(value)
