@@ -5,9 +5,26 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+
+from wavebatch.units import FWHM_PER_SIGMA
 
 NO_SKEW = 1e-6
 """Below this |kappa| a pulse is treated as symmetric."""
+
+
+class PulseTable(NamedTuple):
+    """A pulse of any shape as a table, height 1 and peak at 0, linear between its rows; 0 at both ends.
+
+    The abscissa is in units in which the full width at half maximum is that of a Gaussian of standard deviation 1.
+    """
+
+    first: float
+    step: float
+    value: np.ndarray
+    """float32 (r,)."""
+    slope: np.ndarray
+    """Derivative of the pulse, float32 (r,)."""
 
 
 class PulseShape(NamedTuple):
@@ -16,15 +33,19 @@ class PulseShape(NamedTuple):
     kappa: skew of the log-normal pulse in its stable form; 0 for the others.
     components: (weight, delay, extra variance) of the learned pulse's further Gaussians relative to the first:
         weight per unit of the first one's area, delay behind it, variance minus the first one's.
+    power: exponent p of the generalized Gaussian exp(-|z|^p / 2); 2 for the others.
+    table: pulse of any shape, stretched in time by the width; None for the others.
     """
 
     kappa: float = 0.0
     components: tuple[tuple[float, float, float], ...] = ()
+    power: float = 2.0
+    table: PulseTable | None = None
 
     @property
     def is_gaussian(self) -> bool:
         """True when the plain Gaussian is the whole model."""
-        return abs(self.kappa) < NO_SKEW and not self.components
+        return abs(self.kappa) < NO_SKEW and not self.components and self.power == 2.0 and self.table is None
 
 
 GAUSSIAN = PulseShape()
@@ -40,6 +61,10 @@ def evaluate_pulse(shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarra
     z *= 1 / s
     if shape.components:
         return _evaluate_components(shape, x, t, s, z)
+    if shape.table is not None:
+        return _evaluate_table(shape.table, z)
+    if shape.power != 2.0:
+        return _evaluate_power(shape.power, z)
     if abs(shape.kappa) >= NO_SKEW:
         return _evaluate_skewed(shape.kappa, z)
     return _evaluate_gaussian(z)
@@ -67,6 +92,25 @@ def _evaluate_skewed(kappa: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
     by_time = pulse * level
     by_time /= inside
     return pulse, by_time, by_time * z
+
+
+def _evaluate_power(power: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """f = exp(-|z|^p / 2)."""
+    kind = z.dtype.type
+    distance = np.maximum(np.abs(z), kind(1e-6))
+    by_width = np.exp(kind(power) * np.log(distance))
+    pulse = np.exp(kind(-0.5) * by_width)
+    by_width *= kind(0.5 * power) * pulse
+    return pulse, np.copysign(by_width / distance, z), by_width
+
+
+def _evaluate_table(table: PulseTable, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    place = (z - z.dtype.type(table.first)) * z.dtype.type(1 / table.step)
+    np.clip(place, 0, len(table.value) - 1.001, out=place)
+    row = place.astype(np.int32)
+    place -= row
+    pulse, slope = (column[row] + place * (column[row + 1] - column[row]) for column in (table.value, table.slope))
+    return pulse, -slope, -slope * z
 
 
 def _evaluate_components(
@@ -162,3 +206,26 @@ def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]
         return x[a] + (x[b] - x[a]) * (0.5 * pulse[top] - pulse[a]) / (pulse[b] - pulse[a])
 
     return float(pulse[top]), float(x[top]), cross(right - 1, right) - cross(left + 1, left)
+
+
+TABLE_ROWS = 64
+"""Rows of a tabulated pulse per unit of width."""
+
+
+def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
+    """A pulse given at evenly spaced x as a table: a cubic spline through its samples, 0 beyond them.
+
+    Height, place of the peak and width are taken out of it.
+    """
+    step = x[1] - x[0]
+    x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
+    spline = CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
+    fine = np.arange(x[0], x[-1], step / 64)
+    height, peak, full = _measure_one(spline(fine), fine)
+    unit = full / FWHM_PER_SIGMA
+    rows = np.arange(np.ceil((x[0] - peak) / unit * TABLE_ROWS), np.floor((x[-1] - peak) / unit * TABLE_ROWS) + 1)
+    z = rows / TABLE_ROWS
+    shape, slope = spline(z * unit + peak) / height, spline(z * unit + peak, 1) * unit / height
+    for column in (shape, slope):
+        column[[0, -1]] = 0.0
+    return PulseTable(float(z[0]), 1 / TABLE_ROWS, shape.astype(np.float32), slope.astype(np.float32))

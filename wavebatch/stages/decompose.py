@@ -63,8 +63,8 @@ def closed_form(
     significance: least energy of an echo, in standard deviations of the noise's.
     """
     start = _start_closed_form(block, noise, system, echoes, fraction)
-    settings = _settings(block, system, GAUSSIAN, tolerance=1e-6, max_iterations=steps + 1, grow=False)
-    return _decompose(block, noise, system, start, settings, most=1, significance=significance)
+    settings = make_settings(block, system, GAUSSIAN, tolerance=1e-6, max_iterations=steps + 1, grow=False)
+    return fit_candidates(block, noise, system, start, settings, most=1, significance=significance)
 
 
 @stage("decompose")
@@ -88,8 +88,8 @@ def gaussian(
         standard deviation of the minimum.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
-    settings = _settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
-    return _decompose(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
 
 
 @stage("decompose")
@@ -127,7 +127,7 @@ def adaptive(
     """
     shape = pulse_shape(system, block.spacing)
     ref = shape_limits(system, block.spacing).ref
-    settings = _settings(
+    settings = make_settings(
         block,
         system,
         shape,
@@ -140,15 +140,16 @@ def adaptive(
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
-    return _decompose(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
 
 
-def _settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
+def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
+    """What a decomposition with this pulse may do, with the strip's widths, digitizer and noise."""
     limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
     return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
 
 
-def _decompose(
+def fit_candidates(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
@@ -159,6 +160,15 @@ def _decompose(
     significance: float,
 ) -> EchoTable:
     """Candidates in ns -> clusters -> fits -> flagged table in ns."""
+    candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
+    solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
+    return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
+
+
+def find_clusters(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, settings: Settings, most: int
+) -> tuple[Candidates, Clusters]:
+    """Candidates in samples, as parameters of the pulse, and which of them are fitted together."""
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     start = np.stack(
         [np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1
@@ -179,10 +189,7 @@ def _decompose(
         most=most,
         tail=tail,
     )
-    clusters = clusters._replace(waveform=present[clusters.waveform])
-    del signal
-    solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
-    return _table(block, noise, system, clusters, list(solutions), settings, significance)
+    return candidates, clusters._replace(waveform=present[clusters.waveform])
 
 
 def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
@@ -206,7 +213,7 @@ def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> 
     return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
 
-def _table(
+def describe_solutions(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
@@ -215,6 +222,7 @@ def _table(
     settings: Settings,
     significance: float,
 ) -> EchoTable:
+    """Fits in samples as a flagged table in ns, without echoes that noise explains or that lie outside."""
     if not solutions:
         return EchoTable.empty()
     flat = [_flatten(clusters, solution) for solution in solutions]

@@ -1,0 +1,43 @@
+"""Undamped Gauss-Newton steps: as fast as Levenberg-Marquardt from good starts, lost from bad ones (ALGORITHMS 1.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.kernels.fit import Windows, add_ridge, evaluate_model, gram_matrix, parameter_units, solve_symmetric
+from wavebatch.kernels.pulse import PulseShape
+
+LEAST_WIDTH = 0.1
+"""Width [samples] below which a fit is lost."""
+
+
+def step_undamped(
+    windows: Windows, start: np.ndarray, shape: PulseShape, *, tolerance: float, max_iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters (m, 3, k) after full Gauss-Newton steps without limits, and which problems converged (m,).
+
+    tolerance: a problem is done when the last step promised a fall of chi2 below this. One is lost as soon as a step
+    leads to an amplitude or width that no echo has, or out of the window; its start is given back.
+    """
+    parameters, converged = start.copy(), np.zeros(len(start), bool)
+    index = np.arange(len(start))
+    length = windows.y.shape[1]
+    for _ in range(max_iterations):
+        rows = evaluate_model(windows, parameters[index], shape)
+        gram = gram_matrix(rows)
+        gradient = gram[:, :-1, -1]
+        step = solve_symmetric(add_ridge(gram[:, :-1, :-1].copy()), gradient)
+        promise = np.einsum("mp,mp->m", step, gradient) / windows.std**2
+        step = step.reshape(len(index), *start.shape[1:]) * parameter_units(parameters[index], windows.std)
+        reached = parameters[index] + step
+        amplitude, time, width = reached.transpose(1, 0, 2)
+        sane = (amplitude > 0) & (width > LEAST_WIDTH) & (width < length) & (time > -length) & (time < 2 * length)
+        lost = ~(sane.all(axis=1) & np.isfinite(reached).all(axis=(1, 2)))
+        parameters[index] = np.where(lost[:, None, None], start[index], reached)
+        done = ~lost & (promise < tolerance)
+        converged[index[done]] = True
+        going = np.flatnonzero(~(done | lost))
+        if not len(going):
+            break
+        index, windows = index[going], windows.take(going)
+    return parameters, converged

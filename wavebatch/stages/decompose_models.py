@@ -1,0 +1,225 @@
+"""Decomposers for comparison: other pulse models, and undamped Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.cluster import Candidates, Clusters, cut_windows
+from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
+from wavebatch.kernels.fit import batch_size, evaluate_model, gram_matrix, parameter_errors
+from wavebatch.kernels.gauss_newton import step_undamped
+from wavebatch.kernels.pulse import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.stages.decompose import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
+from wavebatch.stages.reference import reference_pulse
+from wavebatch.stages.shapes import pulse_shape, shape_limits
+from wavebatch.units import FWHM_PER_SIGMA
+
+POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
+"""Exponents of the generalized Gaussian that are tried for every cluster of echoes."""
+
+
+def _model_settings(
+    block: WaveformBlock, system: SystemPulse, shape: PulseShape, max_iterations: int, tolerance: float
+) -> Settings:
+    return make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+
+
+@stage("decompose")
+def skewed(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    kappa: float = 0.0,
+    max_iterations: int = 40,
+    tolerance: float = 0.5,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
+
+    The time is that of the peak. Source: Wang, Wang and Tseng eq. 2; ALGORITHMS 0, 1.2.
+
+    kappa: skew; 0 takes the strip's own from the survey.
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that the last step, which is taken, may promise.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    skew = kappa or system.kappa
+    shape = PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
+    settings = _model_settings(block, system, shape, max_iterations, tolerance)
+    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+@stage("decompose")
+def reference(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    model: Literal["broadened", "stretched", "given"] = "broadened",
+    pulse: str = "",
+    max_iterations: int = 40,
+    tolerance: float = 0.5,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
+
+    Time and amplitude are those of the pulse's peak, the width its full width at half maximum over 2.354820. Source:
+    ALGORITHMS R1; Mallet and Bretar (2009).
+
+    model: `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in
+        time, `given` for the pulse below, stretched.
+    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that the last step, which is taken, may promise.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    shape = pulse_shape(system, block.spacing)
+    if model == "stretched":
+        shape = _tabulate_system(system, shape, block.spacing)
+    elif model == "given":
+        taps, _ = reference_pulse(system, block.spacing, "given", pulse=pulse)
+        shape = PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
+    settings = _model_settings(block, system, shape, max_iterations, tolerance)
+    if model != "broadened":
+        system = replace(system, components=())
+    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:
+    """The survey's pulse as a table."""
+    ref = shape_limits(system, spacing).ref
+    ends = [-6 * ref, 6 * ref]
+    for _, delay, extra in shape.components:
+        wide = 5 * np.sqrt(ref * ref + extra)
+        ends = [min(ends[0], delay - wide), max(ends[1], delay + wide)]
+    x = np.arange(ends[0], ends[1], ref / 16)
+    value = evaluate_pulse(shape, x[:, None].copy(), np.zeros(1), np.full(1, ref))[0][:, 0]
+    return PulseShape(table=tabulate_pulse(x, value))
+
+
+@stage("decompose")
+def generalized_gaussian(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    max_iterations: int = 40,
+    tolerance: float = 0.5,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A sum of generalized Gaussians exp(-|z|^p / 2) whose exponent each cluster of echoes chooses for itself.
+
+    Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
+    width at half maximum over 2.354820. Source: Chauve et al. (2007), eq. 4.
+
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that the last step, which is taken, may promise.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    plain = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
+    candidates, clusters = find_clusters(block, noise, system, echoes, plain, MOST_JOINED)
+    best = np.full(len(clusters.number), np.inf)
+    chosen = np.zeros(len(best), np.int64)
+    found: list[list[Solution]] = []
+    for number, power in enumerate(POWERS):
+        factor = half_width_factor(power)
+        widths = {name: getattr(plain, name) / factor for name in ("width_ref", "width_low", "width_high")}
+        settings = plain._replace(shape=PulseShape(power=power), **widths)
+        solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
+        found.append([_as_half_width(solution, factor) for solution in solutions])
+        for solution in found[-1]:
+            better = solution.cost < best[solution.cluster]
+            best[solution.cluster[better]] = solution.cost[better]
+            chosen[solution.cluster[better]] = number
+    kept = [
+        solution.take(np.flatnonzero(chosen[solution.cluster] == number))
+        for number, solutions in enumerate(found)
+        for solution in solutions
+    ]
+    return describe_solutions(block, noise, system, clusters, kept, plain, significance)
+
+
+def half_width_factor(power: float) -> float:
+    """Full width at half maximum of exp(-|z|^p / 2) over 2.354820."""
+    return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
+
+
+@stage("decompose")
+def gauss_newton(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    max_iterations: int = 20,
+    tolerance: float = 0.01,
+    significance: float = 5.0,
+) -> EchoTable:
+    """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts further off than one sigma are lost.
+
+    A fit that is lost gives its start back, flagged as not converged. Source: Jutzi and Stilla (2005); ALGORITHMS 1.3.
+
+    max_iterations: after which an echo is flagged as not converged.
+    tolerance: fall of chi2 that the last step, which is taken, may promise.
+    significance: least energy of an echo, in standard deviations of the noise's.
+    """
+    settings = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
+    candidates, clusters = find_clusters(block, noise, system, echoes, settings, MOST_JOINED)
+    found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in _alike(clusters, block)]
+    return describe_solutions(block, noise, system, clusters, found, settings, significance)
+
+
+def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
+    """Clusters with the same number of echoes and windows of about the same length, a batch at a time."""
+    length = np.minimum(-(-(clusters.high - clusters.low) // 8) * 8, block.samples.shape[1])
+    kind = clusters.number * (1 << 32) + length
+    order = np.argsort(kind, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else []:
+        size = batch_size(int(clusters.number[group[0]]), int(length[group[0]]))
+        yield from (group[begin : begin + size] for begin in range(0, len(group), size))
+
+
+def _solve_undamped(
+    block: WaveformBlock,
+    noise: Noise,
+    candidates: Candidates,
+    clusters: Clusters,
+    rows: np.ndarray,
+    settings: Settings,
+) -> Solution:
+    low, high = clusters.low[rows], clusters.high[rows]
+    length = min(-(-int((high - low).max()) // 8) * 8, block.samples.shape[1])
+    windows, begin = cut_windows(
+        block.samples, noise.baseline, noise.std, clusters.waveform[rows], low, high, length, settings.clip
+    )
+    member = clusters.first[rows][:, None] + np.arange(clusters.number[rows[0]])
+    start = np.stack([candidates.amplitude[member], candidates.time[member], candidates.width[member]], axis=1)
+    start[:, 1] -= begin[:, None]
+    parameters, converged = step_undamped(
+        windows, start, settings.shape, tolerance=settings.tolerance, max_iterations=settings.max_iterations
+    )
+    bound = (parameters[:, 2] < settings.width_low) | (parameters[:, 2] > settings.width_high)
+    parameters[:, 2] = np.clip(parameters[:, 2], settings.width_low, settings.width_high)
+    model = evaluate_model(windows, parameters, settings.shape)
+    gram = gram_matrix(model)
+    errors = parameter_errors(parameters, windows.std, model, gram)
+    parameters[:, 1] += begin[:, None]
+    cost = gram[:, -1, -1] / windows.std**2
+    used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
+    return Solution(rows, parameters, errors, np.sqrt(cost / used), cost, converged, bound)
+
+
+def _as_half_width(solution: Solution, factor: float) -> Solution:
+    """The solution with widths multiplied by the factor."""
+    scale = np.array([1.0, 1.0, factor])[:, None]
+    return solution._replace(parameters=solution.parameters * scale, errors=solution.errors * scale)
