@@ -16,7 +16,7 @@ RANKS = [
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "compare",
      "returns", "slices", "synthesize"},
     {"auto", "trial", "choice", "sensor", "calibration"},
-    {"work"},
+    {"work", "targets"},
     {"record"},
     {"task", "workers"},
     {"plan"},

@@ -1,0 +1,112 @@
+"""Calibration from targets: files of targets, what lies in them, and a constant that gives their reflectance back."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.calibration import load_calibration
+from wavebatch.cli import main
+from wavebatch.errors import ConfigError
+from wavebatch.simulate import simulate_strip
+from wavebatch.simulate.geometry import EAST, NORTH
+from wavebatch.targets import Target, fit_normal, load_targets
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+def test_what_lies_in_a_polygon():
+    corners = np.array([[0, 0], [10, 0], [10, 10], [5, 3], [0, 10.0]])
+    x, y = np.array([1.0, 9, 5, 5, -1, 5]), np.array([1.0, 8, 1, 8, 5, 20])
+    assert Target("w", 0.2, corners).contains(x, y).tolist() == [True, True, True, False, False, False]
+    many = np.random.default_rng(1).uniform(-2, 12, (2, 100_000))
+    assert Target("w", 0.2, corners).contains(*many).mean() * 14**2 == pytest.approx(65.0, rel=0.02)
+
+
+def test_circles_and_polygons_of_csv_and_geojson(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("name,reflectance,x,y,radius,incidence\ngrey,0.25,100,200,5,\nwhite,0.8,300,400,2,12.5\n")
+    grey, white = load_targets(path)
+    assert (grey.name, grey.reflectance, grey.incidence, white.incidence) == ("grey", 0.25, None, 12.5)
+    assert grey.contains(np.array([104.9, 105.1]), np.array([200.0, 200.0])).tolist() == [True, False]
+    path.write_text("reflectance,vertices\n0.5,0 0 10 0 10 10\n")
+    assert load_targets(path)[0].corners.shape == (3, 2)
+    ring = [[0, 0], [10, 0], [10, 10], [0, 0]]
+    feature = {"type": "Feature", "properties": {"reflectance": 0.4, "name": "a"},
+               "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    assert load_targets(path)[0].contains(np.array([8.0, 2.0]), np.array([2.0, 8.0])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,x\n", "no target in it"),
+        ("reflectance,x,y\n0.2,1,2\n", "target 1: radius is missing"),
+        ("x,y,radius\n1,2,3\n", "target 1: reflectance is missing"),
+        ("reflectance,x,y,radius\nhalf,1,2,3\n", "target 1: not numbers"),
+        ("reflectance,x,y,radius\n20,1,2,3\n", "must lie in 0 to 1.5"),
+        ("reflectance,x,y,radius,incidence\n0.2,1,2,3,89\n", "incidence must lie in 0 to 85"),
+        ("reflectance,vertices\n0.2,1 2 3\n", "target 1: not numbers"),
+        ('{"features": 3}', "not GeoJSON"),
+        ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "is a Point"),
+        ("{", "not GeoJSON"),
+    ],
+)
+def test_wrong_targets_are_one_line(tmp_path, text, message):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_targets(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_normals_are_not_bent_by_outliers():
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 10, (300, 2))
+    z = 0.5 * xy[:, 0] + 0.01 * rng.standard_normal(300)
+    z[:30] += 3.0
+    normal = fit_normal(np.column_stack([xy, z]))
+    assert abs(normal @ np.array([-0.5, 0, 1]) / np.sqrt(1.25)) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    """Flat ground whose echoes all are of one target."""
+    path = tmp_path_factory.mktemp("ground") / "flat.las"
+    simulate_strip("flat", path, pulses=6000, seed=8)
+    return path
+
+
+def test_targets_get_their_reflectance_back(tmp_path, ground):
+    cloud = laspy.read(ground)
+    x, y = float(np.median(cloud.x)), float(np.median(cloud.y))
+    targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
+    targets.write_text(f"name,reflectance,x,y,radius\nnear,0.2,{x},{y},40\nnowhere,0.5,{x + 1e5},{y},40\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
+    assert done.exit_code == 0, done.output
+    assert "nowhere: reflectance 0.5, 0 echoes, too few, left out" in done.stderr
+    found = load_calibration(cal)
+    assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
+    assert found.strip == "flat.las" and "direction vectors" in found.conditions
+    done = call("run", ground, "-o", folder, "--profile", "balanced", "--calibration", cal)
+    assert done.exit_code == 0, done.output
+    cloud = laspy.read(next(folder.glob("*.laz")))
+    inside = np.hypot(cloud.x - x, cloud.y - y) < 40
+    rho = np.asarray(cloud["reflectance"])[inside]
+    assert np.median(rho[rho != -9999]) == pytest.approx(0.2, rel=0.03)
+    done = call("calibrate", ground, "--targets", targets, "-o", cal)
+    assert done.exit_code == 1 and "exists" in done.stderr
+
+
+def test_targets_off_the_strip(tmp_path, ground):
+    targets = tmp_path / "t.csv"
+    targets.write_text(f"reflectance,x,y,radius\n0.2,{EAST + 9e5},{NORTH},40\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1
+    assert "no target has 10 clean single echoes (target 1 0)" in done.stderr
+    assert not (tmp_path / "cal.toml").exists()

@@ -1,0 +1,76 @@
+"""`wavebatch calibrate`: the calibration constant from targets of known reflectance."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from wavebatch.cli.common import debug_option, report_errors, talk
+
+
+@click.command()
+@click.argument("strip", type=click.Path(path_type=Path))
+@click.option("--targets", required=True, type=click.Path(path_type=Path), metavar="FILE",
+              help="GeoJSON polygons with reflectance, or CSV with reflectance and x, y, radius or vertices.")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAL.toml", help="The result.")
+@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
+              help="Where the sensor was; without it the packets' own vectors say.")
+@click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
+@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M", help="Where nothing else says.")
+@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE", help="A saved survey.")
+@click.option("--attenuation", type=click.FloatRange(0.0, 100.0), default=0.22, show_default=True, metavar="DB/KM",
+              help="Of the air, one way.")
+@click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
+              help="Full angle of the beam between the 1/e^2 points; cross sections need it.")
+@click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
+              help="Standard deviation of the targets' reflectances, relative.")
+@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
+              help="Where the packets' vectors point.")
+@click.option("--overwrite", is_flag=True, help="Replace an output that exists.")
+@debug_option
+@report_errors()
+def calibrate(
+    strip: Path,
+    targets: Path,
+    output: Path,
+    trajectory: Path | None,
+    crs: str | None,
+    flight_height: float | None,
+    system_file: Path | None,
+    attenuation: float,
+    divergence: float | None,
+    reflectance_error: float,
+    direction: str,
+    overwrite: bool,
+    debug: bool,
+) -> None:
+    """The calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
+
+    Only echoes that are alone in their waveform and lie on a target count; angles come from each target's own plane,
+    unless its file gives an incidence. Exit code: 0, 1 where the strip or its targets give no constant, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.calibration import format_calibration
+    from wavebatch.io.publish import refuse_existing
+    from wavebatch.sensor import SensorRequest
+    from wavebatch.systemfile import load_survey, write_text
+    from wavebatch.targets import calibrate_strip, load_targets
+
+    if not overwrite:
+        refuse_existing(output)
+    found = calibrate_strip(
+        strip,
+        load_targets(targets),
+        sensor=SensorRequest(trajectory, crs, None, flight_height),
+        system=load_survey(system_file).survey.system if system_file else None,
+        attenuation=attenuation,
+        divergence=divergence,
+        reflectance_error=reflectance_error,
+        direction=direction,
+    )
+    write_text(output, format_calibration(found), overwrite=overwrite)
+    for target in found.targets:
+        said = f"constant {target['constant']:.4g}, spread {100 * target['spread']:.1f} %, incidence " \
+            f"{target['incidence_deg']:.1f} deg" if "constant" in target else "too few, left out"  # fmt: skip
+        talk(f"{target['name']}: reflectance {target['reflectance']:g}, {target['echoes']} echoes, {said}")
+    talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")

@@ -1,0 +1,235 @@
+"""Reference targets of known reflectance: their file, and the calibration constant that a strip over them gives."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.calibration import Calibration
+from wavebatch.choice import read_sample, survey_sample
+from wavebatch.config import load_profile
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.io.strip import StripReader
+from wavebatch.kernels.radiometry import calibrate_echoes
+from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.units import MAD_TO_STD
+
+LEAST_ECHOES = 10
+"""Echoes on a target below which it is left out."""
+
+MOST_ECHOES = 200_000
+"""Echoes that a target takes; more do not make it better."""
+
+_CORNERS = 64
+_BLOCK = 8192
+_UNCLEAN = (
+    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
+    | EchoFlag.AT_BOUND | EchoFlag.UNANCHORED
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """An area of known reflectance."""
+
+    name: str
+    reflectance: float
+    corners: np.ndarray
+    """Of its outline, f8 (k, 2) [m]."""
+    incidence: float | None = None
+    """Angle between ray and normal [deg]; None: from the plane of its own echoes."""
+
+    def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Whether points (n,) lie inside, bool (n,)."""
+        (left, low), (right, high) = self.corners.min(axis=0), self.corners.max(axis=0)
+        near = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
+        odd = np.zeros(len(near), bool)
+        for (x0, y0), (x1, y1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            if y0 != y1:
+                crosses = (y0 > y[near]) != (y1 > y[near])
+                odd ^= crosses & (x[near] < x0 + (y[near] - y0) * (x1 - x0) / (y1 - y0))
+        inside = np.zeros(len(x), bool)
+        inside[near] = odd
+        return inside
+
+
+def load_targets(path: Path | str) -> list[Target]:
+    """The targets of a GeoJSON or CSV file; ConfigError in one line.
+
+    GeoJSON: polygons with the properties reflectance and, if known, name and incidence [deg]. CSV: columns reflectance
+    and x, y, radius, or vertices as `x y x y x y ...`; name and incidence if known. Coordinates as the strip has them.
+    """
+    try:
+        text = Path(path).read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: targets cannot be read: {error}") from error
+    rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(io.StringIO(text)))
+    targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
+    if not targets:
+        raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
+    return targets
+
+
+def _read_geojson(text: str, path: Path | str) -> list[dict[str, Any]]:
+    try:
+        document = json.loads(text)
+        rows = []
+        for feature in document["features"]:
+            shape = feature["geometry"]
+            if shape["type"] != "Polygon":
+                raise ConfigError(f"{path}: a target is a {shape['type']}; only polygons have an area")
+            corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y, *_ in shape["coordinates"][0])
+            rows.append({**(feature.get("properties") or {}), "vertices": corners})
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {type(error).__name__}: {error}") from error
+    return rows
+
+
+def _read_target(row: Mapping[str, Any], where: str) -> Target:
+    fields = {str(key).strip().lower(): value for key, value in row.items() if value not in (None, "")}
+    try:
+        reflectance = float(fields["reflectance"])
+        incidence = float(fields["incidence"]) if "incidence" in fields else None
+        if "vertices" in fields:
+            corners = np.array(str(fields["vertices"]).split(), np.float64).reshape(-1, 2)
+        else:
+            angle = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) * float(fields["radius"])
+            corners = circle + [float(fields["x"]), float(fields["y"])]
+    except KeyError as error:
+        raise ConfigError(
+            f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"
+        ) from error
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: not numbers: {error}") from error
+    if not 0 < reflectance <= 1.5 or len(corners) < 3 or not np.isfinite(corners).all():
+        raise ConfigError(f"{where}: reflectance must lie in 0 to 1.5, and the outline needs three corners")
+    if incidence is not None and not 0 <= incidence < 85:
+        raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
+    return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)
+
+
+@dataclass(slots=True)
+class _Found:
+    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, one row each."""
+
+    rows: list[np.ndarray] = field(default_factory=list)
+    number: int = 0
+
+    def add(self, rows: np.ndarray) -> None:
+        rows = rows[: max(MOST_ECHOES - self.number, 0)]
+        self.rows.append(rows)
+        self.number += len(rows)
+
+
+def calibrate_strip(
+    path: Path,
+    targets: Sequence[Target],
+    *,
+    sensor: SensorRequest | None = None,
+    system: SystemPulse | None = None,
+    attenuation: float = 0.22,
+    divergence: float | None = None,
+    reflectance_error: float = 0.03,
+    direction: str = "auto",
+) -> Calibration:
+    """The calibration constant of a strip over targets: median of its echoes, then of the targets.
+
+    Only single, clean echoes count. attenuation [dB/km]; divergence [mrad]; reflectance_error: relative, of the
+    targets.
+    Raises InputError where no target has enough echoes, or nobody knows where the sensor was.
+    """
+    with StripReader(path, direction=direction) as reader, reader.scan() as scan:
+        source = find_sensor(reader, scan, sensor or SensorRequest())
+        if source.kind == "none":
+            raise InputError(f"{path}: nobody knows where the sensor was: give --trajectory or --flight-height")
+        pulse = system or survey_sample(read_sample(reader, scan)).system
+        found = _collect(reader, scan, targets, source, pulse)
+        fingerprint = take_fingerprint(path, reader.facts.packet_file)
+    results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
+    good = [result for result in results if result["echoes"] >= LEAST_ECHOES]
+    if not good:
+        told = ", ".join(f"{result['name']} {result['echoes']}" for result in results)
+        raise InputError(f"{path}: no target has {LEAST_ECHOES} clean single echoes ({told}); check their coordinates")
+    constants = np.array([result["constant"] for result in good])
+    constant = float(np.median(constants))
+    inner = float(np.median([result["spread"] / np.sqrt(result["echoes"]) for result in good]))
+    between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
+    error = float(np.sqrt(reflectance_error**2 / len(good) + inner**2 + between**2))
+    conditions = f"sensor from {source.kind}, pulse {pulse.sigma_ref:.4g} ns, {sum(r['echoes'] for r in good)} echoes"
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return Calibration(
+        constant, error, attenuation, divergence, Path(path).name, today, conditions, fingerprint, tuple(results)
+    )
+
+
+def _collect(
+    reader: StripReader, scan: Any, targets: Sequence[Target], source: SensorSource, system: SystemPulse
+) -> list[_Found]:
+    """Clean single echoes on every target, unit by unit; only waveforms with a return near a target are decomposed."""
+    chain, found = load_profile("balanced"), [_Found() for _ in targets]
+    corners = np.concatenate([target.corners for target in targets])
+    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+    for number in range(reader.unit_count()):
+        unit = reader.read_unit(number, scan)
+        for block, _ in reader.read_blocks(unit, _BLOCK, owned_only=True):
+            xy = block.returns.xyz[:, :2]
+            near = np.unique(block.returns.waveform[((xy >= low) & (xy <= high)).all(axis=1)])
+            if len(near):
+                part = source.fill(block.rows(near))
+                _add_echoes(part, chain.run(part, system), targets, found)
+    return found
+
+
+def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Target], found: list[_Found]) -> None:
+    alone = echoes.count(len(block))[echoes.waveform] == 1
+    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(_UNCLEAN)) == 0)))
+    xyz = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
+    ray = xyz - block.sensor[echoes.waveform]
+    distance = np.sqrt((ray * ray).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        table = np.column_stack([xyz, distance, echoes.amplitude, echoes.sigma, ray / distance[:, None]])
+    known = np.isfinite(table).all(axis=1)
+    for target, place in zip(targets, found, strict=True):
+        place.add(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
+
+
+def _evaluate(target: Target, found: _Found, attenuation: float) -> dict[str, Any]:
+    """What one target gave: echoes, median of the constant, its relative spread, the angle that was used."""
+    result: dict[str, Any] = {"name": target.name, "reflectance": target.reflectance, "echoes": found.number}
+    if found.number < LEAST_ECHOES:
+        return result
+    rows = np.concatenate(found.rows)
+    xyz, (distance, amplitude, sigma), unit = rows[:, :3], rows[:, 3:6].T, rows[:, 6:]
+    if target.incidence is None:
+        angle = np.arccos(np.clip(np.abs(unit @ fit_normal(xyz)), 0.0, 1.0))
+    else:
+        angle = np.full(len(rows), np.radians(target.incidence))
+    constant = calibrate_echoes(target.reflectance, angle, distance, amplitude, sigma, attenuation)
+    middle = float(np.median(constant))
+    spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
+    return {**result, "constant": middle, "spread": spread, "incidence_deg": float(np.degrees(np.median(angle)))}
+
+
+def fit_normal(xyz: np.ndarray) -> np.ndarray:
+    """Unit normal of the plane through points (n, 3), what lies four robust standard deviations off left out."""
+    kept = xyz
+    for _ in range(4):
+        centre = kept.mean(axis=0)
+        normal = np.linalg.svd(kept - centre, full_matrices=False)[2][2]
+        off = np.abs((xyz - centre) @ normal)
+        near = off <= 4 * MAD_TO_STD * max(float(np.median(off)), 1e-3)
+        kept = xyz[near] if near.sum() >= 3 else xyz
+    return normal
