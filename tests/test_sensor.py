@@ -153,6 +153,13 @@ def test_height_is_the_last_resort():
     assert NOBODY.fill(block).sensor is None
 
 
+def test_degrees_are_refused(wide_strip):
+    with StripReader(wide_strip) as reader, reader.scan() as scan:
+        reader.facts = replace(reader.facts, crs='GEOGCS["WGS 84",DATUM["WGS_1984"]]')
+        with pytest.raises(InputError, match="coordinates are degrees"):
+            find_sensor(reader, scan, SensorRequest())
+
+
 def test_a_few_rays_of_every_place(wide_strip):
     with StripReader(wide_strip) as reader, reader.scan() as scan:
         vectors, _ = sample_rays(reader, scan)

@@ -90,8 +90,10 @@ NOBODY = SensorSource("none")
 def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) -> SensorSource:
     """Where the sensor of a strip was. Depends on nothing but the strip and the request.
 
-    Raises InputError where a trajectory cannot be read, does not overlap, or contradicts the packets' vectors.
+    Raises InputError where a trajectory cannot be read, does not overlap, or contradicts the packets' vectors, and for
+    strips in degrees.
     """
+    _refuse_degrees(reader)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
         return _from_file(reader, vectors, request)
@@ -102,6 +104,15 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     if request.height is not None:
         return SensorSource("flight height", height=request.height, error=HEIGHT_ERROR * request.height)
     return NOBODY
+
+
+def _refuse_degrees(reader: StripReader) -> None:
+    crs = (reader.facts.crs or "").lstrip().upper()
+    if crs.startswith(("GEOGCS[", "GEOGCRS[", "GEOGRAPHICCRS[")):
+        raise InputError(
+            f"{reader.facts.path}: coordinates are degrees, in which nothing has a range: project the strip, or leave "
+            "out the stages that need the sensor's position"
+        )
 
 
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
