@@ -14,6 +14,7 @@ from wavebatch import __version__
 from wavebatch.auto import choose_chain
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.bench.figures import median_range
+from wavebatch.bench.methods import list_methods
 from wavebatch.bench.pareto import choose_cheapest, find_front
 from wavebatch.bench.peers import list_peers, run_peer
 from wavebatch.bench.promises import judge, measure_system
@@ -52,6 +53,8 @@ class BenchOptions:
     """Named scenes, besides the strip."""
     chains: tuple[Path, ...] = ()
     """Chain files, besides the shipped chains."""
+    all_methods: bool = False
+    """Measure every detector and decomposer in the scenes too, each in a chain of its own."""
     seed: int = 0
     waveforms: int = 65_536
     """Simulated waveforms per scene."""
@@ -86,7 +89,8 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
         scenes.insert(0, shape_scene(options.strip, chains["accurate"]))
     if not scenes:
         raise ConfigError("nothing to measure: give a strip or --scene NAME")
-    sections = [_measure_scene(scene, chains, options, place, progress) for place, scene in enumerate(scenes)]
+    measured = chains | (list_methods() if options.all_methods else {})
+    sections = [_measure_scene(scene, measured, options, place, progress) for place, scene in enumerate(scenes)]
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "version": __version__,

@@ -26,6 +26,7 @@ from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 @click.option(
     "--peers/--no-peers", default=True, help="Measure gdecomp (if installed) and scipy too.  [default: peers]"
 )
+@click.option("--all-methods", is_flag=True, help="A row for every detector and every decomposer too.")
 @click.option("--stability/--no-stability", default=True, help="The stiff and extreme cases.  [default: stability]")
 @click.option("--hazard", "hazards", multiple=True, metavar="H1..H16", help="Only the cases of this hazard.")
 @click.option("--promises", is_flag=True, help="Also measure what each release promises, and say what is met.")
@@ -74,7 +75,8 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, a
         click.echo(text)
 
 
-_PASSED = ("seed", "waveforms", "pulses", "repeats", "peers", "stability", "hazards", "promises", "large")
+_PASSED = ("seed", "waveforms", "pulses", "repeats", "all_methods", "peers", "stability", "hazards")
+_PASSED += ("promises", "large")
 
 
 def _quiet(text: str) -> None:

@@ -1,0 +1,69 @@
+"""The contract of all stages, held by the methods with parameters other than their defaults."""
+
+import numpy as np
+import pytest
+from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
+
+from wavebatch import survey
+from wavebatch.blocks import EchoTable
+from wavebatch.chain import STAGES
+
+PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
+VARIANTS = [
+    ("detect.threshold", {"correct_walk": False}),
+    ("detect.zero_crossing", {"derivative": "second"}),
+    ("detect.correlation", {"reference": "given", "pulse": PULSE}),
+    ("detect.asdf", {"rule": "paper", "interpolation": "parabola"}),
+    ("detect.asdf", {"reference": "system"}),
+    ("detect.asdf", {"reference": "given", "pulse": PULSE}),
+    ("detect.wavelet", {"wavelet": "mexican_hat"}),
+    ("detect.wavelet", {"scale": 4.0}),
+    ("detect.richardson_lucy", {"reference": "given", "pulse": PULSE, "iterations": 3}),
+    ("decompose.asdf_only", {"mode": "mixed"}),
+    ("decompose.skewed", {"kappa": 0.2}),
+    ("decompose.reference", {"model": "stretched"}),
+    ("decompose.reference", {"model": "given", "pulse": PULSE}),
+]
+
+
+def call(name, parameters, block, system):
+    noise, candidates, _ = inputs(block, system)
+    given = (candidates,) if name.startswith("decompose") else ()
+    return STAGES[name].function(block, noise, system, *given, **parameters)
+
+
+@pytest.mark.parametrize(("name", "parameters"), VARIANTS)
+@pytest.mark.parametrize("system", ["gaussian", "learned", "short"])
+@pytest.mark.parametrize("s", [1, 2, 40])
+def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system):
+    for samples in waveforms(s).values():
+        block = make_block(samples)
+        table = call(name, parameters, block, SYSTEMS[system])
+        check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
+
+
+@pytest.mark.parametrize(("name", "parameters"), VARIANTS)
+def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
+    block = scene_blocks()["mixed"].rows(slice(0, 29))
+    system = survey.measure_block(block)
+    whole = call(name, parameters, block, system)
+    assert len(whole) > 15
+    for size in (1, 7):
+        cuts = pieces(len(block), size)
+        parts = [(call(name, parameters, block.rows(cut), system), cut.start) for cut in cuts]
+        assert_same(EchoTable.concatenate(parts), whole)
+
+
+def test_parts_of_a_block_do_not_show(monkeypatch):
+    """More waveforms than are worked on at a time."""
+    from wavebatch.stages import detect_correlation, detect_wavelet
+
+    block = scene_blocks()["mixed"].rows(slice(0, 60))
+    system = survey.measure_block(block)
+    names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
+    whole = [call(name, {}, block, system) for name in names]
+    monkeypatch.setattr(detect_correlation, "COLUMNS_AT_A_TIME", 7)
+    monkeypatch.setattr(detect_wavelet, "AT_A_TIME", 7)
+    for name, table in zip(names, whole, strict=True):
+        assert_same(call(name, {}, block, system), table)
+        assert np.unique(table.waveform).size > 40
