@@ -94,6 +94,7 @@ def test_no_angle_where_nothing_is_known_or_beyond_80_degrees():
     angle, angle_err = angles_of_variance(variance, error, distance, BETA)
     assert np.isfinite(angle).tolist() == np.isfinite(angle_err).tolist() == [False] * 5 + [True]
     assert angle[5] == 0.0
+    assert angle_err[5] == pytest.approx(float(angle_of_spread(np.sqrt(0.05), 640.0, BETA)))
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,15 @@ import pytest
 
 from wavebatch import stages  # noqa: F401 - registers them
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.calibration import with_physics
 from wavebatch.chain import STAGES
+from wavebatch.config import load_profile
 from wavebatch.kernels.bounds import crlb
 from wavebatch.kernels.incidence import spread_of_angle
+from wavebatch.simulate.blocks import simulate_pulses
+from wavebatch.simulate.geometry import AIR_SPEED
+from wavebatch.simulate.scenes import find_scene
+from wavebatch.survey import measure_block
 from wavebatch.units import HALF_C
 
 SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
@@ -137,6 +143,28 @@ def test_angles_of_a_village_and_their_errors():
     off, error = done["incidence_angle"] - true, done["incidence_angle_err"]
     assert np.median(np.abs(off)) == pytest.approx(np.median(0.6745 * error), rel=0.2)
     assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
+
+
+def test_angles_of_simulated_slopes():
+    off, errors = [], []
+    scene = find_scene("slope")
+    chain = with_physics(load_profile("balanced"), sensor=True, calibrated=False, divergence=True)
+    system = None
+    for part in range(3):
+        made = simulate_pulses(scene, 2000, np.random.default_rng(part), first=2003 * part)
+        distance = scene.beam_radius / 0.55e-3
+        block = replace(made.block, sensor=made.rays.ground - made.rays.direction * (distance / AIR_SPEED))
+        # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
+        system = system or replace(measure_block(block), sigma_ref=scene.recording.pulse.sigma, divergence=1.1)
+        echoes = chain.run(block, system)
+        true = np.degrees(made.rays.incidence)[echoes.waveform]
+        off.append(echoes.attributes["incidence_angle"] - true)
+        errors.append(echoes.attributes["incidence_angle_err"])
+    off, errors = np.concatenate(off), np.concatenate(errors)
+    known = np.isfinite(off)
+    assert 0.5 < known.mean() < 1.0
+    assert np.median(np.abs(off[known])) == pytest.approx(np.median(0.6745 * errors[known]), rel=0.2)
+    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.05)
 
 
 def test_an_infrared_beam_has_no_angles():

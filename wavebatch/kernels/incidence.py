@@ -77,7 +77,8 @@ def angles_of_variance(
     sigma_s s c^2 / (w^2 tan sec^2). NaN beyond 80 degrees, and where anything is not known.
     """
     known = np.isfinite(variance) & np.isfinite(variance_err) & (np.asarray(distance) > 0)
-    variance = np.where(known, variance, np.nan)
+    # However narrow an echo is, the true variance is not negative: errors do not shrink to nothing with it.
+    variance = np.where(known, np.maximum(variance, -0.5 * variance_err), np.nan)
     upper, middle, lower = (
         angle_of_spread(np.sqrt(np.maximum(variance + step, 0.0)), distance, divergence)
         for step in (variance_err, 0.0, -variance_err)
