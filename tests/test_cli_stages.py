@@ -35,7 +35,8 @@ def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
     kind = name.split(".")[0]
     tables = [example if k == kind else f'[[chain]]\nstage = "{other}"\n' for k, other in others.items()]
     if kind == "attribute":
-        tables.append(example)
+        makers = {s.name for column in STAGES[name].needs for s in STAGES.values() if column in s.makes}
+        tables += [*(f'[[chain]]\nstage = "{maker}"\n' for maker in sorted(makers)), example]
     chain = parse_chain("\n".join(tables), "example")
     assert example.strip() in effective(chain)
 

@@ -123,9 +123,7 @@ def fit_sensor(
     if _condition(normal) < 1e14:
         covariance = residual**2 * np.linalg.inv(normal)
     condition, share = _condition(normal[:3, :3]), float(reverse.mean())
-    return SensorFit(
-        centre, half, found, covariance, condition, distance, _extent(unit), residual, share, len(used)
-    )
+    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, share, len(used))
 
 
 def fit_best(
