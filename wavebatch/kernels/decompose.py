@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -162,6 +163,18 @@ PATIENCE = 5
 """Iterations of the first attempt; what has not converged then goes on together with others of any length."""
 
 
+CENSORED = 40
+"""Iterations that a problem with clipped samples may have where others have only a few: its start is far off (H6)."""
+
+
+class Ending(Enum):
+    """Which problems an attempt ends with, converged or not."""
+
+    CONVERGED = "none"
+    UNCLIPPED = "those without clipped samples"
+    ALL = "all"
+
+
 def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
     """The problem in batches of one window length.
 
@@ -171,8 +184,9 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
     rows = np.arange(len(problem.cluster))
     most = work.settings.max_iterations
     first = FINE_LENGTHS if problem.start.shape[2] <= 2 else COARSE_LENGTHS
-    for lengths, iterations in ((first, min(PATIENCE, most)), (LAST_LENGTHS, most - PATIENCE)):
-        last = iterations == most or lengths is LAST_LENGTHS
+    few = most <= PATIENCE
+    for lengths, iterations in ((first, min(PATIENCE, most)), (LAST_LENGTHS, CENSORED if few else most - PATIENCE)):
+        last = lengths is LAST_LENGTHS
         needed = work.clusters.high[problem.cluster] - work.clusters.low[problem.cluster]
         length = np.minimum(lengths[np.searchsorted(lengths, needed)], longest)
         order = np.argsort(length, kind="stable")
@@ -181,7 +195,8 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
             size = batch_size(problem.start.shape[2], int(length[group[0]])) if len(group) else 1
             for begin in range(0, len(group), size):
                 part = group[begin : begin + size]
-                step = _solve_batch(work, problem.take(part), rows[part], int(length[part[0]]), iterations, last)
+                end = Ending.ALL if last else Ending.UNCLIPPED if few else Ending.CONVERGED
+                step = _solve_batch(work, problem.take(part), rows[part], int(length[part[0]]), iterations, end)
                 unfinished.append((step.unfinished, step.unfinished_rows))
                 yield step
         if last or not unfinished:
@@ -190,7 +205,7 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
         rows = np.concatenate([part for _, part in unfinished])
 
 
-def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, iterations: int, last: bool) -> _Step:
+def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, iterations: int, end: Ending) -> _Step:
     settings, cluster, clusters = work.settings, problem.cluster, work.clusters
     windows, begin = cut_windows(
         work.samples,
@@ -217,11 +232,15 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         hopeless_above=problem.target if np.isfinite(problem.target).any() else None,
         prior=prior,
     )
-    finished = np.ones(len(rows), bool) if last else fit.converged | fit.hopeless
+    finished = fit.converged | fit.hopeless
+    if end is Ending.ALL:
+        finished[:] = True
+    elif end is Ending.UNCLIPPED:
+        finished |= True if windows.clipped is None else ~windows.clipped.any(axis=1)
     solution = _solution(cluster, windows, fit, begin)
     new = np.isfinite(problem.target)
     accepted = finished & ~fit.hopeless & (~new | ((solution.cost < problem.target) & _is_resolved(solution)))
-    proposal, parents = _propose(settings, windows, fit, accepted, begin, limits)
+    proposal, parents = _propose(settings, windows, fit, accepted & fit.converged, begin, limits)
     if proposal is not None:
         proposal = proposal._replace(cluster=cluster[parents])
         parents = np.cumsum(accepted)[parents] - 1
@@ -268,7 +287,10 @@ def _is_resolved(solution: Solution) -> np.ndarray:
 def _propose(
     settings: Settings, windows: Windows, fit: Fit, accepted: np.ndarray, begin: np.ndarray, limits: Limits
 ) -> tuple[Problem | None, np.ndarray]:
-    """Trials with one echo more for the accepted fits that leave something unexplained, and the rows of those."""
+    """Trials with one echo more for the accepted fits that leave something unexplained, and the rows of those.
+
+    accepted: of fits that have not converged nobody knows yet what they leave.
+    """
     none = np.empty(0, np.int64)
     if not settings.grow or fit.parameters.shape[2] >= settings.max_echoes or not accepted.any():
         return None, none

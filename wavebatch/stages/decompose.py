@@ -15,7 +15,7 @@ from wavebatch.kernels.fit import WidthPrior
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal import smooth_121, transpose_samples
 from wavebatch.stages.flags import drop_unproven, flag_echoes
-from wavebatch.stages.merge import merge_unresolved
+from wavebatch.stages.merge import drop_twins, merge_unresolved
 from wavebatch.stages.shapes import (
     ShapeLimits,
     clip_level,
@@ -31,6 +31,12 @@ MARGIN = 1.2
 
 REACH = 3.0
 """Windows extend at least this many system widths beyond the outer candidates."""
+
+LEAST_PLATEAU = 2
+"""Clipped samples between two candidates from which they stand on one flat top ..."""
+
+PLATEAU_SLACK = 2
+"""... if no more samples than this between them are not clipped."""
 
 MOST_JOINED = 6
 """Candidates on one run of signal beyond which it is fitted in parts."""
@@ -63,7 +69,7 @@ def closed_form(
     significance: least energy of an echo, in standard deviations of the noise's.
     """
     start = _start_closed_form(block, noise, system, echoes, fraction)
-    settings = make_settings(block, system, GAUSSIAN, tolerance=1e-6, max_iterations=steps + 1, grow=False)
+    settings = make_settings(block, system, GAUSSIAN, tolerance=0.1, max_iterations=steps + 1, grow=False)
     return fit_candidates(block, noise, system, start, settings, most=1, significance=significance)
 
 
@@ -176,6 +182,7 @@ def find_clusters(
     amplitude, time, width = model_parameters(settings.shape, limits, start.astype(np.float64)).T
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
     ref = system.sigma_ref / block.spacing
+    candidates = _join_plateaus(block, candidates, settings.clip)
     candidates, tail = _explain_tails(candidates, noise, settings)
     present, row = np.unique(candidates.waveform, return_inverse=True)
     signal = transpose_samples(block.samples[present])
@@ -190,6 +197,30 @@ def find_clusters(
         tail=tail,
     )
     return candidates, clusters._replace(waveform=present[clusters.waveform])
+
+
+def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float | None) -> Candidates:
+    """Candidates of which no two stand on one flat top: clipped samples between them are no sign of two echoes (H6)."""
+    waveform, time, amplitude, _ = candidates
+    if clip is None or len(waveform) < 2:
+        return candidates
+    pair = np.flatnonzero(waveform[1:] == waveform[:-1])
+    clipped = block.samples[waveform[pair]] >= clip
+    begin, end = np.rint(time[pair]).astype(np.int64), np.rint(time[pair + 1]).astype(np.int64)
+    last = block.samples.shape[1] - 1
+    count = np.cumsum(np.pad(clipped, ((0, 0), (1, 0))), axis=1, dtype=np.int32)
+    row = np.arange(len(pair))
+    between = count[row, np.clip(end, 0, last)] - count[row, np.clip(begin + 1, 0, last)]
+    flat = (between >= LEAST_PLATEAU) & (end - begin - 1 - between <= PLATEAU_SLACK)
+    if not flat.any():
+        return candidates
+    joined = np.zeros(len(waveform), bool)
+    joined[pair[flat] + 1] = True
+    first = np.flatnonzero(~joined)
+    number = np.diff(np.r_[first, len(waveform)])
+    middle = np.add.reduceat(time, first) / number
+    kept = Candidates(*(field[first] for field in candidates))
+    return kept._replace(time=np.where(number > 1, middle, kept.time), amplitude=np.maximum.reduceat(amplitude, first))
 
 
 def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
@@ -247,7 +278,7 @@ def describe_solutions(
         residual=misfit[keep],
         flags=flags[keep],
     )
-    table = merge_unresolved(table)
+    table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system)
     return flag_echoes(block, noise, system, table)

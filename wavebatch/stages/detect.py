@@ -30,8 +30,12 @@ def _signal(block: WaveformBlock, noise: Noise) -> np.ndarray:
 def _table(
     block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
 ) -> EchoTable:
-    """Candidates in samples as a table in ns."""
-    return EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
+    """Candidates in samples as a table in ns; a constant waveform has none, whatever filters make of its ends (H10)."""
+    rows, row = np.unique(waveform, return_inverse=True)
+    samples = block.samples[rows]
+    varies = (samples.max(axis=1, initial=0) > samples.min(axis=1, initial=block.digitizer.max_count))[row]
+    table = EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
+    return table if varies.all() else table.take(np.flatnonzero(varies))
 
 
 @stage("detect")

@@ -13,6 +13,26 @@ OVERLAP = 2.0
 """Widths of the narrower echo within which two may be one: further apart, a weak one's poor time says nothing."""
 
 
+TWINS = 0.1
+"""Distance in widths below which two echoes that were fitted on their own are one and the same."""
+
+
+def drop_twins(table: EchoTable) -> EchoTable:
+    """The table without the weaker of two neighbours that were fitted each on its own and ended in the same place."""
+    if len(table) < 2:
+        return table
+    same = np.diff(table.waveform) == 0
+    near = np.diff(table.time) < TWINS * np.minimum(table.sigma[1:], table.sigma[:-1])
+    apart = (table.flags[1:] & table.flags[:-1] & np.uint16(EchoFlag.OVERLAPPED)) == 0
+    twin = np.flatnonzero(same & near & apart)
+    if not len(twin):
+        return table
+    keep = np.ones(len(table), bool)
+    weaker_first = table.amplitude[twin] < table.amplitude[twin + 1]
+    keep[np.where(weaker_first, twin, twin + 1)] = False
+    return table.take(np.flatnonzero(keep))
+
+
 def merge_unresolved(table: EchoTable) -> EchoTable:
     """The table with neighbours closer than a quarter of the error of their distance merged, one pair after the other.
 
