@@ -73,6 +73,7 @@ _SHORT = {
     "echo_time": "echo after first sample",
     "energy": "integral of the echo",
     "backscatter_coefficient": "gamma: section per area",
+    "backscatter_coefficient_err": "1 sigma of gamma",
     "incidence_angle": "ray to surface normal",
     "pulse_deviation": "Gauss-Hermite deviation",
 }
@@ -126,7 +127,7 @@ def normalise(name: str) -> str:
 def describe(column: Column, unit: str | None = None) -> str:
     """Meaning and unit of the column in at most 32 bytes, `meaning [unit]`."""
     tail = f" [{unit or column.unit}]"
-    if column.name.endswith("_err"):
+    if column.name.endswith("_err") and column.name not in _SHORT:
         meaning = f"1 sigma of {column.name.removesuffix('_err')}"
     else:
         meaning = _SHORT.get(column.name, column.meaning)
