@@ -217,3 +217,11 @@ def test_joined_tables_keep_their_columns_in_order():
     assert list(joined.attributes) == list(whole.attributes)
     np.testing.assert_array_equal(joined.waveform, whole.waveform)
     np.testing.assert_array_equal(joined.time, whole.time)
+
+
+def test_a_value_that_a_stage_refuses_is_the_chain_files_fault():
+    steps = [("noise.tail", {"samples": 1}), ("detect.maximum", {}), ("decompose.none", {})]
+    chain = Chain(tuple(Step(STAGES[name], values) for name, values in steps), name="mine.toml")
+    block = WaveformBlock.from_samples(np.full((3, 20), 9, np.uint8))
+    with pytest.raises(ConfigError, match=r"chain mine\.toml: noise\.tail: samples must be at least 2, got 1"):
+        chain.run(block, SystemPulse(2.0))

@@ -173,6 +173,8 @@ class Chain:
             arguments = [data[name] for name in KINDS[step.stage.kind][0]]
             try:
                 result = step.stage.function(*arguments, **step.parameters)
+            except ConfigError as error:
+                raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
             except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
                 raise StageError(
                     f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "

@@ -6,6 +6,7 @@ import numpy as np
 
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.errors import ConfigError
 from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.units import QUANTISATION_STD
 
@@ -44,7 +45,7 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: int = 16) -> Noi
     samples: how many samples at the end are taken for noise.
     """
     if samples < 2:
-        raise ValueError(f"samples must be at least 2, got {samples}")
+        raise ConfigError(f"samples must be at least 2, got {samples}")
     end = transpose_samples(block.samples[:, -samples:])
     baseline = np.median(end, axis=0)
     deviation = end - baseline
