@@ -5,7 +5,7 @@ import pytest
 from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
 from wavebatch import survey
-from wavebatch.blocks import EchoTable
+from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
@@ -67,3 +67,12 @@ def test_parts_of_a_block_do_not_show(monkeypatch):
     for name, table in zip(names, whole, strict=True):
         assert_same(call(name, {}, block, system), table)
         assert np.unique(table.waveform).size > 40
+
+
+@pytest.mark.parametrize("name", sorted(name for name, stage in STAGES.items() if stage.kind == "detect"))
+def test_a_constant_waveform_holds_no_echo(name):
+    """H10, T15: whatever its level, and whatever a filter makes of its ends."""
+    block = WaveformBlock.from_samples(np.repeat(np.array([0, 12, 40, 255], np.uint8)[:, None], 80, axis=1))
+    system = SystemPulse(2.0, baseline=12, noise_std=1.0)
+    noise = STAGES["noise.pooled"].function(block, system)
+    assert len(STAGES[name].function(block, noise, system)) == 0

@@ -14,9 +14,8 @@ from wavebatch import __version__
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.io.fingerprint import take_fingerprint
-from wavebatch.io.publish import Draft, reporting
 from wavebatch.report import RunReport
-from wavebatch.systemfile import format_survey
+from wavebatch.systemfile import format_survey, write_text
 from wavebatch.work import Prepared, StripJob
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
@@ -130,14 +129,7 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
     """The document as a file that appears whole or not at all."""
-    text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False) + "\n"
-    draft = Draft(path, overwrite=overwrite)
-    try:
-        with reporting(path):
-            draft.file.write(text.encode())
-        draft.publish()
-    finally:
-        draft.discard()
+    write_text(path, json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False) + "\n", overwrite=overwrite)
 
 
 def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:

@@ -15,6 +15,17 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
     return signal
 
 
+def make_table(
+    block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
+) -> EchoTable:
+    """Candidates in samples as a table in ns; a constant waveform has none, whatever filters make of its ends (H10)."""
+    rows, row = np.unique(waveform, return_inverse=True)
+    samples = block.samples[rows]
+    varies = (samples.max(axis=1, initial=0) > samples.min(axis=1, initial=block.digitizer.max_count))[row]
+    table = EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
+    return table if varies.all() else table.take(np.flatnonzero(varies))
+
+
 def candidate_table(
     block: WaveformBlock,
     system: SystemPulse,
@@ -29,9 +40,10 @@ def candidate_table(
     """
     ref = system.sigma_ref / block.spacing
     last = block.samples.shape[1] - 1
-    return EchoTable.build(
+    return make_table(
+        block,
         waveform,
-        np.clip(time, 0.0, last) * block.spacing,
+        np.clip(time, 0.0, last),
         np.maximum(amplitude, 0.0),
-        np.clip(width, 0.7 * ref, 4.0 * ref) * block.spacing,
+        np.clip(width, 0.7 * ref, 4.0 * ref),
     )

@@ -14,28 +14,11 @@ from wavebatch.kernels.filters import (
     gaussian_taps,
     refine_peaks,
 )
-from wavebatch.kernels.signal import SMOOTH_GAIN, find_peaks, smooth_121, transpose_samples
+from wavebatch.kernels.signal import SMOOTH_GAIN, find_peaks, smooth_121
+from wavebatch.stages.candidates import make_table, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
-
-
-def _signal(block: WaveformBlock, noise: Noise) -> np.ndarray:
-    """Signal above the baseline, float32 (s, n)."""
-    signal = transpose_samples(block.samples)
-    signal -= noise.baseline
-    return signal
-
-
-def _table(
-    block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
-) -> EchoTable:
-    """Candidates in samples as a table in ns; a constant waveform has none, whatever filters make of its ends (H10)."""
-    rows, row = np.unique(waveform, return_inverse=True)
-    samples = block.samples[rows]
-    varies = (samples.max(axis=1, initial=0) > samples.min(axis=1, initial=block.digitizer.max_count))[row]
-    table = EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
-    return table if varies.all() else table.take(np.flatnonzero(varies))
 
 
 @stage("detect")
@@ -47,7 +30,7 @@ def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshol
 
     threshold: least height above the baseline, in standard deviations of the smoothed noise.
     """
-    smoothed = smooth_121(_signal(block, noise))
+    smoothed = smooth_121(signal_above(block, noise))
     twice = smooth_121(smoothed)
     waveform, sample = find_peaks(twice, np.float32(threshold * TWICE_SMOOTHED_GAIN) * noise.std)
     ref = system.sigma_ref / block.spacing
@@ -56,7 +39,7 @@ def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshol
     crowded = np.flatnonzero(gap < 4.0 * ref)
     time[crowded], amplitude[crowded] = refine_peaks(smoothed, waveform[crowded], sample[crowded])
     width = np.minimum(width, 0.5 * gap)
-    return _table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
+    return make_table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
 
 
 def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
@@ -82,12 +65,12 @@ def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, t
     ref = system.sigma_ref / block.spacing
     taps = gaussian_taps(ref)
     energy = filter_energy(taps)
-    signal = _signal(block, noise)
+    signal = signal_above(block, noise)
     correlation = filter_symmetric(signal, taps)
     waveform, sample = find_peaks(correlation, np.float32(threshold * np.sqrt(energy)) * noise.std)
     time, height = refine_peaks(correlation, waveform, sample)
     _, _, width = estimate_starts(smooth_121(signal), waveform, sample, ref)
-    return _table(block, waveform, time, height / energy, np.clip(width, 0.8 * ref, 2.0 * ref))
+    return make_table(block, waveform, time, height / energy, np.clip(width, 0.8 * ref, 2.0 * ref))
 
 
 @stage("detect")
@@ -109,7 +92,7 @@ def second_derivative(
     scale: width of the smoothing, in widths of the system pulse.
     level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
     """
-    signal = _signal(block, noise)
+    signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
     ref = system.sigma_ref / block.spacing
     taps = curvature_taps(max(scale * ref, 0.7))
@@ -120,4 +103,4 @@ def second_derivative(
     waveform, sample = waveform[high], sample[high]
     time, _ = refine_peaks(curvature, waveform, sample)
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)
-    return _table(block, waveform, time, amplitude, np.clip(width, 0.8 * ref, 2.0 * ref))
+    return make_table(block, waveform, time, amplitude, np.clip(width, 0.8 * ref, 2.0 * ref))
