@@ -289,3 +289,55 @@ def test_bad_files_and_values_give_one_line(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(ConfigError, match="tolerance"):
         compare_clouds(good, good, tolerance_ns=0)
+
+
+@pytest.mark.parametrize("by", ["time", "place"])
+def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatch, by):
+    pulse, times, xyz, ray = make_pulses(2000, seed=6)
+    rng = np.random.default_rng(7)
+    total = np.bincount(pulse)[pulse]
+    number = np.arange(len(pulse)) - np.searchsorted(pulse, pulse) + 1
+    times = times if by == "time" else np.zeros(len(times))
+    keep = rng.random(len(times)) < 0.8
+    moved = xyz.copy()
+    far = rng.random(len(times)) < 0.05
+    moved[far] += 1.5 * SPEED * ray[far]
+    flags = np.where(far, EchoFlag.WEAK | EchoFlag.OVERLAPPED, np.where(rng.random(len(times)) < 0.3, 32, 0))
+    amplitude = np.exp(rng.uniform(-1, 6, len(times))).astype("f4")
+    amplitude[:9] = np.nan
+    write_cloud(tmp_path / "a.las", times[keep], moved[keep], echo_flags=flags[keep].astype("u2"))
+    write_cloud(tmp_path / "b.las", times, xyz, amplitude=amplitude)
+    for name, these in (("a.las", keep), ("b.las", np.ones(len(keep), bool))):
+        cloud = laspy.read(tmp_path / name)
+        cloud.return_number, cloud.number_of_returns = number[these], total[these]
+        cloud.intensity = np.full(these.sum(), 9)
+        cloud.write(tmp_path / name)
+    monkeypatch.setattr(module, "BUCKET_POINTS", 900)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    missed, extra = far | ~keep, far & keep
+    naive = {"return": {}, "amplitude": {}, "flag": {}}
+    for echo in range(len(times)):
+        classes = {"return": f"{number[echo]} of {total[echo]}"}
+        if not np.isnan(amplitude[echo]):
+            n = int(np.floor(np.log2(amplitude[echo])))
+            classes["amplitude"] = "below 1" if n < 0 else f"{2**n}-{2 ** (n + 1)}"
+        for kind, name in classes.items():
+            old = naive[kind].get(name, (0, 0))
+            naive[kind][name] = (old[0] + int(missed[echo]), old[1] + 1)
+    assert (result.missed, result.extra) == (missed.sum(), extra.sum())
+    assert result.missed_by["return"] == naive["return"]
+    assert result.missed_by["amplitude"] == naive["amplitude"]
+    assert set(result.missed_by) == {"return", "amplitude", *(["pulse"] if by == "time" else [])}
+    of = keep & ~far & (flags == 32)
+    weak = {"WEAK": (extra.sum(), extra.sum() + of.sum()), "OVERLAPPED": (extra.sum(), extra.sum())}
+    assert result.extra_by["flag"] == {**weak, "none": (0, (keep & (flags == 0)).sum())}
+    assert result.extra_by["intensity"] == {"8-16": (extra.sum(), keep.sum())}
+    if by == "time":
+        found = np.bincount(pulse[keep], minlength=2000)[pulse] > 0
+        assert result.missed_by["pulse"] == {
+            "nothing of the other side": ((missed & ~found).sum(), (~found).sum()),
+            "other echoes of the other side": ((missed & found).sum(), found.sum()),
+        }
+    both = 2 * result.matched / (result.echoes_a + result.echoes_b)
+    assert result.identical == pytest.approx(both) and result.to_dict()["identical"] == result.identical
+    assert result.gain == pytest.approx(keep.sum() / len(times) - 1)

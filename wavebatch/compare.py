@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from wavebatch.blocks import EchoFlag
-from wavebatch.differences import SPEED, Differences, Spread
+from wavebatch.comparison import Comparison, Pairing
 from wavebatch.errors import ConfigError
-from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
 from wavebatch.io.buckets import Buckets
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader
@@ -31,46 +28,6 @@ _MOST_PER_PULSE = 32
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
 _PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """What cloud a has in common with b (another cloud, or the truth). Shares are NaN where nothing is to be shared."""
-
-    a: str
-    b: str
-    matched_by: str
-    """`gps_time`: within pulses of equal time; `position`: nearest neighbours of each other."""
-    tolerance_ns: float
-    pulses: int
-    """Pulses of either (of the truth: its packets); 0 when matched by position."""
-    echoes_a: int
-    echoes_b: int
-    matched: int
-    missed: int
-    """Echoes of b that a lacks."""
-    extra: int
-    """Echoes of a that b lacks."""
-    completeness: float
-    """Share of b's echoes that a has."""
-    correctness: float
-    """Share of a's echoes that b has."""
-    exact_count: float
-    """Share of the pulses with as many echoes in a as in b."""
-    counts_a: dict[int, int]
-    """Pulses by number of echoes in a; those with none are known from b."""
-    counts_b: dict[int, int]
-    differences: dict[str, Spread]
-    """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
-    errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
-    """Against truth only: per class (all, isolated, overlapped) and quantity, with error / bound and calibration.
-
-    `time` is the error of the position; `echo_time`, where the cloud has it, that of the fit alone.
-    Medians and errors of more than a million pairs are those of an even sample."""
-
-    def to_dict(self) -> dict:
-        """Plain numbers, lists and dictionaries for JSON."""
-        return asdict(self)
 
 
 def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison:
@@ -146,16 +103,11 @@ class _Task:
     """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket."""
 
     def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
-        self.by_time, self.tolerance, self.tolerance_ns = by_time, tolerance_ns * SPEED, tolerance_ns
-        self.meta = meta
+        self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
         self.number = min(-(-max(points, 1) // BUCKET_POINTS), MOST_BUCKETS)
         dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, _PACKET_DTYPE)
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)
-        self.pulses = self.exact = self.matched = 0
-        self.echoes = [0, 0]
-        self.counts = [np.zeros(1, np.int64), np.zeros(1, np.int64)]
-        self.differences = Differences()
 
     def place_borders(self, reader: CloudReader) -> None:
         """Borders along x of slabs with about the same number of points."""
@@ -174,8 +126,8 @@ class _Task:
     def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The slab of every point, and the neighbouring ones that it is close to."""
         index, bucket = [], []
-        low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.tolerance)
-        high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.tolerance)
+        low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
+        high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.pairing.tolerance)
         for step in range(int((high - low).max(initial=0)) + 1):
             inside = np.flatnonzero(low + step <= high)
             index.append(inside)
@@ -187,76 +139,10 @@ class _Task:
         for number in range(self.number):
             a, b, packets = (bucket.read(number) for bucket in self.buckets)
             if self.by_time:
-                self._compare_by_time(a, b, packets)
+                self.pairing.pair_by_time(a, b, packets)
             else:
-                self._compare_by_place(a, b, number)
+                own = [np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b)]
+                self.pairing.pair_by_place(a, b, (own[0], own[1]))
         for bucket in self.buckets:
             bucket.close()
-        a, b = self.echoes
-        return Comparison(
-            a=name_a,
-            b=name_b,
-            matched_by="gps_time" if self.by_time else "position",
-            tolerance_ns=self.tolerance_ns,
-            pulses=self.pulses,
-            echoes_a=a,
-            echoes_b=b,
-            matched=self.matched,
-            missed=b - self.matched,
-            extra=a - self.matched,
-            completeness=self.matched / b if b else float("nan"),
-            correctness=self.matched / a if a else float("nan"),
-            exact_count=self.exact / self.pulses if self.pulses else float("nan"),
-            counts_a=_list_counts(self.counts[0]),
-            counts_b=_list_counts(self.counts[1]),
-            differences=self.differences.spreads(),
-            errors=self.differences.errors(self.meta) if self.meta else {},
-        )
-
-    def _compare_by_time(self, a: np.ndarray, b: np.ndarray, packets: np.ndarray) -> None:
-        times = np.concatenate([a["gps_time"], b["gps_time"], packets["gps_time"]])
-        known, group = np.unique(times, return_inverse=True)
-        in_a, in_b = group[: len(a)], group[len(a) : len(a) + len(b)]
-        number_a, number_b = (np.bincount(g, minlength=len(known)) for g in (in_a, in_b))
-        counted = slice(None)
-        if self.meta:
-            counted = np.unique(group[len(a) + len(b) :])
-        self.pulses += len(number_a[counted])
-        self.exact += int((number_a[counted] == number_b[counted]).sum())
-        self.counts = [_add_counts(old, n[counted]) for old, n in zip(self.counts, (number_a, number_b), strict=True)]
-        # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
-        left, right = list_pairs(in_a, a["xyz"][:, 2], in_b, b["xyz"][:, 2], self.tolerance)
-        distance = np.linalg.norm(a["xyz"][left] - b["xyz"][right], axis=1)
-        near = np.flatnonzero(distance <= self.tolerance)
-        left, right, distance = left[near], right[near], distance[near]
-        kept = pair_nearest(left, right, distance, len(a), len(b))
-        self._count(len(a), len(b), a[left[kept]], b[right[kept]])
-
-    def _compare_by_place(self, a: np.ndarray, b: np.ndarray, number: int) -> None:
-        own = [np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b)]
-        none = np.empty(0, np.int64)
-        left = right = none
-        if len(a) and len(b):
-            to_b, nearest_b = cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
-            _, nearest_a = cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
-            left = np.flatnonzero(np.isfinite(to_b) & own[0])
-            right = nearest_b[left]
-            mutual = nearest_a[right] == left
-            left, right = left[mutual], right[mutual]
-        self._count(int(own[0].sum()), int(own[1].sum()), a[left], b[right])
-
-    def _count(self, echoes_a: int, echoes_b: int, a: np.ndarray, b: np.ndarray) -> None:
-        self.echoes[0] += echoes_a
-        self.echoes[1] += echoes_b
-        self.matched += len(a)
-        self.differences.add(a, b)
-
-
-def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    new = np.bincount(numbers, minlength=len(old))
-    new[: len(old)] += old
-    return new
-
-
-def _list_counts(counts: np.ndarray) -> dict[int, int]:
-    return {number: int(pulses) for number, pulses in enumerate(counts) if pulses}
+        return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")

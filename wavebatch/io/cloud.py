@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo
 
+from wavebatch.blocks import COLUMNS
 from wavebatch.errors import InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, read_records
 from wavebatch.io.header import STANDARD_DTYPES, has_record, read_header
@@ -23,11 +24,14 @@ CLOUD_DTYPE = np.dtype(
         ("xyz", "<f8", 3),
         ("ray", "<f4", 3),
         ("flags", "<u2"),
+        ("number", "u1"),
+        ("total", "u1"),
+        ("intensity", "<u2"),
         *((name, "<f4") for name in CLOUD_COLUMNS),
     ]
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0 where there is none; it may point either
-way), EchoFlag bits, and columns (NaN: no data)."""
+way), EchoFlag bits, return number and number of returns, intensity, and columns (NaN: no data)."""
 
 _PIECE = 250_000
 _FAULTS = (ValueError, OSError, OverflowError, MemoryError, RuntimeError, laspy.errors.LaspyException)
@@ -48,7 +52,7 @@ class CloudReader:
         names = set(header.point_format.dimension_names)
         self.has_gps_time = "gps_time" in names
         self.has_packets = "wavepacket_index" in names
-        self._sources = _find_columns(list(header.point_format.extra_dimensions))
+        self._sources = find_columns(list(header.point_format.extra_dimensions), (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
 
     def __enter__(self) -> CloudReader:
@@ -84,6 +88,8 @@ class CloudReader:
         for name in CLOUD_COLUMNS:
             source = self._sources.get(name)
             rows[name] = np.nan if source is None else self._read_column(raw, source)
+        rows["number"], rows["total"] = split_numbers(raw)
+        rows["intensity"] = raw["intensity"]
         if "echo_flags" in self._sources:
             rows["flags"] = raw[self._sources["echo_flags"].name]
         if not self.has_packets:
@@ -109,6 +115,13 @@ class CloudReader:
         return InputError(f"{self.path}: cannot be read as LAS or LAZ: {reason}; run `wavebatch check` on it")
 
 
+def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return numbers and numbers of returns of raw records, u1 (n,) each."""
+    if "classification_flags" in raw.dtype.names:
+        return raw["bit_fields"] & 15, raw["bit_fields"] >> 4
+    return raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
+
+
 def _backends() -> list[laspy.LazBackend]:
     """LAZ decoders that are there; the single-threaded one, because it takes the same time in a batch of jobs."""
     wanted = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
@@ -124,18 +137,19 @@ def _read_no_data(path: Path) -> dict[str, float]:
     return {record.name: record.no_data[0] for record in records if record.no_data is not None}
 
 
-def _find_columns(extra: list[DimensionInfo]) -> dict[str, DimensionInfo]:
-    """Extra dimension per column: our own name before those of the other styles, `wb ` in front before without.
+def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
+    """Extra dimension of those among `columns` that are there: our own name before those of the other styles, `wb ` in front before without.
 
     A dimension of another style counts only when it is stored as that style stores it: RIEGL's Amplitude is in dB.
     """
     by_name = {dimension.name: dimension for dimension in extra}
-    names = [(column, column, None) for column in (*CLOUD_COLUMNS, "echo_flags")]
+    wanted = set(columns)
+    names = [(column, column, None) for column in COLUMNS if column in wanted]
     for style in STYLES.values():
-        names += [(column, naming.name, naming.scale) for column, naming in style.items() if not naming.decibel]
+        names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
     found: dict[str, DimensionInfo] = {}
     for column, name, scale in names:
         for dimension in (by_name.get(f"wb {name}"), by_name.get(name)):
-            if dimension is not None and (dimension.scales is None) == (scale is None):
+            if column in wanted and dimension is not None and (dimension.scales is None) == (scale is None):
                 found.setdefault(column, dimension)
     return found

@@ -10,7 +10,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.errors import ConfigError
-from wavebatch.io.cloud import CloudReader
+from wavebatch.io.cloud import CloudReader, split_numbers
 from wavebatch.io.extra import build_dtype
 from wavebatch.io.header import WKT_BIT, LasHeader, Vlr
 from wavebatch.io.pointfile import PointFile
@@ -56,12 +56,9 @@ class ReturnReader(CloudReader):
             rows["xyz"][:, axis] = raw[name] * points.scales[axis] + points.offsets[axis]
         if self.has_gps_time:
             rows["gps_time"] = widen(raw["gps_time"])
-        if "classification_flags" in raw.dtype.names:
-            rows["number"], rows["total"] = raw["bit_fields"] & 15, raw["bit_fields"] >> 4
-            rows["angle"] = raw["scan_angle"] * np.float32(0.006)
-        else:
-            rows["number"], rows["total"] = raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
-            rows["angle"] = raw["scan_angle_rank"]
+        rows["number"], rows["total"] = split_numbers(raw)
+        modern = "classification_flags" in raw.dtype.names
+        rows["angle"] = raw["scan_angle"] * np.float32(0.006) if modern else raw["scan_angle_rank"]
         rows["intensity"], rows["source"] = raw["intensity"], raw["point_source_id"]
         width = self._sources.get("echo_width")
         rows["echo_width"] = np.nan if width is None else self._read_column(raw, width)

@@ -1,0 +1,184 @@
+"""What two sides have in common: pairs within pulses or by place, counted and measured bucket by bucket."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wavebatch.breakdown import Breakdown, Table
+from wavebatch.differences import SPEED, Differences, Spread
+from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What cloud a has in common with b (another cloud, or the truth). Shares are NaN where nothing is to be shared."""
+
+    a: str
+    b: str
+    matched_by: str
+    """`gps_time`: within pulses of equal time; `position`: nearest neighbours of each other; `waveform`: within each
+    waveform of the strip, by time after its first sample."""
+    tolerance_ns: float
+    pulses: int
+    """Pulses of either (of the truth: its packets); 0 when matched by position."""
+    echoes_a: int
+    echoes_b: int
+    matched: int
+    missed: int
+    """Echoes of b that a lacks."""
+    extra: int
+    """Echoes of a that b lacks."""
+    completeness: float
+    """Share of b's echoes that a has."""
+    correctness: float
+    """Share of a's echoes that b has."""
+    exact_count: float
+    """Share of the pulses with as many echoes in a as in b."""
+    counts_a: dict[int, int]
+    """Pulses by number of echoes in a; those with none are known from b."""
+    counts_b: dict[int, int]
+    differences: dict[str, Spread]
+    """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
+    errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
+    """Against truth only: per class (all, isolated, overlapped) and quantity, with error / bound and calibration.
+
+    `time` is the error of the position; `echo_time`, where the cloud has it, that of the fit alone.
+    Medians and errors of more than a million pairs are those of an even sample."""
+
+    missed_by: dict[str, Table] = field(default_factory=dict)
+    """What the missed echoes are: per kind (return, amplitude or intensity, pulse, flag) and class of it, those missed
+    and all of b's. An echo counts for each of its flags. Intensity stands in where b has no amplitudes."""
+    extra_by: dict[str, Table] = field(default_factory=dict)
+    """What the extra echoes are, as `missed_by`."""
+
+    @property
+    def identical(self) -> float:
+        """Share of the echoes of both that the other side has too (Wagner et al., tables 1 and 2)."""
+        return _share(2 * self.matched, self.echoes_a + self.echoes_b)
+
+    @property
+    def gain(self) -> float:
+        """How many more echoes a has than b, as a share of b's."""
+        return _share(self.echoes_a - self.echoes_b, self.echoes_b)
+
+    def to_dict(self) -> dict:
+        """Plain numbers, lists and dictionaries for JSON."""
+        return {**asdict(self), "identical": self.identical, "gain": self.gain}
+
+
+class Pairing:
+    """Pairs echoes of a and b (records of io.cloud.CLOUD_DTYPE), part by part, and sums up what they have in common.
+
+    tolerance_ns: largest distance of the same echo along the ray. meta: of the truth where b is one.
+    """
+
+    def __init__(self, tolerance_ns: float, meta: dict | None = None) -> None:
+        self.tolerance, self.tolerance_ns = tolerance_ns * SPEED, tolerance_ns
+        self.meta = meta
+        self.pulses = self.exact = self.matched = 0
+        self.echoes = [0, 0]
+        self.counts = [np.zeros(1, np.int64), np.zeros(1, np.int64)]
+        self.differences = Differences()
+        self.breakdowns = (Breakdown(), Breakdown())
+
+    def pair_by_time(self, a: np.ndarray, b: np.ndarray, packets: np.ndarray) -> None:
+        """Takes in pulses that are whole: echoes of equal gps_time are of one.
+
+        packets: records with the gps_time of every pulse that counts, those without an echo too; where there is none,
+        all pulses with an echo count.
+        """
+        times = np.concatenate([a["gps_time"], b["gps_time"], packets["gps_time"]])
+        known, group = np.unique(times, return_inverse=True)
+        in_a, in_b = group[: len(a)], group[len(a) : len(a) + len(b)]
+        number_a, number_b = (np.bincount(g, minlength=len(known)) for g in (in_a, in_b))
+        counted = slice(None)
+        if self.meta or len(packets):
+            counted = np.unique(group[len(a) + len(b) :])
+        self.pulses += len(number_a[counted])
+        self.exact += int((number_a[counted] == number_b[counted]).sum())
+        self.counts = [_add_counts(old, n[counted]) for old, n in zip(self.counts, (number_a, number_b), strict=True)]
+        # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
+        left, right = list_pairs(in_a, a["xyz"][:, 2], in_b, b["xyz"][:, 2], self.tolerance)
+        distance = np.linalg.norm(a["xyz"][left] - b["xyz"][right], axis=1)
+        near = np.flatnonzero(distance <= self.tolerance)
+        left, right, distance = left[near], right[near], distance[near]
+        kept = pair_nearest(left, right, distance, len(a), len(b))
+        left, right = left[kept], right[kept]
+        self.differences.add(a[left], b[right])
+        self._count(0, a, left, number_b[in_a])
+        self._count(1, b, right, number_a[in_b])
+        self.matched += len(left)
+
+    def pair_by_place(self, a: np.ndarray, b: np.ndarray, own: tuple[np.ndarray, np.ndarray]) -> None:
+        """Takes in a region: nearest neighbours of each other are pairs.
+
+        own: echoes that count, bool (k,) for a and b; the others are there as neighbours only.
+        """
+        none = np.empty(0, np.int64)
+        left = right = none
+        if len(a) and len(b):
+            to_b, nearest_b = cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
+            _, nearest_a = cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
+            left = np.flatnonzero(np.isfinite(to_b))
+            right = nearest_b[left]
+            mutual = nearest_a[right] == left
+            left, right = left[mutual], right[mutual]
+        self._count(0, a, left, None, own[0])
+        self._count(1, b, right, None, own[1])
+        # A pair across a border belongs to the region of its echo of a.
+        inside = own[0][left]
+        self.differences.add(a[left[inside]], b[right[inside]])
+        self.matched += int(inside.sum())
+
+    def finish(self, name_a: str, name_b: str, matched_by: str) -> Comparison:
+        """What all parts have in common."""
+        a, b = self.echoes
+        return Comparison(
+            a=name_a,
+            b=name_b,
+            matched_by=matched_by,
+            tolerance_ns=self.tolerance_ns,
+            pulses=self.pulses,
+            echoes_a=a,
+            echoes_b=b,
+            matched=self.matched,
+            missed=b - self.matched,
+            extra=a - self.matched,
+            completeness=_share(self.matched, b),
+            correctness=_share(self.matched, a),
+            exact_count=_share(self.exact, self.pulses),
+            counts_a=_list_counts(self.counts[0]),
+            counts_b=_list_counts(self.counts[1]),
+            differences=self.differences.spreads(),
+            errors=self.differences.errors(self.meta) if self.meta else {},
+            missed_by=self.breakdowns[1].tables(),
+            extra_by=self.breakdowns[0].tables(),
+        )
+
+    def _count(
+        self, side: int, rows: np.ndarray, paired: np.ndarray, others: np.ndarray | None, own: np.ndarray | None = None
+    ) -> None:
+        """Echoes of one side: those that are paired, and how many the other side has in their pulses."""
+        alone = np.ones(len(rows), bool)
+        alone[paired] = False
+        if own is not None:
+            rows, alone = rows[own], alone[own]
+        self.echoes[side] += len(rows)
+        self.breakdowns[side].add(rows, alone, others)
+
+
+def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    new = np.bincount(numbers, minlength=len(old))
+    new[: len(old)] += old
+    return new
+
+
+def _list_counts(counts: np.ndarray) -> dict[int, int]:
+    return {number: int(pulses) for number, pulses in enumerate(counts) if pulses}
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else float("nan")
