@@ -7,13 +7,12 @@ from pathlib import Path
 
 import laspy
 import numpy as np
-from laspy.point.dims import DimensionInfo
+from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.blocks import COLUMNS
-from wavebatch.errors import InputError
-from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, read_records
-from wavebatch.io.header import STANDARD_DTYPES, has_record, read_header
+from wavebatch.io.cloudpoints import CloudPoints
 from wavebatch.io.names import STYLES
+from wavebatch.io.rawbytes import widen
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read where the cloud has them."""
@@ -34,7 +33,9 @@ CLOUD_DTYPE = np.dtype(
 way), EchoFlag bits, return number and number of returns, intensity, and columns (NaN: no data)."""
 
 _PIECE = 250_000
-_FAULTS = (ValueError, OSError, OverflowError, MemoryError, RuntimeError, laspy.errors.LaspyException)
+_PIECE_BYTES = 1 << 26
+_LARGEST = 1e30
+"""Values beyond are damage, no data: their squares would leave single precision."""
 
 
 class CloudReader:
@@ -42,11 +43,7 @@ class CloudReader:
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        try:
-            self._file = laspy.open(self.path, read_evlrs=False, laz_backend=_backends())
-            self._no_data = _read_no_data(self.path)
-        except _FAULTS as error:
-            raise self._complain(error) from error
+        self._file = CloudPoints(self.path)
         header = self._file.header
         self.point_count: int = header.point_count
         names = set(header.point_format.dimension_names)
@@ -66,17 +63,9 @@ class CloudReader:
 
         Points whose packet index is 0 are left out of clouds that still have packets.
         """
-        done = 0
-        try:
-            if self.point_count:
-                self._file.seek(0)
-            for points in self._file.chunk_iterator(size):
-                done += len(points)
-                yield self._convert(points)
-        except _FAULTS as error:
-            raise self._complain(error) from error
-        if done != self.point_count:
-            raise InputError(f"{self.path}: holds {done} points, its header says {self.point_count}; the file is cut")
+        size = max(min(size, _PIECE_BYTES // self._file.header.point_format.size), 1)
+        for start in range(0, self.point_count, size):
+            yield self._convert(self._file.read(start, min(start + size, self.point_count)))
 
     def _convert(self, points: laspy.ScaleAwarePointRecord) -> np.ndarray:
         raw = points.array
@@ -84,14 +73,14 @@ class CloudReader:
         for axis, name in enumerate("XYZ"):
             rows["xyz"][:, axis] = raw[name] * points.scales[axis] + points.offsets[axis]
         if self.has_gps_time:
-            rows["gps_time"] = raw["gps_time"]
+            rows["gps_time"] = widen(raw["gps_time"])
         for name in CLOUD_COLUMNS:
             source = self._sources.get(name)
             rows[name] = np.nan if source is None else self._read_column(raw, source)
         rows["number"], rows["total"] = split_numbers(raw)
         rows["intensity"] = raw["intensity"]
         if "echo_flags" in self._sources:
-            rows["flags"] = raw[self._sources["echo_flags"].name]
+            rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
         if not self.has_packets:
             return rows
         for axis, name in enumerate(("x_t", "y_t", "z_t")):
@@ -100,19 +89,13 @@ class CloudReader:
 
     def _read_column(self, raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
         """Physical values, NaN where the no-data value stands."""
-        stored = raw[dimension.name]
-        values = stored.astype(np.float64)
-        if dimension.scales is not None:
-            values = values * dimension.scales[0] + (0.0 if dimension.offsets is None else dimension.offsets[0])
-        if dimension.name in self._no_data:
-            values[stored == self._no_data[dimension.name]] = np.nan
-        return values
-
-    def _complain(self, error: BaseException) -> InputError:
-        if isinstance(error, InputError):
-            return error
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        return InputError(f"{self.path}: cannot be read as LAS or LAZ: {reason}; run `wavebatch check` on it")
+        values = widen(raw[dimension.name])
+        with np.errstate(over="ignore", invalid="ignore"):
+            if dimension.scales is not None:
+                values = values * dimension.scales[0] + dimension.offsets[0]
+            if dimension.no_data is not None:
+                values[raw[dimension.name] == dimension.no_data[0]] = np.nan
+            return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
 
 def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,23 +105,9 @@ def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
 
 
-def _backends() -> list[laspy.LazBackend]:
-    """LAZ decoders that are there; the single-threaded one, because it takes the same time in a batch of jobs."""
-    wanted = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
-    return [backend for backend in wanted if backend.is_available()]
-
-
-def _read_no_data(path: Path) -> dict[str, float]:
-    """Stored value that means "none" per extra dimension that declares one; laspy loses it on reading."""
-    header = read_header(path)
-    payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
-    size = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
-    records = read_records(payloads[0] if payloads else b"", size)
-    return {record.name: record.no_data[0] for record in records if record.no_data is not None}
-
-
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
-    """Extra dimension of those among `columns` that are there: our own name before those of the other styles, `wb ` in front before without.
+    """Extra dimension per column, of those that are there: our own name before those of the other styles, `wb ` in
+    front before without.
 
     A dimension of another style counts only when it is stored as that style stores it: RIEGL's Amplitude is in dB.
     """
@@ -150,6 +119,13 @@ def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str
     found: dict[str, DimensionInfo] = {}
     for column, name, scale in names:
         for dimension in (by_name.get(f"wb {name}"), by_name.get(name)):
-            if column in wanted and dimension is not None and (dimension.scales is None) == (scale is None):
+            if column in wanted and dimension is not None and _is_stored_as(dimension, column, scale):
                 found.setdefault(column, dimension)
     return found
+
+
+def _is_stored_as(dimension: DimensionInfo, column: str, scale: float | None) -> bool:
+    """Whether the dimension is one number, scaled or not as the style has it, and flags are bits."""
+    if dimension.num_elements != 1 or (dimension.scales is None) != (scale is None):
+        return False
+    return column != "echo_flags" or dimension.kind is DimensionKind.UnsignedInteger

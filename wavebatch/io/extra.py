@@ -14,7 +14,7 @@ RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
-_AT_NO_DATA, _AT_MIN, _AT_MAX = 40, 64, 88
+_AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_OFFSET, _AT_DESCRIPTION = 40, 64, 88, 112, 136, 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +55,11 @@ class ExtraRecord:
         return self.data[4:36].split(b"\0")[0].decode("utf-8", "replace")
 
     @property
+    def description(self) -> str:
+        """The description up to its first NUL."""
+        return self.data[_AT_DESCRIPTION:].split(b"\0")[0].decode("utf-8", "replace")
+
+    @property
     def code(self) -> int:
         """Data type of the LAS specification: 0 undocumented, 1-10 scalars, 11-30 the deprecated vectors."""
         return self.data[2]
@@ -84,6 +89,15 @@ class ExtraRecord:
         numbers = np.frombuffer(self.data, self._container, max(1, dtype.itemsize // dtype.base.itemsize), at)
         with np.errstate(over="ignore", invalid="ignore"):
             return numbers.astype(dtype.base)
+
+    @property
+    def scaling(self) -> tuple[float, float] | None:
+        """Scale and offset of a scalar's stored value, or None where it is the value itself."""
+        if not self.data[3] & _SCALE or not 1 <= self.code <= 10:
+            return None
+        (scale,) = struct.unpack_from("<d", self.data, _AT_SCALE)
+        (offset,) = struct.unpack_from("<d", self.data, _AT_OFFSET)
+        return scale, offset if self.data[3] & _OFFSET else 0.0
 
     @property
     def no_data(self) -> np.ndarray | None:

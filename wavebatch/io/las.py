@@ -1,4 +1,4 @@
-"""The header of a strip, checked before anything else is believed: sizes, counts, format, scale, compression."""
+"""The header of a strip or cloud, checked before anything else is believed: sizes, counts, format, scale."""
 
 from __future__ import annotations
 
@@ -50,20 +50,23 @@ class CheckedHeader:
     warnings: tuple[str, ...]
 
 
-def read_checked_header(path: Path) -> CheckedHeader:
+def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     """Header of the full-waveform strip at `path`; its VLRs are read, its points and EVLRs are not.
 
+    waveforms: False takes any LAS or LAZ file, of any version and point format.
     Raises InputError where it is not a LAS/LAZ strip with waveforms, or contradicts itself.
     """
     try:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
-            _check_front(path, file, size)
+            _check_front(path, file, size, (1, 3) if waveforms else (1, 0))
             header = read_header_of(file)
     except InputError:
         raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; check name and permissions") from error
+    if waveforms:
+        _check_waveforms(path, header)
     _check_format(path, header)
     _check_numbers(path, header)
     payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
@@ -74,16 +77,17 @@ def read_checked_header(path: Path) -> CheckedHeader:
     return CheckedHeader(path, size, header, build_dtype(header.point_format, records), records, points_end, warnings)
 
 
-def _check_front(path: Path, file: BinaryIO, size: int) -> None:
-    """Refuses what would make reading the header cost more than a header may."""
+def _check_front(path: Path, file: BinaryIO, size: int, least: tuple[int, int]) -> None:
+    """Refuses versions before `least`, and what would make reading the header cost more than a header may."""
     front = file.read(_FRONT_FIELDS.size)
     if len(front) < _FRONT_FIELDS.size or front[:4] != b"LASF":
         raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF)")
     _, major, minor, header_size, offset, vlrs, _, _ = _FRONT_FIELDS.unpack(front)
     known = HEADER_SIZES.get((major, minor))
-    if known is None or (major, minor) < (1, 3):
+    if known is None or (major, minor) < least:
+        what = "has no waveforms" if known else "is not known"
         raise InputError(
-            f"{path}: LAS version {major}.{minor} has no waveforms; wavebatch reads versions 1.3, 1.4 and 1.5"
+            f"{path}: LAS version {major}.{minor} {what}; wavebatch reads versions {least[0]}.{least[1]} to 1.5 here"
         )
     if size >= MAX_FILE:
         raise InputError(f"{path}: a file of {size} bytes is beyond what wavebatch addresses; tile the strip")
@@ -99,7 +103,7 @@ def _check_front(path: Path, file: BinaryIO, size: int) -> None:
         )
 
 
-def _check_format(path: Path, header: LasHeader) -> None:
+def _check_waveforms(path: Path, header: LasHeader) -> None:
     number = header.point_format
     if any(vlr.user == "lascompatible" for vlr in header.vlrs):
         raise InputError(
@@ -108,19 +112,28 @@ def _check_format(path: Path, header: LasHeader) -> None:
         )
     if number not in WAVEFORM_FORMATS:
         raise InputError(f"{path}: point format {number} has no waveforms; wavebatch needs format 4, 5, 9 or 10")
-    if number >= 9 and header.version < (1, 4):
-        raise InputError(f"{path}: point format {number} needs LAS 1.4, the header says 1.3; the header is damaged")
-    least = STANDARD_DTYPES[number].itemsize
-    if header.point_length < least:
-        raise InputError(
-            f"{path}: point records of {header.point_length} bytes are too short for format {number} ({least}); "
-            "the header is damaged: get the file again"
-        )
     both = WAVES_INTERNAL | WAVES_EXTERNAL
     if header.global_encoding & both == both:
         raise InputError(
             f"{path}: the header says that packets are in the file and in a .wdp (global encoding bits 1 and 2); "
             "clear the wrong bit of byte 6"
+        )
+
+
+def _check_format(path: Path, header: LasHeader) -> None:
+    number = header.point_format
+    if number not in STANDARD_DTYPES:
+        raise InputError(f"{path}: point format {number} is not known; the header is damaged: get the file again")
+    if number >= 6 and header.version < (1, 4):
+        major, minor = header.version
+        raise InputError(
+            f"{path}: point format {number} needs LAS 1.4, the header says {major}.{minor}; the header is damaged"
+        )
+    least = STANDARD_DTYPES[number].itemsize
+    if header.point_length < least:
+        raise InputError(
+            f"{path}: point records of {header.point_length} bytes are too short for format {number} ({least}); "
+            "the header is damaged: get the file again"
         )
 
 

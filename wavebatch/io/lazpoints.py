@@ -25,7 +25,10 @@ _LASZIP = struct.Struct("<HHBBHIIqqH")
 _ITEM = struct.Struct("<HHH")
 _VARIABLE = 2**32 - 1
 _ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
-_FORMAT_ITEMS = {4: (6, 7, 9), 5: (6, 7, 8, 9), 9: (10, 13), 10: (10, 12, 13)}
+_FORMAT_ITEMS = {
+    0: (6,), 1: (6, 7), 2: (6, 8), 3: (6, 7, 8), 4: (6, 7, 9), 5: (6, 7, 8, 9),
+    6: (10,), 7: (10, 11), 8: (10, 12), 9: (10, 13), 10: (10, 12, 13),
+}  # fmt: skip
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers per item of the layered coding; extra bytes have one per byte."""
 _BYTES = {0, 14}
