@@ -94,7 +94,7 @@ def test_no_angle_where_nothing_is_known_or_beyond_80_degrees():
     angle, angle_err = angles_of_variance(variance, error, distance, BETA)
     assert np.isfinite(angle).tolist() == np.isfinite(angle_err).tolist() == [False] * 5 + [True]
     assert angle[5] == 0.0
-    assert angle_err[5] == pytest.approx(float(angle_of_spread(np.sqrt(0.05), 640.0, BETA)))
+    assert angle_err[5] == pytest.approx(float(angle_of_spread(0.543 * np.sqrt(0.1), 640.0, BETA)))
 
 
 @pytest.mark.parametrize(
@@ -119,5 +119,17 @@ def test_errors_of_angles(snr, expected):
         off = angle - true
         # The published table has one digit after the point: what rounding hides is not held against it.
         assert np.degrees(np.sqrt(np.nanmean(off**2))) == pytest.approx(rms, rel=0.2, abs=0.05)
-        if snr >= 50 and 10 <= degrees <= 60:
-            assert np.mean(np.abs(off) <= angle_err) == pytest.approx(0.683, abs=0.05)
+        if snr >= 50 and degrees <= 60:
+            assert np.mean(np.abs(off) <= angle_err) == pytest.approx(0.683, abs=0.02)
+
+
+@pytest.mark.parametrize("root", np.r_[np.linspace(0.0, 3.0, 31), 4.0, 6.0])
+def test_errors_hold_whatever_the_true_angle_is(root):
+    """By quadrature over the normal law of the variance: no bin of angles pays for another, not even that of 0."""
+    u = np.linspace(root**2 - 6.0, root**2 + 6.0, 20_001)
+    weight = np.exp(-0.5 * (u - root**2) ** 2)
+    # A tiny beam, so that angles are as good as proportional to the spread.
+    near = 1e-3 / float(spread_of_angle(1.0, HEIGHT, BETA))
+    angle, angle_err = angles_of_variance(u * near**2, np.full(len(u), near**2), np.full(len(u), HEIGHT), BETA)
+    inside = np.abs(angle - float(angle_of_spread(root * near, HEIGHT, BETA))) <= angle_err
+    assert weight[inside].sum() / weight.sum() == pytest.approx(0.683, abs=0.012)
