@@ -145,6 +145,12 @@ def test_angles_of_a_village_and_their_errors():
     assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
 
 
+def with_sensor(made):
+    """The simulated block with the true positions of the sensor."""
+    back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
+    return replace(made.block, sensor=made.rays.ground - back)
+
+
 def test_angles_of_simulated_slopes():
     off, errors = [], []
     scene = find_scene("slope")
@@ -152,10 +158,10 @@ def test_angles_of_simulated_slopes():
     system = None
     for part in range(3):
         made = simulate_pulses(scene, 2000, np.random.default_rng(part), first=2003 * part)
-        distance = scene.beam_radius / 0.55e-3
-        block = replace(made.block, sensor=made.rays.ground - made.rays.direction * (distance / AIR_SPEED))
+        block = with_sensor(made)
         # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
-        system = system or replace(measure_block(block), sigma_ref=scene.recording.pulse.sigma, divergence=1.1)
+        known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence}
+        system = system or replace(measure_block(block), **known)
         echoes = chain.run(block, system)
         true = np.degrees(made.rays.incidence)[echoes.waveform]
         off.append(echoes.attributes["incidence_angle"] - true)

@@ -8,9 +8,10 @@ from helpers_scenes import make_block, make_scene
 
 from wavebatch.blocks import EchoFlag
 from wavebatch.errors import ConfigError
+from wavebatch.kernels.radiometry import backscatter
 from wavebatch.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block
 from wavebatch.simulate.blocks import SEED_BLOCK, flag_truth, simulate_blocks
-from wavebatch.simulate.geometry import AIR_SPEED, TERRAINS, Flight, trace_rays
+from wavebatch.simulate.geometry import AIR_SPEED, GROUND, TERRAINS, Flight, trace_rays
 from wavebatch.simulate.hazards import HAZARDS
 from wavebatch.simulate.pulses import PULSES, main_lobe
 from wavebatch.simulate.render import paint_echoes, record_counts
@@ -136,9 +137,10 @@ def test_scenes_have_their_shares_of_echoes(name):
 def test_slope_widens_and_weakens_echoes():
     scene = find_scene("slope")
     block, truth = make_block("slope", 30_000, seed=6)
-    incidence = trace_rays(Flight(), scene.terrain, np.arange(30_000)).incidence
+    rays = trace_rays(Flight(), scene.terrain, np.arange(30_000))
+    incidence = rays.incidence
     assert np.degrees(incidence).max() > 50
-    expected = np.hypot(2.0, scene.beam_radius * np.tan(incidence) / 0.299792458)
+    expected = np.hypot(2.0, 0.5e-3 * scene.divergence * rays.distance * np.tan(incidence) / 0.299792458)
     assert np.allclose(truth.sigma, expected, rtol=1e-5)
     steep = incidence > np.radians(45)
     assert np.median(truth.amplitude[steep]) < 0.75 * np.median(truth.amplitude[incidence < np.radians(10)])
@@ -328,3 +330,18 @@ def test_pulses_take_their_shape_from_options():
 def test_every_scene_says_what_it_is():
     for name in ALL:
         assert len(find_scene(name).meaning) > 15
+
+
+def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
+    scene = find_scene("village")
+    block, truth = make_block(scene, 30_000, seed=7)
+    rays = trace_rays(scene.flight, scene.terrain, np.arange(30_000))
+    roof = rays.ground[:, 2] > GROUND + 1
+    assert 0.15 < roof.mean() < 0.4
+    steep = np.degrees(rays.incidence[roof])
+    assert all((np.abs(steep - angle) < 3).any() for angle in (10, 20, 30, 40, 50, 60))
+    energy = truth.amplitude.astype(float) * truth.sigma
+    gamma = backscatter(4 / scene.light, rays.distance, truth.amplitude, truth.sigma, 0.22)
+    assert gamma == pytest.approx(4 * np.where(roof, 0.4, 0.2) * np.cos(rays.incidence), rel=1e-5)
+    assert np.median(energy[roof]) > np.median(energy[~roof])
+    assert (block.samples == block.digitizer.max_count).any(axis=1).mean() < 0.01

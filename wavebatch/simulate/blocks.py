@@ -75,8 +75,8 @@ def simulate_pulses(
 ) -> Simulated:
     """Block, truth and rays of pulses [first, first + n); the only function that draws random numbers."""
     recording = scene.recording
-    rays = trace_rays(flight or Flight(), scene.terrain, first + np.arange(n))
-    drawn = scene.draw(rng, n, rays.incidence)
+    rays = trace_rays(flight or scene.flight or Flight(), scene.terrain, first + np.arange(n))
+    drawn = scene.draw(rng, n, rays)
     signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
     counts = record_counts(recording, signal, rng, drawn.constant)
     real = slice(None) if drawn.ghost is None else ~drawn.ghost

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from wavebatch.errors import ConfigError
+from wavebatch.kernels.radiometry import transmit
 from wavebatch.simulate.canopy import CANOPIES, Canopy
 from wavebatch.simulate.draws import (
     Drawn,
@@ -20,10 +21,21 @@ from wavebatch.simulate.draws import (
     draw_counts,
     widen_on_slope,
 )
+from wavebatch.simulate.geometry import GROUND, Flight, Rays
 from wavebatch.simulate.hazards import HAZARDS, draw_hazards
 from wavebatch.simulate.pulses import PulseModel, find_pulse
 from wavebatch.simulate.render import Recording
+from wavebatch.units import FWHM_PER_SIGMA
 from wavebatch.words import nearest
+
+GROUND_REFLECTS, ROOFS_REFLECT = 0.2, 0.4
+"""Diffuse reflectances in scenes with light."""
+
+LEAST_ROOF = 1.0
+"""Height above the ground from which a surface is a roof [m]."""
+
+AIR_ATTENUATION = 0.22
+"""Of the air in scenes with light, one way [dB/km]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +52,22 @@ class Scene:
     """24 ns deep, the decomposer of ALGORITHMS.md 4.3 gets the exact counts that are stated there (.96, .61)."""
     terrain: str = "flat"
     """Name of the ground's shape, see simulate.geometry."""
-    beam_radius: float = 0.0
-    """1/e^2 radius of the footprint [m]; above 0, slopes widen the echoes."""
+    divergence: float = 0.0
+    """Full angle of the beam between the 1/e^2 points [mrad]; above 0, slopes widen the echoes."""
+    light: float = 0.0
+    """amplitude sigma range^2 of a white surface that faces the sensor, before the air takes its share [count ns m2].
+    Above 0, echoes are as bright as Lambertian surfaces of GROUND_REFLECTS and ROOFS_REFLECT are.
+    """
+    flight: Flight | None = None
+    """How the scene is flown over; None: as all others are."""
     hazards: tuple[str, ...] = ()
     """Names of hazards that replace all of the above."""
     canopy: Canopy | None = None
     """A stand of plants that replaces counts, amplitude, width and times."""
     recording: Recording = field(default_factory=Recording)
 
-    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
-        """Echoes of n waveforms; incidence: angle between ray and ground's normal [rad], (n,)."""
+    def draw(self, rng: np.random.Generator, n: int, rays: Rays) -> Drawn:
+        """Echoes of n waveforms that came along n rays."""
         if self.hazards:
             return draw_hazards(rng, n, self.recording, self.hazards)
         if self.canopy:
@@ -59,10 +77,20 @@ class Scene:
         time = self.times(rng, count, self.recording)
         amplitude = self.amplitude(rng, len(waveform))
         sigma = self.width(rng, np.repeat(count == 1, count), self.recording.pulse.sigma)
-        if self.beam_radius:
-            sigma, amplitude = widen_on_slope(sigma, amplitude, incidence[waveform], self.beam_radius)
+        if self.light:
+            amplitude = _light_surfaces(self.light, rays)[waveform] / self.recording.pulse.sigma
+        if self.divergence:
+            radius = (0.5e-3 * self.divergence * rays.distance)[waveform]
+            sigma, amplitude = widen_on_slope(sigma, amplitude, rays.incidence[waveform], radius)
         order = np.lexsort((time, waveform)) if len(self.counts) > 2 else slice(None)
         return Drawn(waveform, time[order], amplitude[order], sigma[order])
+
+
+def _light_surfaces(light: float, rays: Rays) -> np.ndarray:
+    """amplitude times sigma of surfaces that face their ray [count ns], (n,)."""
+    high = rays.ground[:, 2] > GROUND + LEAST_ROOF
+    reflectance = np.where(high, ROOFS_REFLECT, GROUND_REFLECTS)
+    return light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
 
 
 def _scenes(*scenes: Scene) -> dict[str, Scene]:
@@ -94,7 +122,19 @@ SCENES: dict[str, Scene] = _scenes(
         amplitude=LogNormal(80.0, 0.3, 20.0, 220.0),
         width=FoldedWidth(0.0, 0.0),
         terrain="facets",
-        beam_radius=0.4,
+        divergence=1.0,
+    ),
+    Scene(
+        "village",
+        "gable roofs of 0 to 60 degrees on level ground under a green laser: pulse of 1.5 ns, sampled every 0.5 ns, "
+        "beam of 1.1 mrad, 640 m, so that widths tell angles; the ground reflects 20 %, roofs 40 %, the air takes "
+        "0.22 dB/km, the calibration constant is 4 / 1.4e8",
+        width=FoldedWidth(0.0, 0.0),
+        terrain="village",
+        divergence=1.1,
+        light=1.4e8,
+        flight=Flight(height=640.0, half_angle=10.0, look_ahead=0.0),
+        recording=Recording(n_samples=128, spacing=0.5, pulse=PulseModel(sigma=1.5 / FWHM_PER_SIGMA)),
     ),
     Scene(
         "shore",
