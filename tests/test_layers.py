@@ -11,11 +11,11 @@ MODULES = sorted(ROOT.rglob("*.py"))
 RANKS = [
     {"errors", "units", "words", "allocator"},
     {"kernels", "blocks", "trajectory"},
-    {"chain", "io", "report", "inputs"},
+    {"chain", "io", "report", "inputs", "pictures"},
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
      "comparison", "compare", "goodness", "returns", "slices", "synthesize"},
-    {"auto", "trial", "choice", "sensor", "calibration"},
+    {"auto", "trial", "choice", "sensor", "calibration", "matchup"},
     {"work", "targets"},
     {"record"},
     {"task", "workers"},

@@ -34,7 +34,7 @@ class Breakdown:
         None where nobody knows.
         """
         numbered = rows["number"] > 0
-        code = np.minimum(rows["number"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["total"], _NUMBERS - 1)
+        code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
         self._count("return", code[numbered], alone[numbered])
         known = ~np.isnan(rows["amplitude"])
         self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
@@ -83,5 +83,5 @@ def _octave(values: np.ndarray) -> np.ndarray:
 _OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
 
 
-def _name_return(number: int, total: int) -> str:
+def _name_return(total: int, number: int) -> str:
     return f"{number} of {total}"

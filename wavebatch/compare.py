@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,8 @@ _MOST_PER_PULSE = 32
 """More points per GPS time than this, on average, and it does not tell pulses apart."""
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
-_PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
+PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
+"""A pulse that counts even if neither side has an echo of it."""
 
 
 def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison:
@@ -39,34 +41,46 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance.
     """
     with CloudReader(a) as first, CloudReader(b) as second:
-        by_time = _can_group(first) and _can_group(second) and _share_times(first, second)
-        task = _Task(by_time, _check(tolerance_ns), max(first.point_count, second.point_count))
-        if not by_time:
-            task.place_borders(first)
+        task = open_task(first, second, tolerance_ns)
         for reader, side in ((first, 0), (second, 1)):
-            for rows in reader.read_pieces():
-                task.add(side, rows[(rows["flags"] & PASSED_THROUGH) == 0])
+            for rows in read_echoes(reader):
+                task.add(side, rows)
         return task.finish(str(a), str(b))
+
+
+def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:
+    """The comparison of two clouds, or of what is as they are, by GPS time where both tell pulses apart by it."""
+    by_time = _can_group(first) and _can_group(second) and _share_times(first, second)
+    task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
+    if not by_time:
+        task.place_borders(first)
+    return task
+
+
+def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
+    """Pieces of a cloud without the points that were passed through."""
+    for rows in reader.read_pieces():
+        yield rows[(rows["flags"] & PASSED_THROUGH) == 0]
 
 
 def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Comparison:
     """Echoes of a cloud against the truth of the simulated strip it was made from; errors and tolerance as in
     compare_clouds."""
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
-        task = _Task(
-            True, _check(tolerance_ns), max(cloud.point_count, reference.meta.get("packets", 0)), reference.meta
-        )
-        for rows in cloud.read_pieces():
-            task.add(0, rows[(rows["flags"] & PASSED_THROUGH) == 0])
+        points = max(cloud.point_count, reference.meta.get("packets", 0))
+        task = CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta)
+        for rows in read_echoes(cloud):
+            task.add(0, rows)
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
         for piece in reference.read_pieces(*names):
             task.add(1, _shape_truth(piece))
         for piece in reference.read_pieces("packet_gps_time"):
-            task.add(2, piece["packet_gps_time"].view(_PACKET_DTYPE))
+            task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
         return task.finish(str(a), str(truth))
 
 
-def _check(tolerance_ns: float) -> float:
+def check_tolerance(tolerance_ns: float) -> float:
+    """The tolerance; ConfigError where it is none."""
     if not 0 < tolerance_ns < 1e6:
         raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
     return tolerance_ns
@@ -99,13 +113,13 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
     return rows
 
 
-class _Task:
+class CloudTask:
     """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket."""
 
     def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
         self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
         self.number = min(-(-max(points, 1) // BUCKET_POINTS), MOST_BUCKETS)
-        dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, _PACKET_DTYPE)
+        dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)
 

@@ -1,15 +1,21 @@
-"""`wavebatch compare`: two results on one strip, a result and the vendor's returns, or a result and the truth."""
+"""`wavebatch compare`: two results or chains on one strip, one of them and the vendor's returns, or a result and the
+truth."""
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.compare import Comparison, compare_clouds, compare_truth
+
+if TYPE_CHECKING:
+    from wavebatch.matchup import Matchup
 
 EXIT_VIOLATED = 1
 """A threshold is not met."""
@@ -18,6 +24,12 @@ EXIT_VIOLATED = 1
 @click.command()
 @click.argument("a", type=click.Path(path_type=Path))
 @click.argument("b", type=click.Path(path_type=Path), required=False)
+@click.option("--strip", type=click.Path(path_type=Path), metavar="STRIP",
+              help="Run A and B on the waveforms of this strip: chain files, fast, balanced, accurate or auto.")
+@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="A saved survey for chains, in place of one of the strip.")
+@click.option("--limit", type=click.IntRange(1), metavar="N",
+              help="About N waveforms spread over the strip, in place of all.")
 @click.option("--truth", type=click.Path(path_type=Path), help="Truth of a simulated strip, in place of B.")
 @click.option("--tolerance", type=float, help="Largest difference of the same echo [ns].  [default: 1; truth: 1.5]")
 @click.option("--min-completeness", type=float, help="Least share of B's echoes that A has.")
@@ -29,27 +41,63 @@ EXIT_VIOLATED = 1
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
 @debug_option
 @report_errors(failure=2)
-def compare(a: Path, b: Path | None, truth: Path | None, tolerance: float | None, as_json: bool, **options) -> None:
+def compare(a: Path, b: Path | None, strip: Path | None, truth: Path | None, as_json: bool, **options) -> None:
     """Compare the echoes of cloud A with those of B: another result, or the strip itself with the vendor's returns.
 
     Echoes of a pulse are the same when they lie within the tolerance along the ray. Points that were passed through
-    without an echo do not count. Exit code: 0 fine, 1 a threshold is not met, 2 wrong usage or a file unreadable.
-    """
-    if (b is None) == (truth is None):
-        raise click.UsageError("give either B or --truth FILE.npz")
-    if b is not None and b.suffix.lower() == ".npz":
-        raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
-    given = {} if tolerance is None else {"tolerance_ns": tolerance}
-    result = compare_truth(a, truth, **given) if truth else compare_clouds(a, b, **given)
+    without an echo do not count.
+
+    With --strip, A and B are chains that are run on it (one of them may be a cloud), and are compared waveform by
+    waveform, also with the vendor's returns and by their goodness of fit; without B, A with the vendor's returns.
+    Exit code: 0 fine, 1 a threshold is not met, 2 wrong usage or a file unreadable.
+    """  # fmt: skip
+    result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
+    between = result.between if strip else result
     if as_json:
         print_json(_finite(result.to_dict()))
     else:
-        click.echo("\n".join(_list_lines(result)))
-    broken = _check_thresholds(result, options)
+        click.echo("\n".join([*_list_lines(between), *(_list_match(result) if strip else [])]))
+    broken = _check_thresholds(between, options)
     for line in broken:
         talk(line)
     if broken:
         sys.exit(EXIT_VIOLATED)
+
+
+def _tolerance(options: dict) -> dict[str, float]:
+    return {} if options["tolerance"] is None else {"tolerance_ns": options["tolerance"]}
+
+
+def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
+    for name in ("system_file", "limit"):
+        if options[name] is not None:
+            raise click.UsageError(f"--{name.removesuffix('_file')} is for chains; give --strip STRIP too")
+    if (b is None) == (truth is None):
+        raise click.UsageError("give either B or --truth FILE.npz")
+    for side in (a, b):
+        if side is not None and _is_chain(side):
+            raise click.UsageError(f"{side} is a chain; say with --strip STRIP what it is to be run on")
+    if b is not None and b.suffix.lower() == ".npz":
+        raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
+    given = _tolerance(options)
+    return compare_truth(a, truth, **given) if truth else compare_clouds(a, b, **given)
+
+
+def _is_chain(side: Path) -> bool:
+    from wavebatch.matchup import find_contender
+
+    return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
+
+
+def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
+    from wavebatch.matchup import find_contender, match_sides
+    from wavebatch.systemfile import load_survey
+
+    if truth is not None:
+        raise click.UsageError("--truth is for a cloud; `wavebatch bench` holds chains against a truth")
+    saved = load_survey(options["system_file"]).survey if options["system_file"] else None
+    sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
+    return match_sides(strip, *sides, survey=saved, limit=options["limit"], **_tolerance(options))
 
 
 def _check_thresholds(result: Comparison, options: dict) -> list[str]:
@@ -84,6 +132,9 @@ def _list_lines(result: Comparison) -> list[str]:
         f"echoes        A {result.echoes_a:>12}   B {result.echoes_b:>12}",
         f"identical     {result.matched:>14}   missed {result.missed}   extra {result.extra}",
         f"completeness  {result.completeness:>14.4f}   correctness {result.correctness:.4f}",
+        f"identical are {result.correctness:>14.2%} of A's   {result.completeness:.2%} of B's   {result.identical:.2%} "
+        "of both",
+        f"more points   {result.gain:>+14.2%} in A than in B",
     ]
     if result.pulses:
         lines += [f"exact count   {result.exact_count:>14.4f}   of {result.pulses} pulses", "", "echoes per pulse"]
@@ -93,7 +144,42 @@ def _list_lines(result: Comparison) -> list[str]:
     for name, spread in result.differences.items():
         values = (spread.median, spread.mean, spread.rms, spread.nmad)
         lines.append(f"{units[name]:<13} {spread.number:>10} " + " ".join(f"{value:>10.4f}" for value in values))
+    for title, tables in (("missed, of B's", result.missed_by), ("extra, of A's", result.extra_by)):
+        lines += _list_breakdown(title, tables)
     return lines + _list_errors(result)
+
+
+def _list_breakdown(title: str, tables: dict) -> list[str]:
+    """The classes of echoes in which any has no partner."""
+    rows = [
+        f"{f'{kind} {name}':<40} {alone:>10} {of:>10} {alone / of:>8.2%}"
+        for kind, table in tables.items()
+        for name, (alone, of) in table.items()
+        if alone
+    ]
+    return ["", f"{title:<40} {'number':>10} {'of':>10} {'share':>8}", *rows] if rows else []
+
+
+def _list_match(result: Matchup) -> Iterator[str]:
+    """What only runs on a strip tell: points per waveform and return, and the goodness of fit."""
+    yield from ("", f"strip {result.strip}: {result.waveforms} waveforms, {result.returns} returns of the vendor")
+    head = ("echoes", "/waveform", "/return", "identical", "missed", "extra")
+    yield f"{'with the returns':<17}" + " ".join(f"{name:>10}" for name in head)
+    for side, one in result.vendor.items():
+        number = one.echoes_a
+        each = [number / of if of else math.nan for of in (result.waveforms, result.returns)]
+        shares = " ".join(f"{value:>10.4f}" for value in each)
+        yield f"{side.upper():<17}{number:>10} {shares} {one.matched:>10} {one.missed:>10} {one.extra:>10}"
+    head = ("waveforms", "mean E", "median E", "mean E0", "median E0")
+    yield from ("", f"{'goodness of fit':<17}" + " ".join(f"{name:>10}" for name in head))
+    for side, classes in result.fit.items():
+        for name, fit in classes.items():
+            if fit.waveforms:
+                values = (fit.mean, fit.median, fit.floor_mean, fit.floor_median)
+                yield f"{side.upper()} {name:<15}{fit.waveforms:>10} " + " ".join(f"{value:>10.6f}" for value in values)
+        if not classes:
+            yield f"{side.upper()} no-data: its echoes do not tell what was fitted"
+    yield "E = |f - y|^2 / |f|^2 of model f and waveform y; E0 is what the noise alone makes of it"
 
 
 def _list_errors(result: Comparison) -> list[str]:

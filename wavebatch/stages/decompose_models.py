@@ -51,10 +51,14 @@ def skewed(
     tolerance: fall of chi2 that the last step, which is taken, may promise.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
-    skew = kappa or system.kappa
-    shape = PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
-    settings = _model_settings(block, system, shape, max_iterations, tolerance)
+    settings = _model_settings(block, system, skewed_shape(system, kappa), max_iterations, tolerance)
     return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
+    """The pulse that `skewed` fits."""
+    skew = kappa or system.kappa
+    return PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
 
 
 @stage("decompose")
@@ -82,16 +86,22 @@ def reference(
     tolerance: fall of chi2 that the last step, which is taken, may promise.
     significance: least energy of an echo, in standard deviations of the noise's.
     """
-    shape = pulse_shape(system, block.spacing)
-    if model == "stretched":
-        shape = _tabulate_system(system, shape, block.spacing)
-    elif model == "given":
-        taps, _ = reference_pulse(system, block.spacing, "given", pulse=pulse)
-        shape = PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
+    shape = reference_shape(system, block.spacing, model, pulse)
     settings = _model_settings(block, system, shape, max_iterations, tolerance)
     if model != "broadened":
         system = replace(system, components=())
     return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+
+
+def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str) -> PulseShape:
+    """The pulse that `reference` fits."""
+    shape = pulse_shape(system, spacing)
+    if model == "stretched":
+        return _tabulate_system(system, shape, spacing)
+    if model == "given":
+        taps, _ = reference_pulse(system, spacing, "given", pulse=pulse)
+        return PulseShape(table=tabulate_pulse(np.arange(len(taps), dtype=np.float64), taps))
+    return shape
 
 
 def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:

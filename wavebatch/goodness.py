@@ -1,0 +1,89 @@
+"""How well fitted echoes explain their waveforms: Wang's E, and what noise alone leaves of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import Step
+from wavebatch.differences import EvenSample
+from wavebatch.stages.models import rebuild_waveforms
+from wavebatch.stages.shapes import clip_level
+
+
+@dataclass(frozen=True, slots=True)
+class Goodness:
+    """Goodness of fit E = |f - y|^2 / |f|^2 over waveforms with an echo; NaN where there is none."""
+
+    waveforms: int
+    mean: float
+    median: float
+    floor_mean: float
+    """Of E0, the E that noise alone leaves of a right fit."""
+    floor_median: float
+
+
+def measure_fit(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, decomposer: Step, echoes: EchoTable
+) -> tuple[np.ndarray, np.ndarray]:
+    """E and E0 of every waveform, f8 (n,); NaN without an echo, or where the decomposer's model is not known.
+
+    f is the sum of the fitted pulses, y the samples above the baseline; those at the digitizer's limit count in
+    neither. E0 = n sn^2 / |f|^2 with n samples. Source: Wang, Wang and Tseng eq. 5; ALGORITHMS 1.2.
+    """
+    model = rebuild_waveforms(block, system, decomposer, echoes)
+    if model is None:
+        return np.full(len(block), np.nan), np.full(len(block), np.nan)
+    used = block.samples < clip_level(block, system)
+    model = np.where(used, model.astype(np.float64), 0.0)
+    residual = np.where(used, block.samples - noise.baseline[:, None].astype(np.float64) - model, 0.0)
+    energy = np.square(model).sum(axis=1)
+    energy[energy <= 0] = np.nan
+    floor = np.count_nonzero(used, axis=1) * np.square(noise.std.astype(np.float64))
+    return np.square(residual).sum(axis=1) / energy, floor / energy
+
+
+class FitQuality(EvenSample):
+    """Collects E and E0 of waveforms: sums of all, an even sample of them for medians."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._sums = {name: np.zeros(3) for name in ("all", "single", "multi", "both")}
+
+    def add(self, misfit: np.ndarray, floor: np.ndarray, number: np.ndarray, both: np.ndarray) -> None:
+        """Takes in waveforms (n,): E, E0, how many echoes each has, and whether the other side has one too."""
+        rows = np.flatnonzero(np.isfinite(misfit))
+        part = {"misfit": misfit[rows], "floor": floor[rows], "number": number[rows], "both": both[rows]}
+        for name, inside in _classes(part).items():
+            self._sums[name] += [inside.sum(), part["misfit"][inside].sum(), part["floor"][inside].sum()]
+        self.keep(part)
+
+    def result(self) -> dict[str, Goodness]:
+        """Goodness of all waveforms, those with a single echo, with several, and where both sides have one; empty
+        where E was known of none."""
+        whole = self.join()
+        if not whole or not len(whole["misfit"]):
+            return {}
+        classes = _classes(whole)
+        found = {}
+        for name, (number, misfit, floor) in self._sums.items():
+            inside = classes[name]
+            found[name] = Goodness(
+                waveforms=int(number),
+                mean=float(misfit / number) if number else float("nan"),
+                median=_median(whole["misfit"][inside]),
+                floor_mean=float(floor / number) if number else float("nan"),
+                floor_median=_median(whole["floor"][inside]),
+            )
+        return found
+
+
+def _classes(part: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    number = part["number"]
+    return {"all": number > 0, "single": number == 1, "multi": number > 1, "both": part["both"]}
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
