@@ -1,6 +1,7 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
 #   make test      the fast tests          make test-all   all of them
+#   make papers    the tables of five papers on simulated data
 #   make bench     error against run time  make lint       ruff       make clean   remove what was made
 
 PYTHON ?= python3
@@ -9,7 +10,7 @@ BIN    := $(VENV)/bin
 DEMO   := demo
 BENCH  := bench
 
-.PHONY: demo test test-all bench lint clean
+.PHONY: demo test test-all papers bench lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -40,6 +41,10 @@ test: $(VENV)/.test
 
 test-all: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto
+
+papers: $(VENV)/.run
+	@status=0; for script in examples/papers/s?_*.py; do \
+	  echo "== $$script"; $(BIN)/python $$script || status=1; echo; done; exit $$status
 
 bench: $(VENV)/.test
 	@mkdir -p $(BENCH)

@@ -1,11 +1,11 @@
-"""Simulated waveforms for tests: blocks with their truth, and the SystemPulse that a perfect survey would find."""
+"""Simulated waveforms for tests: blocks with their truth."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
-from wavebatch.simulate import Recording, Scene, find_scene, simulate_blocks
+from wavebatch.blocks import EchoTable, WaveformBlock
+from wavebatch.simulate import Scene, find_scene, simulate_blocks
 
 
 def make_scene(name: str, **recording) -> Scene:
@@ -17,15 +17,3 @@ def make_scene(name: str, **recording) -> Scene:
 def make_block(scene: str | Scene, n: int, seed: int = 0) -> tuple[WaveformBlock, EchoTable]:
     """One block of n waveforms and its truth."""
     return next(simulate_blocks(scene, n, seed=seed, size=n))
-
-
-def perfect_system(recording: Recording) -> SystemPulse:
-    """What a survey without error would say of the recording."""
-    return SystemPulse(
-        sigma_ref=recording.pulse.sigma,
-        baseline=recording.baseline,
-        baseline_spread=recording.baseline_spread,
-        noise_std=recording.recorded_noise,
-        noise_gain=recording.noise_gain,
-        kappa=recording.pulse.kappa,
-    )

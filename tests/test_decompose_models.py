@@ -11,6 +11,7 @@ from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.fit import Windows
 from wavebatch.kernels.gauss_newton import step_undamped
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.simulate.papers import PULSE_SIGMA
 from wavebatch.units import HALF_C
 
 FINE = 100.0
@@ -74,7 +75,7 @@ WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
 @pytest.mark.parametrize(("kappa", "noise_share", "gaussian", "log_normal"), WANG)
 def test_goodness_of_fit_of_wang(kappa, noise_share, gaussian, log_normal):
     """T7: E = |f - y|^2 / |f|^2 of Gaussian and log-normal fits to 60 samples, FWHM 5 ns, within 10 %."""
-    n, x, sigma = 400, np.arange(60.0), 5 / 2.354820045
+    n, x, sigma = 400, np.arange(60.0), PULSE_SIGMA
     rng = np.random.default_rng(int(1e4 * noise_share))
     time = 30 + rng.uniform(-0.5, 0.5, n)
     std = 100 * noise_share

@@ -17,6 +17,8 @@ from wavebatch.kernels.asdf import (
     slide_taps,
     square_differences,
 )
+from wavebatch.simulate import known_noise, known_system, simulate_block
+from wavebatch.simulate.papers import WAGNER
 from wavebatch.stages.detect_correlation import parabola_shift
 from wavebatch.stages.reference import reference_pulse
 
@@ -177,21 +179,6 @@ def test_what_is_no_pulse_is_refused(pulse):
         reference_pulse(SYSTEM, 1.0, "given", pulse=pulse)
 
 
-def wagner_waveforms(n=4000, seed=11):
-    """The waveforms of the reproduction in ALGORITHMS.md 1.1."""
-    rng = np.random.default_rng(seed)
-    count = 1 + rng.choice(5, n, p=[0.58, 0.30, 0.09, 0.025, 0.005])
-    y = np.zeros((n, 120))
-    for w, k in enumerate(count):
-        spread = 0.105 if k == 1 else 0.35
-        amplitude = np.clip(25 * np.exp(0.8 * rng.standard_normal(k)), 5, 230)
-        sigma = 2 * np.sqrt(1 + spread * np.abs(rng.standard_normal(k)))
-        y[w] = gauss(120, *zip(amplitude, rng.uniform(10, 110, k), sigma, strict=True))
-    counts = np.rint(20 + y + rng.standard_normal(y.shape)).astype(np.uint16)
-    std = np.full(n, np.hypot(1, np.sqrt(1 / 12)), np.float32)
-    return WaveformBlock.from_samples(counts), Noise(np.full(n, 20, np.float32), std)
-
-
 def differences(a, b, n=4000):
     """Share of echoes of a and b that are the same within 1 ns, and the differences of those."""
     match = match_echoes(a, b, 1.0)
@@ -200,8 +187,8 @@ def differences(a, b, n=4000):
 
 def test_tables_of_wagner_et_al():
     """T6: Gaussian decomposition against ASDF; ASDF with a mean pulse against ASDF with a Gaussian."""
-    block, noise = wagner_waveforms()
-    system = SystemPulse(2.0, baseline=20.0, noise_std=1.04)
+    block, _ = simulate_block(WAGNER, 4000, np.random.default_rng(11))
+    noise, system = known_noise(WAGNER.recording, len(block)), known_system(WAGNER.recording)
     paper = {"rule": "paper", "interpolation": "parabola"}
     asdf = STAGES["detect.asdf"].function(block, noise, system, **paper)
     maxima = STAGES["detect.maximum"].function(block, noise, system)

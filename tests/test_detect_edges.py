@@ -6,9 +6,8 @@ import pytest
 from wavebatch import stages  # noqa: F401
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.simulate.papers import PULSE_SIGMA as SIGMA
 
-SIGMA = 5 / 2.354820045
-"""A full width at half maximum of 5 ns, as in the paper."""
 SYSTEM = SystemPulse(SIGMA, baseline=500.0, noise_std=100.0)
 
 

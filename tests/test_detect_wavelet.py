@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse
 from wavebatch.chain import STAGES
 from wavebatch.kernels.deconvolve import (
     convolve_pulse,
@@ -15,36 +15,27 @@ from wavebatch.kernels.deconvolve import (
     deconvolve_wiener,
 )
 from wavebatch.kernels.wavelet import b3_detail, b3_gain, b3_level
+from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.simulate.papers import WANG_CASES, simulate_wang
 
-SIGMA = 5 / 2.354820045
-CASES = {
-    "a": ((80, 0), (100, 4)),
-    "b": ((80, 0), (100, 5)),
-    "c": ((80, 0), (100, 4), (50, 8)),
-    "d": ((80, 0), (100, 4), (50, 9)),
-    "e": ((80, 0), (100, 5), (50, 10)),
-}
-"""Amplitude and time of the echoes of Wang's figure 5; full widths at half maximum of 5 ns."""
 GAUSS = np.exp(-0.5 * (np.arange(-6, 7) / 2) ** 2)
 SKEWED = np.exp(-0.5 * (np.log1p(0.12 * np.arange(-6, 7)) / 0.24) ** 2)
 
 
-def record(echoes, sigma, std, n, seed=0, spacing=1.0, s=80):
+def record(echoes, sigma, std, n, seed=0, spacing=1.0):
     """Waveforms with echoes (amplitude, time after sample 30) at random phases, finely rounded; the noise known."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(-0.5, 0.5, n) * (std > 0)
-    x = np.arange(s) * spacing
-    y = std * rng.standard_normal((n, s))
-    for amplitude, time in echoes:
-        y += amplitude * np.exp(-0.5 * ((x - (30 + time + phase[:, None]) * spacing) / sigma) ** 2)
-    block = WaveformBlock.from_samples(np.rint(5000 + 100 * y).astype(np.uint16), spacing=spacing)
-    return block, Noise(np.full(n, 5000, np.float32), np.full(n, 100 * max(std, 0.3), np.float32)), phase
+    amplitude, time = np.array(echoes, float).T
+    recording = fine_recording(std, sigma, spacing=spacing)
+    block, _ = simulate_echoes(recording, (30 + time + phase[:, None]) * spacing, FINE * amplitude, sigma, rng)
+    return block, known_noise(recording, n, 0.3 * FINE), phase
 
 
 def count(name, case, std=0.0, n=1, **parameters):
-    block, noise, _ = record(CASES[case], SIGMA, std, n, seed=ord(case))
-    system = SystemPulse(SIGMA, baseline=5000.0, noise_std=100.0)
-    return STAGES[f"detect.{name}"].function(block, noise, system, **parameters).count(n)
+    block, _, recording = simulate_wang(case, std, n, np.random.default_rng(ord(case)))
+    noise = known_noise(recording, n, 0.3 * FINE)
+    return STAGES[f"detect.{name}"].function(block, noise, known_system(recording), **parameters).count(n)
 
 
 @pytest.mark.parametrize("wavelet", ["b3", "mexican_hat"])
@@ -60,9 +51,11 @@ def test_case_b_is_resolved_at_scales_one_and_two(scale, number):
 
 @pytest.mark.parametrize("std", [0.5, 1.0, 2.0, 4.0])
 def test_cases_of_wang_in_noise(std):
-    share = {case: (count("wavelet", case, std, 600, threshold=3.0) == len(CASES[case])).mean() for case in "abe"}
+    """Three standard deviations let noise through in 0.1 % of the samples: most of what is exact in `a` is that."""
+    n = 4000
+    share = {case: (count("wavelet", case, std, n, threshold=3.0) == len(WANG_CASES[case])).mean() for case in "abe"}
     assert share["b"] >= 0.9
-    assert share["a"] <= 0.14
+    assert share["a"] <= 0.12
     if std <= 1:
         assert share["e"] >= 0.9
 

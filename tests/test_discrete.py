@@ -10,6 +10,7 @@ from wavebatch.errors import ConfigError, InputError
 from wavebatch.returns import count_returns
 from wavebatch.simulate import DiscreteReceiver, StripOptions, find_scene, simulate_block, simulate_returns
 from wavebatch.simulate.canopy import CANOPIES
+from wavebatch.simulate.papers import RETURN_TABLES
 
 
 def fire_slowly(receiver, pulse, distance, amplitude):
@@ -52,19 +53,9 @@ def test_wrong_receivers_are_refused(wrong):
         DiscreteReceiver(**wrong)
 
 
-# Shares of pulses with exactly 1, 2, 3, 4 returns [%] as published; stand and dead zone of the sensor.
-TABLES = {
-    "orion-6": (0.65, (40.9, 42.3, 13.7, 3.1)),
-    "orion-20": (0.65, (28.8, 33.8, 22.9, 14.5)),
-    "orion-22": (0.65, (26.9, 32.1, 23.7, 17.3)),
-    "gemini-6": (2.0, (81.9, 17.9, 0.2, 0.0)),
-    "gemini-24": (2.0, (18.9, 42.3, 29.0, 9.9)),
-}
-
-
-@pytest.mark.parametrize("stand", list(TABLES))
+@pytest.mark.parametrize("stand", list(RETURN_TABLES))
 def test_published_return_numbers_are_reproduced(stand, tmp_path):
-    dead_zone, exact = TABLES[stand]
+    dead_zone, exact = RETURN_TABLES[stand]
     simulate_returns(f"canopy.{stand}", tmp_path / "c.las", pulses=8192, seed=77, receiver=DiscreteReceiver(dead_zone))
     stats = count_returns([tmp_path / "c.las"])[1]
     number = np.cumsum(exact[::-1])[::-1] / np.sum(np.cumsum(exact[::-1]))

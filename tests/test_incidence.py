@@ -5,14 +5,14 @@ import pytest
 
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.incidence import (
-    _direct_width,
-    _spread_pulse,
     angle_of_spread,
     angles_of_variance,
     build_table,
+    direct_width,
     paper_table,
     pulse_table,
     spread_of_angle,
+    spread_pulse,
     spread_variance,
 )
 
@@ -45,8 +45,8 @@ def test_angle_is_the_inverse_of_spread():
 
 
 def test_widths_of_the_corrected_pulse():
-    time, curves = _spread_pulse(2, SPREADS, LENGTH / 3.3946780749849567)
-    direct = [_direct_width(time, curve, np.exp(-2.0)) for curve in curves]
+    time, curves = spread_pulse(2, SPREADS, LENGTH / 3.3946780749849567)
+    direct = [direct_width(time, curve, np.exp(-2.0)) for curve in curves]
     assert direct == pytest.approx([2.6815, 2.8070, 3.2490, 3.9250, 5.5356, 8.6708, 17.7907], rel=0.005)
 
 

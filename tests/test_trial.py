@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers_scenes import make_block, make_scene, perfect_system
+from helpers_scenes import make_block, make_scene
 
 from wavebatch.blocks import EchoTable, WaveformBlock
 from wavebatch.choice import COSTS
 from wavebatch.config import list_profiles, load_profile
 from wavebatch.evaluate import score
-from wavebatch.simulate import find_pulse
+from wavebatch.simulate import find_pulse, known_system
 from wavebatch.survey import survey_block
 from wavebatch.trial import Prediction, predict_errors, simulate_again
 from wavebatch.units import HALF_C
@@ -47,7 +47,7 @@ def test_predictions_come_true(scene, optimism):
 def test_the_bound_and_a_perfect_chain_agree_on_flat_ground():
     scene = make_scene("flat")
     block, _ = make_block(scene, 4000, seed=4)
-    accurate = predict_errors(block, perfect_system(scene.recording), CHAINS)[-1]
+    accurate = predict_errors(block, known_system(scene.recording), CHAINS)[-1]
     assert accurate.name == "accurate" and accurate.factor == pytest.approx(1.0, abs=0.06)
     assert accurate.range_error == accurate.bound * accurate.factor
     assert accurate.to_json()["range_error_m"] == pytest.approx(accurate.range_error, rel=1e-5)
@@ -61,7 +61,7 @@ def test_predictions_are_the_same_every_time():
 
 def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
     block = WaveformBlock.from_samples(np.zeros((4000, 60), np.uint8))
-    system = perfect_system(make_scene("flat").recording)
+    system = known_system(make_scene("flat").recording)
     system = replace(system, noise_gain=0.05, saturation=200.0)
     waveform = np.arange(4000)
     echoes = EchoTable.build(waveform, np.full(4000, 30.0), np.where(waveform % 2, 100.0, 400.0), np.full(4000, 2.0))
@@ -77,6 +77,6 @@ def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
 
 def test_nothing_to_find_is_no_error():
     block = WaveformBlock.from_samples(np.full((300, 60), 12, np.uint8))
-    for prediction in predict_errors(block, perfect_system(make_scene("flat").recording), CHAINS):
+    for prediction in predict_errors(block, known_system(make_scene("flat").recording), CHAINS):
         assert prediction.range_error == 0
     assert Prediction("x", 0.01, np.inf, 0.0).to_json()["range_error_m"] is None

@@ -131,11 +131,11 @@ def paper_table(sigma_ref: float) -> WidthTable:
     """
     tau = FWHM_PER_SIGMA * sigma_ref / PAPER_TAU
     spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)] * tau
-    time, curves = _spread_pulse(1, spread / np.sqrt(2.0), tau, causal=True)
-    return build_table(spread, np.array([0.25 * _direct_width(time, curve, np.exp(-2.0)) for curve in curves]))
+    time, curves = spread_pulse(1, spread / np.sqrt(2.0), tau, causal=True)
+    return build_table(spread, np.array([0.25 * direct_width(time, curve, np.exp(-2.0)) for curve in curves]))
 
 
-def _spread_pulse(
+def spread_pulse(
     exponent: int, spread: np.ndarray, tau: float, *, causal: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times [ns] (s,) and the pulse t^exponent exp(-t) spread by Gaussians of given standard deviations (k, s)."""
@@ -154,7 +154,7 @@ def _spread_pulse(
     return time, curves / curves.max(axis=1, keepdims=True)
 
 
-def _direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
+def direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
     """Width of a curve of height 1 at `level`, between the first and the last crossing beside its peak."""
     top = int(np.argmax(curve))
     right = top + int(np.argmax(curve[top:] < level))
@@ -168,10 +168,10 @@ def _direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
 
 def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:
     """Standard deviations [ns] of least-squares Gaussians, mean over the phases of the samples, per spread (k,)."""
-    time, curves = _spread_pulse(2, spread, tau)
+    time, curves = spread_pulse(2, spread, tau)
     widths = np.zeros(len(spread))
     for k, curve in enumerate(curves):
-        peak, half = time[np.argmax(curve)], _direct_width(time, curve, 0.5)
+        peak, half = time[np.argmax(curve)], direct_width(time, curve, 0.5)
         first, last = time[np.flatnonzero(curve > 1e-6)[[0, -1]]]
         for phase in _PHASES:
             at = np.arange(first - 3.0 * half + phase * spacing, last + spacing, spacing)

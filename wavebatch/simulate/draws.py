@@ -25,6 +25,19 @@ class Drawn:
     """Level of waveforms that hold one count only, NaN for the others, (n,); None when there is none."""
 
 
+def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None = None) -> Drawn:
+    """Arrays (n, k), or what can be spread to them, as a flat, sorted list; NaN times are left out."""
+    n, k = time.shape
+    order = np.argsort(time, axis=1, kind="stable")
+    keep = ~np.isnan(np.take_along_axis(time, order, 1)).ravel()
+
+    def flatten(values) -> np.ndarray:
+        return np.take_along_axis(np.broadcast_to(values, (n, k)), order, 1).ravel()[keep]
+
+    ghosts = None if ghost is None else flatten(ghost)
+    return Drawn(np.repeat(np.arange(n), k)[keep], flatten(time), flatten(amplitude), flatten(sigma), ghosts)
+
+
 @dataclass(frozen=True, slots=True)
 class LogUniform:
     """Amplitudes between low and high [count], evenly spread over their logarithm."""

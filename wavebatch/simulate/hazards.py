@@ -6,23 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.simulate.draws import Drawn
+from wavebatch.simulate.draws import Drawn, tabulate_echoes
 from wavebatch.simulate.render import Recording
 
 Draw = Callable[[np.random.Generator, int, Recording], Drawn]
-
-
-def _table(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None = None) -> Drawn:
-    """Arrays (n, k), or what can be spread to them, as a flat, sorted list; NaN times are left out."""
-    n, k = time.shape
-    order = np.argsort(time, axis=1, kind="stable")
-    keep = ~np.isnan(np.take_along_axis(time, order, 1)).ravel()
-
-    def flatten(values) -> np.ndarray:
-        return np.take_along_axis(np.broadcast_to(values, (n, k)), order, 1).ravel()[keep]
-
-    ghosts = None if ghost is None else flatten(ghost)
-    return Drawn(np.repeat(np.arange(n), k)[keep], flatten(time), flatten(amplitude), flatten(sigma), ghosts)
 
 
 def _middle(rng: np.random.Generator, n: int, recording: Recording, room: float = 10.0) -> np.ndarray:
@@ -42,7 +29,7 @@ def draw_near(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     start = _middle(rng, n, recording)
     first = _log(rng, 30, 150, (n, 1))
     amplitude = np.hstack([first, first * rng.uniform(0.2, 1.0, (n, 1))])
-    return _table(np.hstack([start - gap / 2, start + gap / 2]), amplitude, s)
+    return tabulate_echoes(np.hstack([start - gap / 2, start + gap / 2]), amplitude, s)
 
 
 def draw_saturated(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -51,13 +38,13 @@ def draw_saturated(rng: np.random.Generator, n: int, recording: Recording) -> Dr
     strong = (recording.clip - recording.baseline) / rng.uniform(0.3, 0.95, (n, 1))
     time = _middle(rng, n, recording)
     before = np.where(rng.random((n, 1)) < 1 / 3, time - rng.uniform(6, 9, (n, 1)) * s, np.nan)
-    return _table(np.hstack([before, time]), np.hstack([_log(rng, 15, 60, (n, 1)), strong]), s)
+    return tabulate_echoes(np.hstack([before, time]), np.hstack([_log(rng, 15, 60, (n, 1)), strong]), s)
 
 
 def draw_huge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 5 to 500 times as high as the receiver can record: a flat top, its amplitude is anyone's guess."""
     strong = (recording.clip - recording.baseline) * _log(rng, 5, 500, (n, 1))
-    return _table(_middle(rng, n, recording), strong, recording.pulse.sigma)
+    return tabulate_echoes(_middle(rng, n, recording), strong, recording.pulse.sigma)
 
 
 def draw_ringing(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -68,7 +55,7 @@ def draw_ringing(rng: np.random.Generator, n: int, recording: Recording) -> Draw
     share = rng.uniform(0.01, 0.05, (n, 1))
     times = np.hstack([time, time + 4 * s, time + 8 * s])
     heights = np.hstack([strong, -share * strong, share * strong])
-    return _table(times, heights, s, ghost=np.array([False, True, True]))
+    return tabulate_echoes(times, heights, s, ghost=np.array([False, True, True]))
 
 
 def draw_edge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -76,12 +63,12 @@ def draw_edge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     s = recording.pulse.sigma
     inside = s * rng.uniform(-0.5, 2.0, (n, 1))
     time = np.where(rng.random((n, 1)) < 0.5, inside, recording.duration - inside)
-    return _table(time, _log(rng, 20, 200, (n, 1)), s)
+    return tabulate_echoes(time, _log(rng, 20, 200, (n, 1)), s)
 
 
 def draw_tiny(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo of 2 to 6 counts."""
-    return _table(_middle(rng, n, recording), _log(rng, 2, 6, (n, 1)), recording.pulse.sigma)
+    return tabulate_echoes(_middle(rng, n, recording), _log(rng, 2, 6, (n, 1)), recording.pulse.sigma)
 
 
 def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -90,20 +77,20 @@ def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Dra
     time = _middle(rng, n, recording)
     gap = s * rng.uniform(3.5, 8, (n, 1)) * rng.choice([-1, 1], (n, 1))
     heights = np.hstack([rng.uniform(150, 220, (n, 1)), _log(rng, 6, 12, (n, 1))])
-    return _table(np.hstack([time, time + gap]), heights, s)
+    return tabulate_echoes(np.hstack([time, time + gap]), heights, s)
 
 
 def draw_broad(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 2.5 to 4 times as wide as the system pulse: steep ground, dense crown."""
     wide = recording.pulse.sigma * rng.uniform(2.5, 4.0, (n, 1))
-    return _table(_middle(rng, n, recording, 12), _log(rng, 20, 120, (n, 1)), wide)
+    return tabulate_echoes(_middle(rng, n, recording, 12), _log(rng, 20, 120, (n, 1)), wide)
 
 
 def draw_crowd(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """Eight echoes evenly over the window: more than decomposers like to fit."""
     s = recording.pulse.sigma
     at = np.linspace(4 * s, recording.duration - 4 * s, 8) + 0.3 * s * rng.standard_normal((n, 8))
-    return _table(at, _log(rng, 15, 150, (n, 8)), s)
+    return tabulate_echoes(at, _log(rng, 15, 150, (n, 8)), s)
 
 
 def draw_constant(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:

@@ -1,0 +1,197 @@
+"""Wang, Wang, Tseng, A comparison of lidar waveform decomposition models: figure 5, tables 1 and 2.
+
+Which pairs and triples a wavelet tells apart, how well Gaussians and log-normals fit skewed pulses, and what the loop
+that adds echoes at the largest residual gains (ALGORITHMS.md 1.2).
+
+    python examples/papers/s1_wang.py [--seed N] [--number WAVEFORMS]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from table import Table, main
+
+from wavebatch.blocks import EchoTable
+from wavebatch.evaluate import score
+from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.signal import find_peaks
+from wavebatch.simulate import (
+    FINE,
+    find_scene,
+    fine_recording,
+    known_noise,
+    known_system,
+    simulate_block,
+    simulate_echoes,
+)
+from wavebatch.simulate.papers import PULSE_SIGMA, WANG_CASES, simulate_wang
+from wavebatch.stages.candidates import signal_above
+from wavebatch.stages.decompose import gaussian
+from wavebatch.stages.decompose_loops import residual_loop
+from wavebatch.stages.decompose_models import skewed
+from wavebatch.stages.detect import maximum
+from wavebatch.stages.detect_wavelet import wavelet
+
+PAPER_COUNTS = {"a": 1, "b": 2, "c": 1, "d": 2, "e": 3}
+LOCAL_MAXIMA = {"a": 1, "b": 2, "c": 1, "d": 1, "e": 2}
+IN_NOISE = {
+    0.5: {"a": 4, "b": 94, "c": 0, "d": 5, "e": 96},
+    1.0: {"a": 5, "b": 95, "c": 0, "d": 5, "e": 95},
+    2.0: {"a": 3, "b": 95, "c": 0, "d": 3, "e": 54},
+    4.0: {"a": 11, "b": 94, "c": 1, "d": 0, "e": 13},
+}
+"""Share of the waveforms with the exact number of echoes [%], by noise and case, B3 wavelet of scale 2."""
+CRITICAL = {
+    ("b3", 1.0): 3.69,
+    ("b3", 2.0): 4.40,
+    ("b3", 3.0): 6.38,
+    ("mexican_hat", 1.0): 3.89,
+    ("mexican_hat", 1.5): 4.30,
+    ("mexican_hat", 2.0): 4.82,
+    ("mexican_hat", 3.0): 6.05,
+}
+"""Least distance of echoes of 80 and 100 that are two [ns], by wavelet and scale."""
+CLASSES = {
+    "Leica ground": (0.104, 0.0214, 0.0094, 0.0073, 0.0089, 0.0069),
+    "Leica tree": (0.184, 0.0158, 0.0103, 0.0040, 0.0100, 0.0037),
+    "Riegl ground": (0.0, 0.0097, 0.0015, 0.0016, 0.0014, 0.0014),
+    "Riegl tree": (0.05, 0.0186, 0.0060, 0.0055, 0.0058, 0.0052),
+}
+"""Skew, noise over amplitude, E of Gaussian and log-normal in the paper, the same in the specification."""
+LOOP = {"urban": (0.924, 0.947), "forest": (0.613, 0.707)}
+"""Completeness of maxima and fit, and of wavelet, fit and loop, in ALGORITHMS.md 2.5."""
+
+
+def find_wavelet(block, noise, system) -> EchoTable:
+    """The paper's candidates: maxima of the second scale of the B3 wavelet above three standard deviations."""
+    return wavelet(block, noise, system, threshold=3.0)
+
+
+def find_raw_maxima(block, noise, system) -> EchoTable:
+    """Local maxima of the samples themselves."""
+    signal = signal_above(block, noise)
+    waveform, sample = find_peaks(signal, 3.0 * noise.std)
+    return EchoTable.build(waveform, sample, signal[sample, waveform], np.full(len(sample), system.sigma_ref))
+
+
+def count_exact(detect: Callable, case: str, std: float, number: int, rng: np.random.Generator) -> np.ndarray:
+    """Echoes found per waveform of a case."""
+    block, _, recording = simulate_wang(case, std, number, rng)
+    return detect(block, known_noise(recording, number, 0.3 * FINE), known_system(recording)).count(number)
+
+
+def table_of_cases() -> Table:
+    """Figure 5: echoes found without noise."""
+    table = Table("figure 5: echoes found without noise", 0)
+    rng = np.random.default_rng(0)
+
+    def hat(*waveforms) -> EchoTable:
+        return wavelet(*waveforms, wavelet="mexican_hat", threshold=3.0)
+
+    for name, detect in (("B3, scale 2", find_wavelet), ("Mexican hat", hat)):
+        for case, expected in PAPER_COUNTS.items():
+            table.near(f"{name}, {case}", count_exact(detect, case, 0.0, 1, rng)[0], expected, paper=expected)
+    for case, expected in LOCAL_MAXIMA.items():
+        table.near(f"raw maxima, {case}", count_exact(find_raw_maxima, case, 0.0, 1, rng)[0], expected)
+        table.add(f"maxima smoothed twice, {case}", count_exact(maximum, case, 0.0, 1, rng)[0])
+    for scale, expected in ((1.0, 2), (2.0, 2), (3.0, 1)):
+        found = count_exact(lambda *w, s=scale: wavelet(*w, scale=s, threshold=3.0), "b", 0.0, 1, rng)[0]
+        table.near(f"B3, b at scale {scale:g}", found, expected, paper=expected)
+    return table
+
+
+def table_of_critical_distances() -> Table:
+    """Least distances that are two echoes, mean over phases."""
+    table = Table("least distance of echoes of 80 and 100 [ns]")
+    recording = fine_recording(0.0, PULSE_SIGMA)
+    phase, distance = np.linspace(0, 1, 8, endpoint=False), np.arange(3.0, 8.0, 0.02)
+    first = 30 + np.tile(phase, len(distance))
+    time = np.stack([first, first + np.repeat(distance, len(phase))], axis=1)
+    block, _ = simulate_echoes(recording, time, FINE * np.array([80.0, 100.0]), PULSE_SIGMA, np.random.default_rng(0))
+    noise, system = known_noise(recording, len(block), 0.3 * FINE), known_system(recording)
+    for (name, scale), expected in CRITICAL.items():
+        found = wavelet(block, noise, system, wavelet=name, scale=scale).count(len(block))
+        least = distance[np.argmax(found.reshape(len(distance), -1) == 2, axis=0)]
+        table.near(f"{name}, scale {scale:g}", least.mean(), expected, within=0.12)
+    return table
+
+
+def table_of_noise(number: int, seed: int) -> Table:
+    """Shares of waveforms in which the exact number is found in noise."""
+    table = Table("figure 5 in noise: exact number of echoes [%]", 1)
+    rng = np.random.default_rng(seed)
+    for std, shares in IN_NOISE.items():
+        for case, expected in shares.items():
+            found = 100 * (count_exact(find_wavelet, case, std, number, rng) == len(WANG_CASES[case])).mean()
+            low = 90 if case == "b" or (case == "e" and std <= 1) else -np.inf
+            table.add(f"{case}, noise {std:g}", found, low, 12 if case == "a" else np.inf, spec=expected)
+    return table
+
+
+def misfit(found: EchoTable, y: np.ndarray, kappa: float) -> float:
+    """Mean of E = |f - y|^2 / |f|^2 over the waveforms (n, s) in which one echo is found."""
+    n, s = y.shape
+    alone = found.take(found.count(n)[found.waveform] == 1)
+    pulse = evaluate_pulse(
+        PulseShape(kappa=kappa), np.tile(np.arange(s), (len(alone), 1)), alone.time[:, None], alone.sigma[:, None]
+    )[0]
+    f = alone.amplitude[:, None] * pulse
+    return float(np.mean(np.sum((f - y[alone.waveform]) ** 2, axis=1) / np.sum(f**2, axis=1)))
+
+
+def table_of_models(number: int, seed: int) -> Table:
+    """Tables 1 and 2: goodness of fit E of Gaussians and log-normals to 60 samples."""
+    table = Table("tables 1, 2: goodness of fit E", 5)
+    rng = np.random.default_rng(seed)
+    for name, (kappa, share, *expected) in CLASSES.items():
+        recording = fine_recording(100 * share, PULSE_SIGMA, n_samples=60, kappa=kappa)
+        time = 30 + rng.uniform(-0.5, 0.5, (number, 1))
+        block, _ = simulate_echoes(recording, time, 100 * FINE, PULSE_SIGMA, rng)
+        noise, system = known_noise(recording, number), known_system(recording)
+        start = maximum(block, noise, system)
+        y = block.samples - noise.baseline[:, None]
+        for place, (model, fit, skew) in enumerate((("Gaussian", gaussian, 0.0), ("log-normal", skewed, kappa))):
+            value = misfit(fit(block, noise, system, start), y, skew)
+            paper, spec = expected[place], expected[place + 2]
+            table.add(f"{name}, {model}", value, 0.9 * spec, 1.1 * spec, paper=paper, spec=spec)
+    return table
+
+
+def table_of_the_loop(number: int, seed: int) -> Table:
+    """Echoes that are found with and without the residual loop."""
+    table = Table("residual loop: completeness and gain [%, points]", 1)
+    for name, spec in LOOP.items():
+        recording = find_scene(name).recording
+        block, truth = simulate_block(name, number, np.random.default_rng(seed))
+        noise, system = known_noise(recording, number), known_system(recording)
+        candidates = find_wavelet(block, noise, system)
+
+        def complete(found: EchoTable, truth=truth, recording=recording) -> float:
+            return 100 * score(found, truth, number, noise_std=recording.recorded_noise).completeness
+
+        maxima = complete(gaussian(block, noise, system, maximum(block, noise, system)))
+        single = complete(gaussian(block, noise, system, candidates))
+        loop = complete(residual_loop(block, noise, system, candidates))
+        table.add(f"{name}: maxima, fit", maxima, spec=100 * spec[0])
+        table.add(f"{name}: wavelet, fit", single)
+        table.near(f"{name}: wavelet, fit, loop", loop, 100 * spec[1], within=4.0)
+        table.add(f"{name}: gain by the loop", loop - single, 0.2)
+        table.add(f"{name}: gain over the maxima", loop - maxima, 0.5, spec=100 * (spec[1] - spec[0]))
+    return table
+
+
+def measure(number: int, seed: int) -> list[Table]:
+    """All tables."""
+    return [
+        table_of_cases(),
+        table_of_critical_distances(),
+        table_of_noise(number, seed),
+        table_of_models(max(number // 10, 20), seed),
+        table_of_the_loop(number, seed),
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(measure, __doc__, 4000))

@@ -1,0 +1,192 @@
+"""Jutzi, Stilla (2005), Waveform processing of laser pulses for reconstruction of surfaces in urban areas.
+
+How weak an echo the detectors find, how exact Gauss-Newton is at 20 samples per ns and from which starts it converges,
+and the straight lines that the Hough transform finds in a slice of waveforms (ALGORITHMS.md 1.3).
+
+    python examples/papers/s2_jutzi.py [--seed N] [--number WAVEFORMS]
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from table import Table, main
+
+from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.kernels.bounds import bound_time
+from wavebatch.kernels.fit import Limits, Windows, fit_windows
+from wavebatch.kernels.gauss_newton import step_undamped
+from wavebatch.kernels.pulse import GAUSSIAN
+from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.simulate.papers import PULSE_SIGMA
+from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments
+from wavebatch.stages.decompose_models import gauss_newton
+from wavebatch.stages.detect import matched_filter
+from wavebatch.stages.detect_edges import sustained_threshold
+from wavebatch.units import FWHM_PER_SIGMA, HALF_C
+
+RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
+DETECTORS = {
+    "3 sn over 5 samples": (sustained_threshold, (0, 0.001, 0.054, 0.332, 0.699, 0.895, 0.979, 1)),
+    "matched filter, false alarms 0.1 %": (matched_filter, (0.395, 0.950, 1, 1, 1, 1, 1, 1)),
+    "matched filter, false alarms 1 %": (partial(matched_filter, threshold=3.70), (0.623, 0.987, 1, 1, 1, 1, 1, 1)),
+    "one sample above 3 sn": (
+        partial(sustained_threshold, duration=0.2),
+        (0.421, 0.872, 0.996, 1, 1, 1, 1, 1),
+    ),
+}
+"""Detector, share of the echoes that it finds by A/sn (ALGORITHMS.md 1.3)."""
+FALSE_ALARMS = {
+    "3 sn over 5 samples": (0, 0.1, 0),
+    "matched filter, false alarms 0.1 %": (0, 0.3, 0.1),
+    "matched filter, false alarms 1 %": (0.3, 1.7, 1),
+    "one sample above 3 sn": (20, 27, 23.5),
+}
+"""Least, most and expected share [%] of waveforms of 200 samples of noise with an echo."""
+PULSES = {"1": (20.4, 2.10), "2": (12.3, 3.49), "3": (29.4, 1.46), "4": (20.7, 2.07)}
+"""Table 1: amplitude over noise and bound of the range [mm] of its pulses, 0.217 m wide, sampled every 50 ps."""
+BASIN = {0.5: (99.9, 100), 1.0: (99.9, 100), 1.5: (0, 45), 2.0: (0, 0.5), 3.0: (0, 0.5)}
+"""Least and most share of undamped fits that converge [%], by distance of the start in sigma."""
+START_WIDTHS = (0.4, 0.7, 1.0, 1.5, 2.0, 3.0)
+"""In sigma."""
+SLOPES = (0.0, 0.1, 0.2, 0.5, 1.0, -0.7)
+
+
+def detected(detect, ratio: float, number: int, rng: np.random.Generator) -> float:
+    """Share of echoes of A/sn = ratio that are found within 4 ns."""
+    recording = fine_recording(1.0, PULSE_SIGMA)
+    time = 40 + rng.uniform(-0.5, 0.5, (number, 1))
+    block, _ = simulate_echoes(recording, time, ratio * FINE, PULSE_SIGMA, rng)
+    found = detect(block, known_noise(recording, number), known_system(recording))
+    near = np.abs(found.time - time[found.waveform, 0]) < 4
+    return float((found.take(np.flatnonzero(near)).count(number) > 0).mean())
+
+
+def table_of_detection(number: int, seed: int) -> Table:
+    """Detection probability by A/sn, amplitude of 50 % detection, false alarms."""
+    table = Table("share of the echoes that are found", 3)
+    rng = np.random.default_rng(seed)
+    half = {}
+    for name, (detect, expected) in DETECTORS.items():
+        shares = [detected(detect, ratio, number, rng) for ratio in RATIOS]
+        for ratio, share, value in zip(RATIOS, shares, expected, strict=True):
+            if value < 1 or ratio == RATIOS[expected.index(1)]:
+                table.add(f"{name}: A/sn {ratio}", share, max(value - 0.04, 0), min(value + 0.04, 1), spec=value)
+        fine = np.linspace(1, 8, 15)
+        half[name] = np.interp(0.5, [detected(detect, ratio, max(number // 4, 1), rng) for ratio in fine], fine)
+    table.near("A/sn for 50 %: 3 sn over 5 samples", half["3 sn over 5 samples"], 5.5, within=0.25)
+    table.near("A/sn for 50 %: matched filter, 0.1 %", half["matched filter, false alarms 0.1 %"], 2.2, within=0.15)
+    recording = fine_recording(1.0, PULSE_SIGMA, n_samples=200)
+    for name, (low, high, value) in FALSE_ALARMS.items():
+        block, _ = simulate_echoes(recording, np.full((number, 1), np.nan), 0.0, PULSE_SIGMA, rng)
+        found = DETECTORS[name][0](block, known_noise(recording, number), known_system(recording))
+        table.add(f"{name}: false alarms [%]", 100 * (found.count(number) > 0).mean(), low, high, spec=value)
+    return table
+
+
+def start_from(y: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The paper's start: time and height of the maximum of the smoothed waveform, width at half of its height."""
+    smooth = np.apply_along_axis(np.convolve, 1, y, np.ones(9) / 9, "same")
+    top = np.argmax(smooth, axis=1)
+    height = smooth[np.arange(len(y)), top]
+    return top * spacing, height, np.count_nonzero(smooth > 0.5 * height[:, None], axis=1) * spacing / FWHM_PER_SIGMA
+
+
+def table_of_precision(number: int, seed: int) -> Table:
+    """Table 1: standard deviations of range and width by Gauss-Newton, over the Cramer-Rao bound."""
+    table = Table("table 1, pulses every 50 ps: Gauss-Newton")
+    rng = np.random.default_rng(seed)
+    sigma, spacing = 0.217 / HALF_C, 0.05
+    for name, (ratio, millimetres) in PULSES.items():
+        recording = fine_recording(1.0, sigma, n_samples=320, spacing=spacing)
+        time = 8 + rng.uniform(-0.5, 0.5, (number, 1)) * spacing
+        block, _ = simulate_echoes(recording, time, ratio * FINE, sigma, rng)
+        noise = known_noise(recording, number)
+        start = EchoTable.build(np.arange(number), *start_from(block.samples - noise.baseline[:, None], spacing))
+        found = gauss_newton(block, noise, known_system(recording), start, max_iterations=8)
+        bound = 1000 * HALF_C * float(bound_time(ratio, sigma, 1.0, spacing))
+        lost = (found.flags & np.uint16(EchoFlag.NOT_CONVERGED)) != 0
+        table.near(f"pulse {name}: bound of the range [mm]", bound, millimetres, share=0.03)
+        for what, off in (("range", found.time - time[found.waveform, 0]), ("sigma", found.sigma - sigma)):
+            table.add(f"pulse {name}: std of {what} / bound", 1000 * HALF_C * np.std(off) / bound, 0.9, 1.12, spec=1)
+        table.add(f"pulse {name}: not converged [%]", 100 * lost.mean(), 0, 0.2, spec=0)
+    return table
+
+
+def table_of_basins(number: int, seed: int) -> Table:
+    """Fits that reach the echo from starts that are off, mean over widths of the start; sigma 2, SNR 100."""
+    table = Table("fits that converge, by the start's distance [%]", 1)
+    n, x, sigma = max(number // 10, 10), np.arange(60.0, dtype=np.float32), 2.0
+    rng = np.random.default_rng(seed)
+    time = 30 + rng.uniform(-0.5, 0.5, (n, 1))
+    y = 100 * np.exp(-0.5 * ((x - time) / sigma) ** 2) + rng.standard_normal((n, 60))
+    windows = Windows(y.astype(np.float32), np.tile(x, (n, 1)), np.ones(n))
+    limits = Limits(*(np.array(edge)[None, :, None] for edge in ((0.0, -3.0, 0.7 * sigma), (1e4, 63.0, 4 * sigma))))
+    for off, (low, high) in BASIN.items():
+        undamped, damped = [], []
+        height = 100 * np.exp(-0.5 * off**2)
+        for width in START_WIDTHS:
+            start = np.tile(np.array([[height], [off * sigma], [width * sigma]]), (n, 1, 1))
+            start[:, 1] += time
+            found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-3, max_iterations=40)
+            undamped.append((converged & (np.abs(found[:, 1] - time)[:, 0] < 0.2)).mean())
+            fit = fit_windows(windows, start, limits, GAUSSIAN)
+            damped.append((fit.converged & (np.abs(fit.parameters[:, 1] - time)[:, 0] < 0.2)).mean())
+        table.add(f"Gauss-Newton, {off:g} sigma off", 100 * np.mean(undamped), low, high)
+        table.add(f"Levenberg-Marquardt, {off:g} sigma off", 100 * np.mean(damped), 99.5, spec=100)
+    return table
+
+
+def paint_slice(rng: np.random.Generator, pieces, height: int = 320, width: int = 400) -> ScanLine:
+    """A slice of SNR 15 with straight surfaces, 8 samples wide: (time at the middle pulse, slope, first, behind)."""
+    image = rng.standard_normal((height, width))
+    pulse, x = np.arange(height)[:, None], np.arange(width)
+    for middle, slope, first, behind in pieces:
+        band = 15 * np.exp(-0.5 * ((x - middle - slope * (pulse - height // 2)) / 8.0) ** 2)
+        image += np.where((pulse >= first) & (pulse < behind), band, 0)
+    row, time = np.divmod(np.arange(height * width), width)
+    origin = np.stack([0.5 * np.arange(height), np.zeros(height), np.full(height, 100.0)], axis=1)
+    direction = np.tile([0.0, 0.0, -HALF_C], (height, 1))
+    number = np.arange(height)
+    values = image.reshape(-1).astype(np.float32)
+    return ScanLine(0, number, number * 1e-5, origin, direction, 1.0, row, time.astype(np.float64), values)
+
+
+def table_of_lines(number: int, seed: int) -> Table:
+    """Position and angle of straight lines in slices of time by pulse; segments of one line."""
+    table = Table("lines in slices of 320 pulses, SNR 15", 4)
+    rng = np.random.default_rng(seed)
+    options = SliceOptions(geometry="time", sigma=8.0)
+    for slope in SLOPES:
+        off, turn, alone = [], [], []
+        for _ in range(max(number // 500, 2)):
+            middle = 200 + rng.uniform(-3, 3)
+            line = paint_slice(rng, [(middle, slope, 0, 320)])
+            segments = find_segments(cut_slice(line, options), options)
+            alone.append(len(segments) == 1)
+            time, pulse = np.mean(segments[0].ends, axis=0)
+            off.append((time - slope * (pulse - 160) - middle) / np.hypot(1, slope))
+            turn.append((segments[0].theta - np.degrees(np.arctan2(-slope, 1)) + 90) % 180 - 90)
+        table.add(f"slope {slope:g}: rms position [px]", np.sqrt(np.mean(np.square(off))), 0, 0.05, spec=0.02)
+        table.add(f"slope {slope:g}: rms angle [deg]", np.sqrt(np.mean(np.square(turn))), 0, 0.1, spec=0.04)
+        table.near(f"slope {slope:g}: slices with one segment [%]", 100 * np.mean(alone), 100)
+    line = paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
+    segments = find_segments(cut_slice(line, options), options)
+    table.near("a line with a gap of 40 px: segments", len(segments), 2)
+    table.near("  pulses of the shorter one", min(segment.pulses for segment in segments), 140, within=4)
+    return table
+
+
+def measure(number: int, seed: int) -> list[Table]:
+    """All tables."""
+    return [
+        table_of_detection(number, seed),
+        table_of_precision(max(number // 2, 10), seed),
+        table_of_basins(number, seed),
+        table_of_lines(number, seed),
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(measure, __doc__, 4000))

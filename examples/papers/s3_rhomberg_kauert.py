@@ -1,0 +1,169 @@
+"""Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024), Angle of incidence from echo pulse width.
+
+The table of widths by angle as printed and as corrected, the footprint by Monte Carlo, the errors of angles, and what
+its figure 6 shows: angles from fitted widths minus the true ones, with their pile-up at 0 (ALGORITHMS.md 1.4).
+
+    python examples/papers/s3_rhomberg_kauert.py [--seed N] [--number ECHOES]
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from table import Table, main
+
+from wavebatch.kernels.bounds import bound_time
+from wavebatch.kernels.incidence import (
+    FWHM_PER_TAU,
+    angles_of_variance,
+    direct_width,
+    paper_table,
+    pulse_table,
+    spread_of_angle,
+    spread_pulse,
+    spread_variance,
+)
+from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.stages.decompose import gaussian
+from wavebatch.stages.detect import maximum
+from wavebatch.units import FWHM_PER_SIGMA, C
+
+HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
+"""Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""
+OWN = LENGTH / FWHM_PER_SIGMA
+DEGREES = (5, 10, 20, 30, 45, 60, 75)
+WIDTHS = {
+    "as printed": (1.9259, 1.9725, 2.1257, 2.3534, 2.8934, 3.9601, 7.1218),
+    "corrected": (2.6815, 2.8070, 3.2490, 3.9250, 5.5356, 8.6708, 17.7907),
+    "Gaussian closed form": (2.5809, 2.6792, 3.0683, 3.7209, 5.3432, 8.5244, 17.7121),
+    "4 x fitted Gaussian": (None, 2.7000, 3.1547, 3.8598, 5.5076, 8.6620, 17.7894),
+}
+"""Widths at e^-2 [ns] by angle."""
+SPREADS = {5: 0.1027, 10: 0.2069, 20: 0.4274, 30: 0.678, 45: 1.172, 60: 2.036, 80: 6.67}
+"""Standard deviations of the pulse's spread [ns] by angle."""
+ERRORS = {
+    20: (7.2, 5.9, 6.4, 6.2, 5.3, 4.6, 5.4, 8.5, None),
+    50: (4.5, 3.9, 3.4, 2.2, 1.9, 1.7, 2.0, 2.7, 6.1),
+    100: (3.2, 2.7, 1.5, 1.1, 0.9, 0.9, 1.0, 1.3, 2.1),
+    300: (1.8, 1.0, 0.5, 0.4, 0.3, 0.3, 0.3, 0.4, 0.7),
+}
+"""Rms errors [deg] of angles of 0, 5, 10, 15, 20, 30, 45, 60, 75 degrees, by A/sn of an echo of 0 degrees."""
+READ_AS_ZERO = {(20, 5): 43, (50, 5): 32}
+"""Share of the echoes that are narrower than the pulse [%], by A/sn and angle."""
+TRUE_DEGREES = (0, 5, 10, 15, 20, 30, 45, 60, 75)
+
+
+def table_of_widths() -> Table:
+    """Width of the echo at e^-2 by angle."""
+    table = Table("width at e^-2 [ns] by angle", 4)
+    spreads = spread_of_angle(np.radians(DEGREES), HEIGHT, DIVERGENCE)
+    time, curves = spread_pulse(2, spreads, LENGTH / FWHM_PER_TAU)
+    printed, fitted = paper_table(OWN), pulse_table(2.5364 / 4, 0.05)
+    ours = {
+        "as printed": 4 * np.interp(spreads, printed.spread, printed.width),
+        "corrected": np.array([direct_width(time, curve, np.exp(-2.0)) for curve in curves]),
+        "Gaussian closed form": 4 * np.hypot(OWN, spreads),
+        "4 x fitted Gaussian": 4 * np.interp(spreads, fitted.spread, fitted.width),
+    }
+    for name, expected in WIDTHS.items():
+        for degrees, width, value in zip(DEGREES, ours[name], expected, strict=True):
+            if value is not None:
+                table.near(f"{name}, {degrees}", width, value, share=0.005)
+    # The paper looks up widths of fitted Gaussians in a table of direct widths.
+    degrees = np.arange(0, 12.5, 0.5)
+    spreads = spread_of_angle(np.radians(degrees), HEIGHT, DIVERGENCE)
+    time, curves = spread_pulse(2, spreads, LENGTH / FWHM_PER_TAU)
+    direct = np.array([direct_width(time, curve, np.exp(-2.0)) for curve in curves])
+    fit = 4 * np.interp(spreads, fitted.spread, fitted.width)
+    table.near("corrected, 0", direct[0], 2.6403, share=0.005)
+    table.near("10 deg fitted, looked up as direct [deg]", np.interp(fit[20], direct, degrees), 6.0, within=0.2)
+    table.near("  read as 0 below [deg]", np.interp(direct[0], fit, degrees), 7.9, within=0.2)
+    return table
+
+
+def table_of_footprints(number: int, seed: int) -> Table:
+    """Spread by a plane under a Gaussian beam: rays of a footprint against the closed form."""
+    table = Table("std of the spread by angle [ns]", 4)
+    x, y = np.random.default_rng(seed).normal(0.0, HEIGHT * DIVERGENCE / 4, (2, 10 * number))
+    for degrees, expected in SPREADS.items():
+        ray = np.stack([x / HEIGHT, y / HEIGHT, np.ones_like(x)])
+        distance = HEIGHT / (1.0 - np.tan(np.radians(degrees)) * ray[0]) * np.sqrt((ray**2).sum(axis=0))
+        closed = float(spread_of_angle(np.radians(degrees), HEIGHT, DIVERGENCE))
+        table.near(f"Monte Carlo, {degrees}", np.std(2 * distance / C), expected, share=0.01)
+        table.near(f"closed form, {degrees}", closed, expected, share=0.01)
+    return table
+
+
+def table_of_errors(number: int, seed: int) -> Table:
+    """Rms errors of angles from widths at their bound, and angles read as 0."""
+    table = Table("rms error of the angle [deg]; read as 0 [%]")
+    rng = np.random.default_rng(seed)
+    for snr, expected in ERRORS.items():
+        for degrees, rms in zip(TRUE_DEGREES, expected, strict=True):
+            true = np.radians(degrees)
+            sigma = np.hypot(OWN, spread_of_angle(true, HEIGHT, DIVERGENCE))
+            amplitude = snr * np.cos(true) * OWN / sigma
+            found = sigma + bound_time(amplitude, sigma, 1.0, 1.0) * rng.standard_normal(number)
+            error = bound_time(amplitude, np.maximum(found, 0.2), 1.0, 1.0)
+            angle, _ = angles_of_variance(found**2 - OWN**2, 2 * found * error, np.full(number, HEIGHT), DIVERGENCE)
+            if rms is not None:
+                ours = np.degrees(np.sqrt(np.nanmean((angle - true) ** 2)))
+                table.near(f"SNR {snr}, {degrees} deg", ours, rms, within=0.05, share=0.2, spec=rms)
+            if degrees == 0:
+                table.near(f"SNR {snr}, 0 deg: read as 0", 100 * np.mean(angle == 0), 50, within=2)
+            elif (snr, degrees) in READ_AS_ZERO:
+                share = 100 * np.mean(angle == 0)
+                table.near(f"SNR {snr}, {degrees} deg: read as 0", share, READ_AS_ZERO[snr, degrees], within=3)
+    return table
+
+
+def fitted_angles(degrees: np.ndarray, snr: float, mode: str, rng: np.random.Generator) -> np.ndarray:
+    """Angles [deg] that Gaussians fitted to simulated echoes, sampled every 0.5 ns, have for planes of `degrees`."""
+    spread = spread_of_angle(np.radians(degrees), HEIGHT, DIVERGENCE)
+    recording = fine_recording(1.0, OWN, n_samples=96, spacing=0.5)
+    sigma = np.hypot(OWN, spread)
+    amplitude = snr * np.cos(np.radians(degrees)) * OWN / sigma
+    time = 24 + rng.uniform(-0.25, 0.25, (len(degrees), 1))
+    block, _ = simulate_echoes(recording, time, FINE * amplitude[:, None], sigma[:, None], rng)
+    noise, system = known_noise(recording, len(block)), known_system(recording)
+    found = gaussian(block, noise, system, maximum(block, noise, system))
+    angles = np.full(len(degrees), np.nan)
+    alone = found.take(found.count(len(block))[found.waveform] == 1)
+    width = alone.sigma.astype(np.float64)
+    variance = spread_variance(paper_table(OWN), width) if mode == "paper" else width**2 - OWN**2
+    error = 2 * width * alone.sigma_err
+    angles[alone.waveform] = np.degrees(angles_of_variance(variance, error, np.full(len(alone), HEIGHT), DIVERGENCE)[0])
+    return angles
+
+
+def figure_of_differences(number: int, seed: int) -> tuple[Table, str]:
+    """Figure 6: angle from the fitted width minus the true one, of roofs of 0 to 60 degrees at SNR 100."""
+    rng = np.random.default_rng(seed)
+    true = rng.choice([0.0, 10, 20, 30, 40, 50, 60], number)
+    found = fitted_angles(true, 100.0, "system", rng)
+    off, known = found - true, np.isfinite(found)
+    table = Table("figure 6: angle from the width minus the true one")
+    table.add("found [%]", 100 * known.mean(), 97)
+    table.add("median [deg]", np.median(off[known]), -0.3, 0.3)
+    table.add("within 5 deg, slopes of 10 and more [%]", 100 * np.mean(np.abs(off[known & (true >= 10)]) < 5), 97)
+    table.near("level planes read as 0 [%]", 100 * np.mean(found[known & (true == 0)] == 0), 50, within=8)
+    printed = fitted_angles(true, 100.0, "paper", rng)
+    some = true == 30
+    table.add("30 deg by the printed formulas, median [deg]", np.nanmedian(printed[some]), 40)
+    edges = np.arange(-12, 14, 2) - 1.0
+    counts = np.histogram(np.clip(off[known], -11.9, 11.9), edges)[0]
+    bars = [f"{a + 1:4.0f} |{'#' * round(60 * c / counts.max())} {c}" for a, c in zip(edges, counts, strict=False)]
+    return table, "\n".join(["angle minus truth [deg], bins of 2 deg", *bars])
+
+
+def measure(number: int, seed: int) -> list[Table | str]:
+    """All tables, and the histogram."""
+    return [
+        table_of_widths(),
+        table_of_footprints(number, seed),
+        table_of_errors(number, seed),
+        *figure_of_differences(max(number // 2, 10), seed),
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(measure, __doc__, 20_000))

@@ -1,0 +1,116 @@
+"""Ussyshkin, Theriault (2011), Airborne lidar: advances in discrete return technology for 3D vegetation mapping.
+
+The return numbers and least separations that a receiver with a dead zone has in stands of plants, the lidar equation,
+and how well waveforms are modelled from discrete returns (ALGORITHMS.md 1.5).
+
+    python examples/papers/s4_ussyshkin.py [--seed N] [--number PULSES]
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from table import Table, main
+
+from wavebatch.kernels.radar import pass_atmosphere, receive_power, spread_cross_section
+from wavebatch.returns import ReturnStats, count_returns
+from wavebatch.simulate import DiscreteReceiver, Recording, simulate_returns
+from wavebatch.simulate.papers import RETURN_TABLES
+from wavebatch.simulate.render import paint_echoes
+
+CORN = {0.64: (1.13, 0.90), 0.67: (1.15, 0.92)}
+"""Mean separation of the first and the second, the second and the third return [m], by dead zone [m]."""
+
+
+def fly(stand: str, dead_zone: float, number: int, seed: int) -> ReturnStats:
+    """What `wavebatch stats` says of `wavebatch simulate canopy.STAND --sensor discrete --dead-zone METRES`."""
+    with TemporaryDirectory() as folder:
+        cloud = Path(folder) / "cloud.las"
+        simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))
+        return count_returns([cloud])[1]
+
+
+def table_of_numbers(number: int, seed: int) -> Table:
+    """Tables of return numbers: shares of the returns, their differences, returns per pulse."""
+    table = Table("return numbers [%]")
+    for stand, (dead_zone, exact) in RETURN_TABLES.items():
+        stats = fly(stand, dead_zone, number, seed)
+        shares = np.cumsum(exact[::-1])[::-1]
+        shares = 100 * shares / shares.sum()
+        ours = [100 * stats.by_number.get(k, 0.0) for k in (1, 2, 3, 4)]
+        for k, (mine, paper) in enumerate(zip(ours, shares, strict=True), 1):
+            table.add(f"{stand} m, number {k}", mine, paper=paper)
+        table.add(f"{stand} m, sum of |differences| [points]", np.abs(np.subtract(ours, shares)).sum(), 0, 6)
+        per_pulse = np.dot((1, 2, 3, 4), exact) / 100
+        table.near(f"{stand} m, returns per pulse", stats.returns_per_pulse, per_pulse, within=0.08, paper=per_pulse)
+        table.near(f"{stand} m, dead zone [m]", stats.separations["all"].least, dead_zone, within=0.03)
+    return table
+
+
+def table_of_separations(number: int, seed: int) -> Table:
+    """Vertical target discrimination in a cornfield 2.2 m high."""
+    table = Table("cornfield: separation of consecutive returns [m]", 3)
+    for dead_zone, means in CORN.items():
+        stats = fly("corn", dead_zone, number, seed)
+        for pair, spec, low, high in zip(("1-2", "2-3"), means, (0.635, 0.605), (0.69, 0.73), strict=True):
+            found = stats.separations[pair]
+            table.add(f"{dead_zone:g} m, least of {pair}", found.least, low, high, paper=0.65, spec=dead_zone)
+            paper = 1.3 if pair == "1-2" else 1.02
+            table.add(f"{dead_zone:g} m, mean of {pair}", found.mean, spec - 0.06, spec + 0.06, paper=paper, spec=spec)
+        four = 100 * stats.by_count.get(4, 0.0)
+        table.add(f"{dead_zone:g} m, pulses of four returns [%]", four, 0, 0.2, paper=0, spec=0.05)
+    for dead_zone, third, low, high in ((1.5, 3, 0, 0), (2.5, 2, 0, 1.5)):
+        share = 100 * fly("corn", dead_zone, number, seed).by_number.get(third, 0.0)
+        table.add(f"{dead_zone:g} m, returns of number {third} [%]", share, low, high, spec=0.5 if third == 2 else 0)
+    return table
+
+
+def table_of_the_equation() -> Table:
+    """The lidar equation (3) of a diffuse surface that fills the footprint, against its short form."""
+    table = Table("lidar equation (3)", 6)
+    figures = {"transmitted": 4000.0, "aperture": 0.1, "efficiency": 0.4, "attenuation": 0.3}
+    for distance in (300.0, 800.0, 3000.0):
+        section = spread_cross_section(np.array(0.3), np.array(distance), 7e-4)
+        power = receive_power(section, np.array(distance), divergence=7e-4, **figures)
+        through = pass_atmosphere(distance, figures["attenuation"])
+        short = 4000 * 0.1**2 * 0.3 * 0.4 * through**2 / (4 * distance**2)
+        table.near(f"over P D^2 rho Q T^2 / (4 R^2), {distance:g} m", power / short, 1.0, share=1e-6)
+        half = receive_power(section, np.array(distance), divergence=3.5e-4, **figures)
+        table.near(f"  with half the angle, {distance:g} m", half / short, 4.0, share=1e-6)
+    return table
+
+
+def table_of_models(number: int, seed: int) -> Table:
+    """Equations (1), (2): waveforms of echoes of various widths, modelled with one width at the returns."""
+    table = Table("waveforms modelled from returns: relative L2 error")
+    rng = np.random.default_rng(seed)
+    n = max(number // 5, 20)
+    count = 1 + rng.choice(4, n, p=[0.4, 0.3, 0.2, 0.1])
+    gap = np.where(np.arange(4) < count[:, None], rng.uniform(4.5, 15, (n, 4)), np.nan)
+    time = 10 + np.cumsum(gap, axis=1)
+    there = np.isfinite(time)
+    waveform = np.nonzero(there)[0]
+    amplitude = np.clip(25 * np.exp(0.8 * rng.standard_normal(there.sum())), 5, 230)
+    sigma = 2 * np.sqrt(1 + 0.4 * np.abs(rng.standard_normal(there.sum())))
+    recording = Recording(n_samples=96)
+    true, model = (paint_echoes(recording, n, waveform, time[there], amplitude, s) for s in (sigma, 0 * sigma + 2))
+    error = np.linalg.norm(model - true, axis=1) / np.linalg.norm(true, axis=1)
+    table.near("median", np.median(error), 0.12, within=0.02)
+    table.near("90 % quantile", np.quantile(error, 0.9), 0.18, within=0.04)
+    return table
+
+
+def measure(number: int, seed: int) -> list[Table]:
+    """All tables."""
+    return [
+        table_of_numbers(number, seed),
+        table_of_separations(number, seed),
+        table_of_the_equation(),
+        table_of_models(number, seed),
+    ]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(measure, __doc__, 20_000))
