@@ -14,7 +14,7 @@ RANKS = [
     {"chain", "io", "report", "inputs", "pictures"},
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
-     "comparison", "compare", "goodness", "returns", "slices", "synthesize"},
+     "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
     {"auto", "trial", "choice", "sensor", "calibration", "matchup"},
     {"work", "targets"},
     {"record"},

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
 from wavebatch.blocks import EchoFlag
-from wavebatch.errors import InputError
+from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.buckets import Buckets
 from wavebatch.io.returnfile import ReturnReader
 from wavebatch.units import HALF_C
@@ -21,7 +22,6 @@ MOST_BUCKETS = 72
 
 _BIN = 0.01
 _BINS = 10_000
-_MOST_COUNT = 64
 _MOST_PAIR = 15
 _PASSED = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
@@ -64,6 +64,8 @@ class ReturnStats:
     flags: dict[str, int] | None
     """Points per flag of `echo_flags`; None where no cloud has the column."""
     warnings: tuple[str, ...]
+    areas: tuple[AreaStats, ...] = ()
+    """Of every area that holds a pulse, where areas are asked for; together they have all points and pulses."""
 
     @property
     def returns_per_pulse(self) -> float:
@@ -71,22 +73,28 @@ class ReturnStats:
         return self.points / self.pulses if self.pulses else float("nan")
 
 
-def count_returns(clouds: Sequence[Path], skip=None) -> tuple[list[ReturnStats], ReturnStats]:
+def count_returns(
+    clouds: Sequence[Path], skip=None, *, divisions: Sequence[Division] = ()
+) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of every cloud and of all of them together, whatever the order of their points.
 
     Pulses are points of equal GPS time in a cloud; where times do not tell them apart, runs of rising return numbers.
+    divisions: into areas, each counted on its own; a pulse belongs, with all of its returns, to the area of its first.
     skip: called with the InputError of a cloud that cannot be read, which is then left out; None lets it through.
-    Memory does not grow with the clouds; large ones need room in TMPDIR.
+    Memory does not grow with the clouds; large ones need room in TMPDIR. Raises ConfigError for too many areas.
     """
-    each, total = [], _Tally()
+    each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path))
+            tally = _tally_cloud(Path(path), divisions)
         except InputError as error:
             if skip is None:
                 raise
             skip(error)
             continue
+        number += sum(map(len, tally.areas))
+        if number > MOST_AREAS:
+            raise ConfigError(f"{path}: more than {MOST_AREAS} areas with it; give a larger --area, or fewer clouds")
         each.append(tally.finish(str(path)))
         total.merge(tally)
     return each, total.finish("total")
@@ -100,10 +108,11 @@ def pulses_told_apart(reader: ReturnReader) -> bool:
     return rows is None or not len(rows) or len(np.unique(rows["gps_time"])) * 16 >= len(rows)
 
 
-def _tally_cloud(path: Path) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
     with ReturnReader(path) as reader:
         by_time = pulses_told_apart(reader)
-        tally = _Tally(methods={"gps_time" if by_time else "return_number"})
+        areas = [AreaTally(division) for division in divisions]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = min(-(-max(reader.point_count, 1) // BUCKET_POINTS), MOST_BUCKETS)
@@ -160,12 +169,13 @@ class _Tally:
     incomplete: int = 0
     methods: set[str] = field(default_factory=set)
     by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
-    by_count: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_COUNT + 1, np.int64))
+    by_count: np.ndarray = field(default_factory=lambda: np.zeros(MOST_COUNT + 1, np.int64))
     bins: np.ndarray = field(default_factory=lambda: np.zeros(_BINS, np.int64))
     pairs: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR, np.int64))
     sums: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR))
     least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
     flags: np.ndarray | None = None
+    areas: list[AreaTally] = field(default_factory=list)
 
     def add_points(self, rows: np.ndarray) -> None:
         """Return numbers and flags of some points."""
@@ -181,16 +191,21 @@ class _Tally:
         rows = rows[np.lexsort((rows["number"], rows["key"]))]
         first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
         counts = np.diff(np.append(first, len(rows)))
-        self.by_count += np.bincount(np.minimum(counts, _MOST_COUNT), minlength=_MOST_COUNT + 1)
+        self.by_count += np.bincount(np.minimum(counts, MOST_COUNT), minlength=MOST_COUNT + 1)
         self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
         pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
         before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
-        distance = np.linalg.norm(rows["xyz"][before + 1] - rows["xyz"][before], axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = np.linalg.norm(rows["xyz"][before + 1] - rows["xyz"][before], axis=1)
+        known = np.isfinite(distance)
+        before, distance = before[known], distance[known]
         rank = np.minimum(rows["number"][before], _MOST_PAIR) - 1
         self.bins += np.bincount(np.minimum(distance / _BIN, _BINS - 1).astype(np.int64), minlength=_BINS)
         self.pairs += np.bincount(rank, minlength=_MOST_PAIR)
         self.sums += np.bincount(rank, distance, _MOST_PAIR)
         np.minimum.at(self.least, rank, distance)
+        for area in self.areas:
+            area.add(rows, first, before, distance)
 
     def merge(self, other: _Tally) -> None:
         """Adds what another cloud has."""
@@ -200,6 +215,8 @@ class _Tally:
         for name in ("by_number", "by_count", "bins", "pairs", "sums"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.least = np.minimum(self.least, other.least)
+        for area, more in zip(self.areas, other.areas, strict=True):
+            area.merge(more)
         if other.flags is not None:
             self.flags = other.flags + (0 if self.flags is None else self.flags)
 
@@ -216,13 +233,14 @@ class _Tally:
             pulses=pulses,
             incomplete=self.incomplete,
             pulses_by=" and ".join(sorted(self.methods)),
-            by_number=_shares(self.by_number),
-            by_count=_shares(self.by_count),
+            by_number=share_counts(self.by_number),
+            by_count=share_counts(self.by_count),
             separations=self._list_separations(),
             dead_zone=zone,
             hidden=hidden,
             flags=names,
             warnings=tuple(self._warn(zone, hidden, pulses)),
+            areas=tuple(stats for area in self.areas for stats in area.finish()),
         )
 
     @property
@@ -268,11 +286,6 @@ class _Tally:
                 "say; tiles and thinned clouds give fewer returns per pulse than the sensor had"
             )
         return lines
-
-
-def _shares(counts: np.ndarray) -> dict[int, float]:
-    total = int(counts.sum())
-    return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}
 
 
 def _separation(pairs: int, total: float, least: float) -> Separation:

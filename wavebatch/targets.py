@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import datetime
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.strip import StripReader
 from wavebatch.kernels.radiometry import calibrate_echoes
+from wavebatch.polygons import find_inside, read_features
 from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.units import MAD_TO_STD
 
@@ -51,16 +51,7 @@ class Target:
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Whether points (n,) lie inside, bool (n,)."""
-        (left, low), (right, high) = self.corners.min(axis=0), self.corners.max(axis=0)
-        near = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
-        odd = np.zeros(len(near), bool)
-        for (x0, y0), (x1, y1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
-            if y0 != y1:
-                crosses = (y0 > y[near]) != (y1 > y[near])
-                odd ^= crosses & (x[near] < x0 + (y[near] - y0) * (x1 - x0) / (y1 - y0))
-        inside = np.zeros(len(x), bool)
-        inside[near] = odd
-        return inside
+        return find_inside([self.corners], x, y)
 
 
 def load_targets(path: Path | str) -> list[Target]:
@@ -81,19 +72,12 @@ def load_targets(path: Path | str) -> list[Target]:
 
 
 def _read_geojson(text: str, path: Path | str) -> list[dict[str, Any]]:
-    try:
-        document = json.loads(text)
-        rows = []
-        for feature in document["features"]:
-            shape = feature["geometry"]
-            if shape["type"] != "Polygon":
-                raise ConfigError(f"{path}: a target is a {shape['type']}; only polygons have an area")
-            corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y, *_ in shape["coordinates"][0])
-            rows.append({**(feature.get("properties") or {}), "vertices": corners})
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {type(error).__name__}: {error}") from error
+    rows = []
+    for properties, rings in read_features(text, path):
+        if len(rings) > 1:
+            raise ConfigError(f"{path}: a target has {len(rings)} rings; give every part one of its own, without holes")
+        corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
+        rows.append({**properties, "vertices": corners})
     return rows
 
 

@@ -1,0 +1,196 @@
+"""Where pulses are counted: cells of a grid or polygons, and sums of their returns per area."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from wavebatch.errors import ConfigError
+from wavebatch.polygons import Polygon, find_inside
+
+MOST_AREAS = 100_000
+"""Areas of all clouds together that are counted, so that memory is bounded."""
+
+MOST_NUMBER, MOST_COUNT = 15, 64
+"""Largest return number of LAS; returns of a pulse from which they are counted as one class."""
+
+_OUTSIDE = -1
+_HALF = 1 << 30
+
+_FARTHEST = 1e9
+"""No coordinate on Earth is larger; damaged ones are."""
+
+
+class Area(NamedTuple):
+    """What an area is called."""
+
+    kind: str
+    """`cell`, `polygon`, or `outside`: in no polygon, or without a place."""
+    name: str
+    x: float
+    y: float
+    """Lower left corner of a cell; NaN for others."""
+
+
+class Division(Protocol):
+    """Areas of which every place belongs to one at most."""
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """A number per place (n,), i8, that tells areas apart; -1 outside of all."""
+
+    def describe(self, number: int) -> Area:
+        """What the area of that number is called."""
+
+
+class Grid:
+    """Square cells whose borders are multiples of `size`, in the unit of the clouds' coordinates."""
+
+    def __init__(self, size: float) -> None:
+        if not (np.isfinite(size) and size > 0):
+            raise ConfigError(f"--area {size:g}: the side of a cell must be above 0")
+        self.size = float(size)
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find; raises ConfigError for cells too small to be numbered where the places are."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            known = (np.abs([x, y]) < _FARTHEST).all(axis=0)
+            place = np.floor(np.stack([x, y]) / self.size)
+        if (np.abs(place[:, known]) >= _HALF).any():
+            raise ConfigError(f"--area {self.size:g}: the cells are too small for these coordinates; give a larger one")
+        column, row = np.where(known, place, 0.0).astype(np.int64) + _HALF
+        return np.where(known, (column << 31) | row, _OUTSIDE)
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        if number == _OUTSIDE:
+            return Area("outside", "outside", float("nan"), float("nan"))
+        x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
+        return Area("cell", f"{x:.10g} {y:.10g}", x, y)
+
+
+class PolygonSet:
+    """Polygons; where they overlap, a place belongs to the first."""
+
+    def __init__(self, polygons: Sequence[Polygon]) -> None:
+        self.polygons = tuple(polygons)
+
+    def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """As Division.find."""
+        found = np.full(len(x), _OUTSIDE, np.int64)
+        for number, polygon in enumerate(self.polygons):
+            free = np.flatnonzero(found == _OUTSIDE)
+            found[free[find_inside(polygon.rings, x[free], y[free])]] = number
+        return found
+
+    def describe(self, number: int) -> Area:
+        """As Division.describe."""
+        if number == _OUTSIDE:
+            return Area("outside", "outside", float("nan"), float("nan"))
+        return Area("polygon", self.polygons[number].name, float("nan"), float("nan"))
+
+
+@dataclass(frozen=True, slots=True)
+class AreaStats:
+    """What the returns of the pulses of one area are like."""
+
+    kind: str
+    """`cell`, `polygon`, or `outside`: in no polygon, or without a place."""
+    name: str
+    x: float
+    y: float
+    """Lower left corner of a cell; NaN for others."""
+    points: int
+    pulses: int
+    returns_per_pulse: float
+    by_number: dict[int, float]
+    """Share of the area's returns that have this return number."""
+    by_count: dict[int, float]
+    """Share of its pulses with exactly this many returns."""
+    pairs: int
+    """Separations of consecutive returns."""
+    mean: float
+    least: float
+    """Of the separations [m]; NaN where there is no pair."""
+
+
+class AreaTally:
+    """Sums per area of a division; tallies of several clouds can be merged."""
+
+    def __init__(self, division: Division) -> None:
+        self.division = division
+        self._areas = np.empty(0, np.int64)
+        self._counts = np.zeros((0, MOST_NUMBER + 1 + MOST_COUNT + 1 + 1), np.int64)
+        self._sums = np.zeros((0, 2))
+
+    def __len__(self) -> int:
+        return len(self._areas)
+
+    def add(self, rows: np.ndarray, first: np.ndarray, before: np.ndarray, distance: np.ndarray) -> None:
+        """Takes in whole pulses: a pulse with all of its returns belongs to the area of its first return.
+
+        rows: returns sorted by pulse, then number; first: row of the first return of every pulse; before: rows that
+        have a separation from the next one; distance: that separation [m].
+        """
+        places = rows["xyz"][first]
+        areas, own = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
+        n, number = len(areas), np.diff(np.append(first, len(rows)))
+        of_row = np.repeat(own, number)
+        by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
+        by_count = np.bincount(
+            own * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT), minlength=n * (MOST_COUNT + 1)
+        )
+        of_pair = of_row[before]
+        pairs = np.bincount(of_pair, minlength=n)[:, None]
+        least = np.full(n, np.inf)
+        np.minimum.at(least, of_pair, distance)
+        counts = np.concatenate([by_number.reshape(n, -1), by_count.reshape(n, -1), pairs], axis=1)
+        self._join(areas, counts, np.stack([np.bincount(of_pair, distance, n), least], axis=1))
+
+    def merge(self, other: AreaTally) -> None:
+        """Adds what another cloud has."""
+        self._join(other._areas, other._counts, other._sums)
+
+    def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray) -> None:
+        """areas: ascending, each once."""
+        known = np.union1d(self._areas, areas)
+        if len(known) > MOST_AREAS:
+            raise ConfigError(f"more than {MOST_AREAS} areas hold pulses; give a larger --area, or fewer clouds")
+        old, new = np.searchsorted(known, self._areas), np.searchsorted(known, areas)
+        if len(known) > len(self._areas):
+            kept_counts, kept_sums = self._counts, self._sums
+            self._counts = np.zeros((len(known), counts.shape[1]), np.int64)
+            self._sums = np.tile([0.0, np.inf], (len(known), 1))
+            self._counts[old], self._sums[old], self._areas = kept_counts, kept_sums, known
+        self._counts[new] += counts
+        self._sums[new, 0] += sums[:, 0]
+        self._sums[new, 1] = np.minimum(self._sums[new, 1], sums[:, 1])
+
+    def finish(self) -> list[AreaStats]:
+        """The statistics: cells by column and row, polygons as the file has them, what is outside last."""
+        order = np.argsort(np.where(self._areas == _OUTSIDE, np.iinfo(np.int64).max, self._areas), kind="stable")
+        return [self._describe(row) for row in order.tolist()]
+
+    def _describe(self, row: int) -> AreaStats:
+        by_number, by_count, pairs = np.split(self._counts[row], [MOST_NUMBER + 1, MOST_NUMBER + 2 + MOST_COUNT])
+        points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(pairs[0])
+        total, least = self._sums[row].tolist()
+        return AreaStats(
+            *self.division.describe(int(self._areas[row])),
+            points=points,
+            pulses=pulses,
+            returns_per_pulse=points / pulses,
+            by_number=share_counts(by_number),
+            by_count=share_counts(by_count),
+            pairs=number,
+            mean=total / number if number else float("nan"),
+            least=least if number else float("nan"),
+        )
+
+
+def share_counts(counts: np.ndarray) -> dict[int, float]:
+    """Shares of the sum, of those that are not 0."""
+    total = int(counts.sum())
+    return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}

@@ -1,0 +1,84 @@
+"""Polygons of a GeoJSON file, and which points lie inside."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Polygon:
+    """An area with a name; one with several parts or with holes has several rings."""
+
+    name: str
+    rings: tuple[np.ndarray, ...]
+    """Corners of each, f8 (k, 2)."""
+
+
+def find_inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Whether points (n,) lie inside an odd number of rings, bool (n,); points without a place lie nowhere.
+
+    Of two polygons that share a border, each point of it lies in one.
+    """
+    corners = np.concatenate(rings)
+    (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
+    near = np.flatnonzero((x >= left) & (x <= right) & (y >= low) & (y <= high))
+    odd = np.zeros(len(near), bool)
+    for ring in rings if len(near) else ():
+        for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            if y0 != y1:
+                crosses = (y0 > y[near]) != (y1 > y[near])
+                odd ^= crosses & (x[near] < x0 + (y[near] - y0) * (x1 - x0) / (y1 - y0))
+    inside = np.zeros(len(x), bool)
+    inside[near] = odd
+    return inside
+
+
+def load_polygons(path: Path | str) -> list[Polygon]:
+    """The polygons of a GeoJSON file, named by the property `name` or by their number; ConfigError in one line.
+
+    Polygons and MultiPolygons, in the coordinates of the clouds.
+    """
+    try:
+        text = Path(path).read_text("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: polygons cannot be read: {error}") from error
+    polygons = []
+    for number, (properties, rings) in enumerate(read_features(text, path), 1):
+        for ring in rings:
+            if len(ring) < 3 or not np.isfinite(ring).all():
+                raise ConfigError(f"{path}: polygon {number}: a ring needs three corners, and finite coordinates")
+        polygons.append(Polygon(str(properties.get("name") or number), tuple(rings)))
+    if not polygons:
+        raise ConfigError(f"{path}: no polygon in it; give a GeoJSON FeatureCollection of polygons")
+    return polygons
+
+
+def read_features(text: str, path: Path | str) -> list[tuple[dict[str, Any], list[np.ndarray]]]:
+    """Properties and rings, f8 (k, 2) each, of every feature of a GeoJSON document; ConfigError in one line.
+
+    path: named in errors.
+    """
+    try:
+        features = []
+        for feature in json.loads(text)["features"]:
+            shape = feature["geometry"]
+            if shape["type"] not in ("Polygon", "MultiPolygon"):
+                raise ConfigError(f"{path}: a feature is a {shape['type']}; only polygons have an area")
+            parts = [shape["coordinates"]] if shape["type"] == "Polygon" else shape["coordinates"]
+            rings = [np.array([[float(x), float(y)] for x, y, *_ in ring]) for part in parts for ring in part]
+            if not rings:
+                raise ConfigError(f"{path}: a {shape['type']} has no ring")
+            features.append((dict(feature.get("properties") or {}), rings))
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {type(error).__name__}: {error}") from error
+    return features
