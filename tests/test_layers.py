@@ -16,7 +16,7 @@ RANKS = [
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
      "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
     {"auto", "trial", "choice", "sensor", "calibration", "matchup"},
-    {"work", "targets"},
+    {"work", "targets", "voxels"},
     {"record"},
     {"task", "workers"},
     {"plan"},

@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "stats": ("wavebatch.cli.stats:stats", "Return numbers, separations and flags of point clouds."),
     "synthesize": ("wavebatch.cli.synthesize:synthesize", "Waveforms modelled from discrete returns."),
     "slice": ("wavebatch.cli.slice:slice_", "Straight surface lines in the scan lines of a strip."),
+    "voxelize": ("wavebatch.cli.voxelize:voxelize", "What came back from every voxel of a 3D grid."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "The calibration constant, from targets of known reflectance."),
     "bench": ("wavebatch.cli.bench:bench", "Error against run time of chains on simulated truth."),
 }

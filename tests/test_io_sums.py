@@ -1,0 +1,58 @@
+"""Sums by key: the same whatever was spilled, and in bounded memory."""
+
+import tempfile
+
+import numpy as np
+import pytest
+
+from wavebatch.errors import InputError
+from wavebatch.io.sums import KeyedSums
+
+
+def slow_sums(parts):
+    sums = {}
+    for key, value in parts:
+        for one, row in zip(key.tolist(), value.tolist(), strict=True):
+            sums[one] = [a + b for a, b in zip(sums.get(one, [0] * len(row)), row, strict=True)]
+    return sums
+
+
+def draw_parts(seed, spread, number=40):
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(0, 200, number)
+    return [
+        (rng.integers(0, spread, n).astype(np.uint64) << np.uint64(40), rng.integers(-9, 2**40, (n, 3))) for n in sizes
+    ]
+
+
+@pytest.mark.parametrize("held", [3, 50, 400, 100_000])
+@pytest.mark.parametrize("spread", [1, 30, 100_000])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_sums_are_those_of_a_dictionary(held, spread, seed):
+    parts = draw_parts(seed, spread)
+    with KeyedSums(3, held=held) as sums:
+        for key, value in parts:
+            sums.add(key, value)
+        pieces = list(sums.pieces())
+        assert bool(sums.spilled) == (min(spread, 4000) > held // 2)
+    keys = np.concatenate([key for key, _ in pieces])
+    values = np.concatenate([value for _, value in pieces])
+    expected = slow_sums(parts)
+    assert keys.tolist() == sorted(expected)
+    assert values.tolist() == [expected[key] for key in keys.tolist()]
+
+
+def test_pieces_can_be_read_twice_and_may_be_none():
+    with KeyedSums(2, held=1000) as sums:
+        assert list(sums.pieces()) == []
+        for key, value in draw_parts(3, 100_000, 300):
+            sums.add(key, value[:, :2])
+        first, second = ([key.tolist() for key, _ in sums.pieces()] for _ in range(2))
+    assert first == second and len(first) > 1
+
+
+def test_a_full_disk_is_one_line(monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with KeyedSums(3, held=10) as sums, pytest.raises(InputError, match="TMPDIR"):
+        for key, value in draw_parts(4, 1000):
+            sums.add(key, value)

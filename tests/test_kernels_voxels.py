@@ -1,0 +1,172 @@
+"""Rays through voxels: against a walk in exact fractions, and the sums along them."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from wavebatch.kernels import voxels
+from wavebatch.kernels.profiles import keep_signal, measure_offsets, window_signal
+from wavebatch.kernels.voxels import (
+    KEY_BITS,
+    accumulate_profile,
+    cross_voxels,
+    differences_along,
+    fits_keys,
+    pack_index,
+    split_rays,
+    total_until,
+    unpack_index,
+)
+
+
+def walk(start, step, begin, end, size):
+    """Voxels of one ray with the time inside each, plane by plane in exact fractions (Amanatides and Woo 1987)."""
+    p = [Fraction(float(value)) for value in start]
+    v = [Fraction(float(value)) for value in step]
+    size, now, end = Fraction(float(size)), Fraction(float(begin)), Fraction(float(end))
+    index = [(x + d * now) // size for x, d in zip(p, v, strict=True)]
+    found = []
+    while now < end:
+        times = []
+        for x, d, i in zip(p, v, index, strict=True):
+            plane = (i + 1 if d > 0 else i) * size
+            times.append((plane - x) / d if d else end + 1)
+        leave = min([*times, end])
+        found.append((tuple(int(i) for i in index), float(now), float(leave - now)))
+        for axis, time in enumerate(times):
+            if time == leave:
+                index[axis] += 1 if v[axis] > 0 else -1
+        now = leave
+    return found
+
+
+def draw_rays(rng, n):
+    start = rng.uniform(-20, 20, (n, 3))
+    step = rng.normal(0, 0.05, (n, 3)) + [0, 0, -0.14]
+    begin = rng.uniform(-3, 0, n)
+    return start, step, begin, begin + rng.uniform(0, 90, n)
+
+
+@pytest.mark.parametrize("size", [0.07, 0.5, 1.0, 3.3, 50.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_crossings_are_those_of_a_slow_walk(size, seed):
+    rays = draw_rays(np.random.default_rng(seed), 40)
+    found = cross_voxels(*rays, size)
+    for row in range(40):
+        expected = [one for one in walk(*(values[row] for values in rays), size) if one[2] > 2e-6]
+        mine = np.flatnonzero((found.ray == row) & (found.inside > 2e-6))
+        assert [tuple(index) for index in found.index[mine].tolist()] == [one[0] for one in expected]
+        assert found.enter[mine] == pytest.approx([one[1] for one in expected], abs=1e-9)
+        assert found.inside[mine] == pytest.approx([one[2] for one in expected], abs=1e-9)
+
+
+def test_rays_along_faces_and_through_edges_lie_in_one_voxel_at_a_time():
+    start = np.array([[1.0, 0.5, 5.0], [0.0, 0.0, 0.0], [0.25, 0.25, 3.0], [2.5, 2.5, 2.5]])
+    step = np.array([[0.0, 0.0, -1.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    begin, end = np.array([0.0, 0.0, 0.0, 1.5]), np.array([3.0, 4.0, 2.0, 3.0])
+    found = cross_voxels(start, step, begin, end, 1.0)
+    cells = [found.index[found.ray == row].tolist() for row in range(4)]
+    assert cells[0] == [[1, 0, 4], [1, 0, 3], [1, 0, 2]]
+    assert cells[1] == [[i, i, i] for i in range(4)]
+    assert cells[2] == [[0, 0, 3]]
+    assert cells[3] == [[0, 2, 2], [-1, 2, 2]]
+
+
+def test_rays_do_not_know_of_each_other():
+    rays = draw_rays(np.random.default_rng(4), 500)
+    whole = cross_voxels(*rays, 0.3)
+    parts = [cross_voxels(*(values[row : row + 1] for values in rays), 0.3) for row in range(0, 500, 7)]
+    for row, part in zip(range(0, 500, 7), parts, strict=True):
+        mine = whole.ray == row
+        for name in ("enter", "inside", "index"):
+            assert np.array_equal(getattr(whole, name)[mine], getattr(part, name))
+
+
+def test_slices_of_rays_cover_all_and_stay_small(monkeypatch):
+    monkeypatch.setattr(voxels, "AT_A_TIME", 2000)
+    rays = draw_rays(np.random.default_rng(5), 300)
+    slices = split_rays(*rays, 0.2)
+    assert np.concatenate([np.arange(300)[part] for part in slices]).tolist() == list(range(300))
+    for part in slices:
+        found = cross_voxels(*(values[part] for values in rays), 0.2)
+        widest = np.bincount(found.ray).max()
+        assert widest * (part.stop - part.start) <= 2000 or part.stop - part.start == 1
+    assert split_rays(*(values[:0] for values in rays), 0.2) == []
+    assert len(cross_voxels(*(values[:0] for values in rays), 0.2).ray) == 0
+
+
+def test_keys_sort_as_indices_and_come_back(rng):
+    limits = [1 << (bits - 1) for bits in KEY_BITS]
+    index = np.stack([rng.integers(-limit, limit, 2000) for limit in limits], axis=1)
+    index[0], index[1] = [-limit for limit in limits], [limit - 1 for limit in limits]
+    keys = pack_index(index)
+    assert np.array_equal(unpack_index(keys), index)
+    assert np.array_equal(np.argsort(keys), np.lexsort(index.T[::-1]))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, 1e300])
+@pytest.mark.parametrize("what", [0, 1, 2])
+def test_rays_that_keys_cannot_reach_are_told(bad, what):
+    rays = [values.copy() for values in draw_rays(np.random.default_rng(6), 5)]
+    rays[what].reshape(5, -1)[2, -1] = bad
+    assert fits_keys(*rays, 0.5).tolist() == [True, True, False, True, True]
+
+
+def test_a_ray_of_too_many_voxels_does_not_fit():
+    start, step = np.zeros((2, 3)), np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    times = np.zeros(2), np.full(2, 1e4)
+    assert fits_keys(start, step, *times, 0.005).tolist() == [True, False]
+
+
+def test_sums_over_time_spread_every_sample_over_its_step(rng):
+    profile = rng.uniform(0, 5, (3, 6))
+    total = accumulate_profile(profile)
+    for time in (-5.0, -0.5, -0.25, 0.0, 1.3, 4.999, 10.0):
+        for row in range(3):
+            edges = [2.0 * (i - 0.5) for i in range(7)]
+            slow = sum(
+                profile[row, i] * min(max((time - edges[i]) / 2.0, 0.0), 1.0) for i in range(6)
+            )
+            assert total_until(total, np.array([row]), np.array([time]), 2.0)[0] == pytest.approx(slow, abs=1e-12)
+
+
+def test_differences_add_up_to_the_whole():
+    ray = np.array([0, 0, 0, 2, 2])
+    values, last = np.array([0, 3, 7, 0, 5]), np.array([10, 99, 6])
+    assert differences_along(values, ray, last).tolist() == [3, 4, 3, 5, 1]
+    none = np.empty(0, np.int64)
+    assert len(differences_along(none, none, last)) == 0
+
+
+def test_runs_below_the_least_are_noise_and_the_sum_of_a_run_stays():
+    profile = np.array([[0, 1, 6, -2, 0.2, 0, 0, 0.5, 0.5, 9], [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]], np.float32)
+    support = np.array([[0, 1, 1, 1, 1, 0, 0, 1, 1, 0], [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]], bool)
+    signal, seen = keep_signal(profile, support, np.array([2.0, 3.1]), np.array([0.3, 0.3]))
+    assert signal[0] == pytest.approx(np.array([0, 1, 6, 0, 0, 0, 0, 0, 0, 0]) * 5.2 / 7)
+    assert not signal[1].any() and seen.tolist() == [True, False]
+    nothing, seen = keep_signal(profile, np.zeros_like(support), np.zeros(2), np.zeros(2))
+    assert not nothing.any() and not seen.any()
+
+
+def test_windows_hold_all_support(rng):
+    support = rng.random((80, 200)) < 0.02
+    first, length = window_signal(support, 5)
+    for row in range(200):
+        places = np.flatnonzero(support[:, row])
+        if not len(places):
+            assert length[row] == 0
+            continue
+        assert first[row] <= max(places[0] - 5, 0) and first[row] + length[row] >= min(places[-1] + 6, 80)
+        assert first[row] >= 0 and first[row] + length[row] <= 80 and length[row] % 8 == 0
+    assert window_signal(np.ones((5, 2), bool), 4)[1].tolist() == [5, 5]
+
+
+def test_offsets_are_those_of_the_returns_of_a_packet():
+    profile = np.zeros((3, 40))
+    profile[0, [10, 11]], profile[0, 30] = [1.0, 1.0], 2.0
+    profile[1, 20] = 5.0
+    row, sample = np.array([0, 0, 1, 2]), np.array([10.1, 29.6, 35.0, 5.0])
+    offset, known = measure_offsets(profile, row, sample, 3)
+    assert known.tolist() == [True, False, False]
+    assert offset == pytest.approx([0.4, 0.0, 0.0])

@@ -1,0 +1,138 @@
+"""`wavebatch voxelize`: what came back from every voxel of a 3D grid, by deconvolution."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+
+if TYPE_CHECKING:
+    from wavebatch.voxels import VoxelSummary
+
+_SENSOR = ("trajectory", "crs", "flight_height")
+
+
+@click.command()
+@click.argument("strip", type=click.Path(path_type=Path))
+@click.option("--size", required=True, type=float, metavar="M", help="Edge of a voxel; faces lie at multiples of it.")
+@click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
+              help="The voxels: .npz, or .las or .laz with a point at the centre of each.")
+@click.option("--method", type=click.Choice(["richardson_lucy", "gold", "wiener"]), default="richardson_lucy",
+              show_default=True, help="How waveforms are deconvolved with the system pulse.")
+@click.option("--iterations", type=click.IntRange(1, 10_000), metavar="N",
+              help="More separate closer surfaces, and take longer.  [default: 40, of gold 100]")
+@click.option("--snr", type=click.FloatRange(0, min_open=True), metavar="RATIO",
+              help="Amplitude over noise that the filter of --method wiener is made for.  [default: 20]")
+@click.option("--threshold", type=click.FloatRange(0), default=4.27, show_default=True, metavar="STD",
+              help="Less signal in a row than a lone echo of this many standard deviations is noise, and left out.")
+@click.option("--headroom", type=click.FloatRange(0, 100_000), default=0.0, show_default=True, metavar="M",
+              help="Count rays over this length before their first sample too, where sensors record from just above "
+                   "the first echo: the canopy's height.")
+@click.option("--all-crossed", is_flag=True, help="Write voxels that rays crossed without any signal, too.")
+@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="A saved survey (of `wavebatch survey -o`) in place of one of the strip.")
+@click.option("--calibration", "calibration_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="Of `wavebatch calibrate`, with divergence: adds the cross section in m2.")
+@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
+              help="For cross sections: where the sensor was; without it the packets' own vectors say.")
+@click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
+@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
+              help="For cross sections, where nothing else says where the sensor was.")
+@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
+              help="Where the packets' vectors point.")
+@click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
+@click.option("--overwrite", is_flag=True, help="Replace an output that exists.")
+@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@debug_option
+@report_errors()
+def voxelize(strip: Path, output: Path, **options: Any) -> None:
+    """What came back from every voxel of a 3D grid: the waveforms of STRIP, deconvolved and put along their rays.
+
+    \b
+    Per voxel with signal:
+      energy         integral of the signal that came from it [DN ns]
+      cross_section  backscatter cross section [m2], with --calibration
+      rays           rays that crossed it and had light left
+      path           way of these rays inside it [m]
+      light          what was left of them, a whole ray being 1
+      share          share of that light that came back from it; 1 - share is its transmittance
+
+    Every sample is spread over its own way, so that voxels smaller than a sample's 15 cm have no holes. A ray ends at
+    its last signal: what lies behind is not seen. What is not in the file was not seen, or (without --all-crossed)
+    seen to be empty. Memory does not grow with the strip; TMPDIR needs room for large ones.
+
+    Exit code: 0, 1 where the strip cannot be read or the output not be written, 2 wrong usage.
+    """  # fmt: skip
+    from tqdm import tqdm
+
+    from wavebatch.calibration import load_calibration
+    from wavebatch.sensor import SensorRequest
+    from wavebatch.systemfile import load_survey
+    from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
+
+    _check_options(options)
+    deconvolution = Deconvolution(
+        options["method"], options["iterations"], options["snr"], options["threshold"]
+    )
+    settings = VoxelOptions(options["size"], deconvolution, options["headroom"], options["all_crossed"])
+    calibration_file, system_file = options["calibration_file"], options["system_file"]
+    with tqdm(unit=" waveforms", disable=options["quiet"] or not sys.stderr.isatty(), leave=False) as bar:
+
+        def show(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done)
+
+        summary = voxelize_strip(
+            strip,
+            output,
+            settings,
+            system=load_survey(system_file) if system_file else None,
+            calibration=load_calibration(calibration_file) if calibration_file else None,
+            sensor=SensorRequest(options["trajectory"], options["crs"], None, options["flight_height"]),
+            direction=options["direction"],
+            headerless=options["headerless"],
+            overwrite=options["overwrite"],
+            progress=show,
+        )
+    if options["as_json"]:
+        print_json(asdict(summary))
+    if not options["quiet"]:
+        for line in _list_lines(summary):
+            talk(line)
+
+
+def _check_options(options: dict[str, Any]) -> None:
+    """Refuses options that would do nothing."""
+    if options["snr"] is not None and options["method"] != "wiener":
+        raise click.UsageError("--snr needs --method wiener")
+    if options["iterations"] is not None and options["method"] == "wiener":
+        raise click.UsageError("--method wiener has no --iterations")
+    for name in _SENSOR:
+        if options[name] is not None and options["calibration_file"] is None:
+            raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
+    if options["crs"] is not None and options["trajectory"] is None:
+        raise click.UsageError("--crs is of no use without --trajectory")
+
+
+def _list_lines(summary: VoxelSummary) -> list[str]:
+    x, y, z = summary.shape
+    lines = [
+        f"{summary.output}: {summary.voxels} voxels of {summary.size:g} m in {x} x {y} x {z}, "
+        f"{summary.energy:.6g} DN ns from {summary.with_signal} of {summary.waveforms} waveforms"
+    ]
+    loose = summary.with_signal - summary.anchored
+    if loose:
+        lines.append(f"note: {loose} waveforms have no return at their signal; placed by the raw location")
+    if summary.clipped:
+        lines.append(f"note: {summary.clipped} waveforms are saturated: their energy is too low")
+    if summary.outside:
+        lines.append(f"note: {summary.outside} waveforms are left out: their position is no number, or far off")
+    if summary.unknown:
+        lines.append(f"note: the cross section of {summary.unknown} waveforms is not known")
+    return lines

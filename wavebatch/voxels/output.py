@@ -1,0 +1,182 @@
+"""Voxels as a sparse NPZ, or as a point cloud with a point at the centre of each."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.errors import ConfigError, InputError
+from wavebatch.io.extra import ExtraRecord, build_dtype
+from wavebatch.io.facts import StripFacts
+from wavebatch.io.header import WKT_BIT, LasHeader, Vlr, has_record, read_header
+from wavebatch.io.pointfile import PointFile
+from wavebatch.io.publish import Draft, reporting
+from wavebatch.voxels.grid import VoxelColumn
+
+SUFFIXES = (".npz", ".las", ".laz")
+_PIECE = 1 << 18
+_WKT = 2112
+_MOST_INDEX = 2**31 - 1
+
+
+def check_target(target: Path, strip: Path) -> None:
+    """Raises ConfigError for a name that says no format, InputError where the output is the strip itself."""
+    if target.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if target.exists() and strip.exists() and target.samefile(strip):
+        raise InputError(f"{target}: is the strip itself; choose another output")
+
+
+class NpzVoxels:
+    """Writes voxels to an .npz: `write`, then `commit`; as a context manager nothing remains unless committed.
+
+    Arrays: index i4 (n, 3), one array per column, origin f8 (3,) [m], size [m], crs (WKT, or empty), meta (JSON). Voxel
+    i lies between origin + i size and origin + (i + 1) size. No-data is NaN. Raises InputError where it cannot write.
+    """
+
+    def __init__(self, target: Path, columns: Sequence[VoxelColumn], *, overwrite: bool) -> None:
+        self.target = target
+        self._draft = Draft(target, overwrite=overwrite)
+        self._dtypes = {"index": np.dtype("<i4")} | {column.name: np.dtype(f"<{column.dtype}") for column in columns}
+        self._number = 0
+        with reporting(target):
+            self._spools: dict[str, IO[bytes]] = {
+                name: tempfile.TemporaryFile(dir=target.parent)  # noqa: SIM115 - closed in `__exit__`
+                for name in self._dtypes
+            }
+
+    def __enter__(self) -> NpzVoxels:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for spool in self._spools.values():
+            spool.close()
+        self._draft.discard()
+
+    def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+        """Appends voxels (m, 3) and their columns."""
+        with reporting(self.target):
+            for name, values in {"index": index, **columns}.items():
+                self._spools[name].write(np.ascontiguousarray(values, self._dtypes[name]).tobytes())
+        self._number += len(index)
+
+    def commit(self, origin: np.ndarray, size: float, crs: str | None, meta: Mapping[str, Any]) -> None:
+        """Completes and publishes the file."""
+        single = {"origin": origin, "size": size, "crs": crs or "", "meta": json.dumps(meta, sort_keys=True)}
+        with reporting(self.target), zipfile.ZipFile(
+            self._draft.file, "w", zipfile.ZIP_DEFLATED, allowZip64=True, compresslevel=1
+        ) as archive:
+            for name, spool in self._spools.items():
+                with _open_member(archive, name) as member:
+                    shape = (self._number, 3) if name == "index" else (self._number,)
+                    header = {"descr": self._dtypes[name].str, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    spool.seek(0)
+                    shutil.copyfileobj(spool, member, _PIECE)
+            for name, value in single.items():
+                with _open_member(archive, name) as member:
+                    np.lib.format.write_array(member, np.array(value), allow_pickle=False)
+        self._draft.publish()
+
+
+def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    """A member with a fixed date, so that the same voxels give the same bytes."""
+    info = zipfile.ZipInfo(f"{name}.npy")
+    info.compress_type = zipfile.ZIP_DEFLATED
+    return archive.open(info, "w", force_zip64=True)
+
+
+class LasVoxels:
+    """Writes voxels as points with extra bytes to a .las or .laz; used as NpzVoxels is.
+
+    The centre of every voxel is exact: coordinates count half voxels from the lower corner of the grid. The strip's CRS
+    is kept.
+    """
+
+    def __init__(
+        self,
+        target: Path,
+        columns: Sequence[VoxelColumn],
+        *,
+        facts: StripFacts,
+        origin: np.ndarray,
+        size: float,
+        meta: Mapping[str, Any],
+        overwrite: bool,
+    ) -> None:
+        self._columns = columns
+        records = [
+            ExtraRecord.build(
+                column.name,
+                column.dtype,
+                column.meaning if column.unit == "-" else f"{column.meaning} [{column.unit}]",
+                no_data=column.no_data,
+            )
+            for column in columns
+        ]
+        header = _build_header(facts, origin, size, meta)
+        self._returns = 0b1_0001 if header.point_format >= 6 else 0b1001
+        self._dtype = build_dtype(header.point_format, records)
+        self._file = PointFile(target, header, self._dtype, records, overwrite=overwrite)
+
+    def __enter__(self) -> LasVoxels:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.abort()
+
+    def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
+        """Appends voxels (m, 3) and their columns."""
+        rows = np.zeros(len(index), self._dtype)
+        for axis, name in enumerate("XYZ"):
+            rows[name] = 2 * index[:, axis] + 1
+        rows["bit_fields"] = self._returns
+        for column in self._columns:
+            values = columns[column.name]
+            if column.no_data is not None:
+                values = np.where(np.isnan(values), values.dtype.type(column.no_data), values)
+            rows[column.name] = values
+        self._file.write(rows)
+
+    def commit(self) -> None:
+        """Completes and publishes the file."""
+        self._file.finish_points()
+        self._file.finish()
+        self._file.draft.publish()
+
+
+def _build_header(facts: StripFacts, origin: np.ndarray, size: float, meta: Mapping[str, Any]) -> LasHeader:
+    source = read_header(facts.path)
+    vlrs = [vlr for vlr in source.vlrs if vlr.user == "LASF_Projection"]
+    if not has_record(vlrs, "LASF_Projection", _WKT) and (facts.crs or "").endswith("]"):
+        text = facts.crs.encode() + b"\0"  # from an extended record
+        if len(text) > 65535:
+            raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
+        vlrs.append(Vlr(b"LASF_Projection", _WKT, text, b"OGC coordinate system WKT"))
+    modern = source.point_format >= 6
+    encoding = source.global_encoding & 1
+    if modern and (has_record(vlrs, "LASF_Projection", _WKT) or not vlrs):
+        encoding |= WKT_BIT
+    text = json.dumps(meta, sort_keys=True, separators=(",", ":")).encode()
+    return LasHeader(
+        version=(1, 4) if modern else source.version,
+        point_format=6 if modern else 0,
+        point_length=0,
+        scales=(0.5 * size,) * 3,
+        offsets=tuple(float(value) for value in origin),
+        vlrs=[*vlrs, Vlr(b"wavebatch", 1, text, b"how these voxels were made (JSON)")],
+        file_source_id=source.file_source_id,
+        global_encoding=encoding,
+        project_id=source.project_id,
+        system_identifier=b"EXTRACTION",
+        generating_software=f"wavebatch {__version__}".encode(),
+        creation=source.creation,
+    )
