@@ -10,14 +10,14 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
     {"errors", "units", "words", "allocator"},
-    {"kernels", "blocks", "trajectory"},
+    {"kernels", "blocks", "trajectory", "nodata"},
     {"chain", "io", "report", "inputs", "pictures"},
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
      "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
-    {"auto", "trial", "choice", "sensor", "calibration", "matchup"},
+    {"angles", "auto", "trial", "choice", "sensor", "calibration", "matchup"},
     {"work", "targets", "voxels"},
-    {"record"},
+    {"record", "remarks"},
     {"task", "workers"},
     {"plan"},
     {"batch"},

@@ -13,6 +13,7 @@ from wavebatch.calibration import Calibration, format_calibration, load_calibrat
 from wavebatch.cli import main
 from wavebatch.config import load_profile
 from wavebatch.errors import ConfigError
+from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
 from wavebatch.units import HALF_C
 
@@ -70,6 +71,32 @@ def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, cal
                "--jobs", "2", "--block-size", "999")  # fmt: skip
     assert done.exit_code == 0, done.output
     assert next(tmp_path.glob("*.laz")).read_bytes() == next(plain.glob("*.laz")).read_bytes()
+    told = report(plain)
+    for name, counts in told["counts"]["no_data"].items():
+        assert sum(counts.values()) == told["counts"]["echoes"], name
+    assert set(told["counts"]["no_data"]) >= {"range", "incidence_angle", "reflectance"}
+    again = report(tmp_path)
+    assert {key: again[key] for key in ("counts", "remarks")} == {key: told[key] for key in ("counts", "remarks")}
+
+
+def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
+    strip, cal = tmp_path / "flat.las", tmp_path / "cal.toml"
+    simulate_strip("flat", strip, pulses=1500, seed=2)
+    cal.write_text(format_calibration(replace(FOUND, divergence=0.3)))
+    done = run(strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", cal, "-v")
+    assert done.exit_code == 0, done.output
+    counts = report(tmp_path / "out")["counts"]
+    angle = counts["no_data"]["incidence_angle"]
+    assert "KNOWN" not in angle and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
+    (remark,) = report(tmp_path / "out")["remarks"]
+    assert f"incidence_angle: none of {counts['echoes']} echoes has one" in remark
+    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse of", "max_error is 10"):
+        assert number in remark
+    assert remark in done.stderr
+    told = f"no-data for {angle['UNCERTAIN']} of {counts['echoes']} echoes: more uncertain than max_error"
+    assert told in done.stderr
+    quiet = run(strip, "-o", tmp_path / "more", "--profile", "fast", "--calibration", cal)
+    assert remark in quiet.stderr and "no-data for" not in quiet.stderr
 
 
 def write_trajectory(path):

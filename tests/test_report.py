@@ -48,6 +48,19 @@ def test_a_report_reads_back_from_its_json():
     assert (again + report).to_json() == (report + report).to_json()
 
 
+def test_reasons_for_no_data_merge_survive_being_written_and_must_add_up():
+    a = _report() + RunReport(no_data={"range": {"KNOWN": 5, "NO_SENSOR": 3}}, remarks=("one",))
+    b = _report() + RunReport(no_data={"range": {"KNOWN": 8}}, remarks=("one", "another"))
+    both = a + b
+    assert both.no_data == (b + a).no_data == {"range": {"KNOWN": 13, "NO_SENSOR": 3}}
+    assert both.remarks == (b + a).remarks == ("another", "one")
+    both.check("echoes", "strip.las")
+    again = RunReport.from_json(json.loads(json.dumps(both.to_json())))
+    assert again.no_data == both.no_data and again.remarks == both.remarks
+    with pytest.raises(StageError, match="echoes is 8 but its parts add up to 9"):
+        (a + RunReport(no_data={"range": {"KNOWN": 1}})).check("echoes", "strip.las")
+
+
 def test_timing_is_kept_apart():
     timed = _report() + RunReport(timing={"read": 2.0})
     assert timed.to_json() == _report().to_json()

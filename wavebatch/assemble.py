@@ -11,6 +11,7 @@ import numpy as np
 from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
 from wavebatch.errors import StageError
 from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns
+from wavebatch.nodata import count_reasons
 from wavebatch.report import RunReport, count_flags
 from wavebatch.units import PS_PER_NS
 
@@ -246,7 +247,8 @@ def _count_packets(unit: Unit, table: EchoTable, per_packet: np.ndarray, owned: 
         "echoes": len(table),
         "added_echoes": int(np.count_nonzero(table.attributes["point"] < 0)),
     }
-    return RunReport(counts=counts) + RunReport.of_echoes(per_packet[owned], table.amplitude, table.sigma)
+    account = RunReport(counts=counts, no_data=count_reasons(table.attributes))
+    return account + RunReport.of_echoes(per_packet[owned], table.amplitude, table.sigma)
 
 
 def _count_returns(inside: np.ndarray, has_echoes: np.ndarray, found: np.ndarray) -> RunReport:

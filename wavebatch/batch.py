@@ -196,4 +196,5 @@ class _Batch:
         if outcome.error is not None:
             self._tell({**event, "error": outcome.error})
         else:
-            self._tell({**event, "counts": outcome.report.to_json()["counts"]})
+            told = outcome.report.to_json()
+            self._tell({**event, "counts": told["counts"], "remarks": told["remarks"]})

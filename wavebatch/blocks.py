@@ -79,6 +79,9 @@ COLUMNS: dict[str, Column] = _columns(
     Column("cross_section", "f4", "m2", "backscatter cross section"),
     Column("backscatter_coefficient", "f4", "-", "cross section per illuminated area (gamma)"),
     Column("reflectance", "f4", "-", "diffuse reflectance"),
+    Column("relative_backscatter", "f4", "DN ns m2", "not calibrated: backscatter in units of its own strip"),
+    Column("relative_cross_section", "f4", "DN ns m4", "not calibrated: cross section in units of its own strip"),
+    Column("relative_reflectance", "f4", "DN ns m2", "not calibrated: reflectance in units of its own strip"),
     Column("incidence_angle", "f4", "deg", "angle between ray and surface normal"),
     Column("range_err", "f4", "m", "one standard deviation of the echo along the ray, from the fit"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
@@ -87,6 +90,9 @@ COLUMNS: dict[str, Column] = _columns(
     Column("cross_section_err", "f4", "m2", "one standard deviation of cross_section"),
     Column("backscatter_coefficient_err", "f4", "-", "one standard deviation of gamma"),
     Column("reflectance_err", "f4", "-", "one standard deviation of reflectance"),
+    Column("relative_backscatter_err", "f4", "DN ns m2", "one standard deviation of relative_backscatter"),
+    Column("relative_cross_section_err", "f4", "DN ns m4", "one standard deviation of relative_cross_section"),
+    Column("relative_reflectance_err", "f4", "DN ns m2", "one standard deviation of relative_reflectance"),
     Column("pulse_deviation", "f4", "-", "Gauss-Hermite deviation from the system pulse, sqrt(h3^2 + h4^2)"),
     Column("echo_flags", "u2", "bits", "see the table of flags", no_data=None),
     Column("x", "f8", "m", "easting of the echo", extra_bytes=False),
@@ -259,6 +265,8 @@ class SystemPulse:
     """C' of kernels/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
     calibration_err: float = 0.0
     """Standard deviation of the calibration, relative."""
+    channels: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    """The same two of digitizers that have a calibration of their own, by index."""
     attenuation: float = 0.22
     """Of the light on its way through the air, one way [dB/km]."""
     sensor_error: float = 0.0
@@ -267,6 +275,11 @@ class SystemPulse:
     def __post_init__(self) -> None:
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
+
+    def calibrate(self, digitizer: int) -> tuple[float, float]:
+        """Calibration of the digitizer with this index, and its relative error; NaN where it has none."""
+        whole = (np.nan if self.calibration is None else self.calibration, self.calibration_err)
+        return self.channels.get(digitizer, whole)
 
 
 _FIELDS: dict[str, type] = {

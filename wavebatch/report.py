@@ -79,6 +79,10 @@ class RunReport:
     """Points written without attributes, by the flag that says why."""
     flags: Mapping[str, int] = field(default_factory=dict)
     """Points written per flag."""
+    no_data: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """Echoes per column that can lack values, and per reason in nodata.NoData; KNOWN are those that have one."""
+    remarks: tuple[str, ...] = ()
+    """Lines about a strip as a whole, for whoever reads the report."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
     amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
     """Echoes per bin of AMPLITUDE_BINS."""
@@ -92,6 +96,8 @@ class RunReport:
             counts=_add(self.counts, other.counts),
             passed_through=_add(self.passed_through, other.passed_through),
             flags=_add(self.flags, other.flags),
+            no_data=_add_reasons(self.no_data, other.no_data),
+            remarks=tuple(sorted({*self.remarks, *other.remarks})),
             echoes_per_waveform=self.echoes_per_waveform + other.echoes_per_waveform,
             amplitude=self.amplitude + other.amplitude,
             echo_width=self.echo_width + other.echo_width,
@@ -132,7 +138,8 @@ class RunReport:
             "points_out": out,
             "waveforms": int(self.echoes_per_waveform.sum()),
         }
-        for name, total in sums.items():
+        by_reason = [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
+        for name, total in [*sums.items(), *by_reason]:
             if get(name) != total:
                 raise StageError(
                     f"{where}: {name} is {get(name)} but its parts add up to {total}; nothing was written for this "
@@ -147,7 +154,9 @@ class RunReport:
                 **{name: self.count(name) for name in COUNTS},
                 "passed_through": {name: self.passed_through.get(name, 0) for name in _PASSED},
                 "flags": {flag.name: self.flags.get(flag.name, 0) for flag in EchoFlag},
+                "no_data": {column: dict(reasons) for column, reasons in self.no_data.items()},
             },
+            "remarks": list(self.remarks),
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
                 **{name: _histogram_json(_BINS[name], counts) for name, counts in histograms.items()},
@@ -163,6 +172,10 @@ class RunReport:
             counts={name: int(counts[name]) for name in COUNTS},
             passed_through={name: int(n) for name, n in counts["passed_through"].items()},
             flags={name: int(n) for name, n in counts["flags"].items()},
+            no_data={
+                column: {name: int(n) for name, n in reasons.items()} for column, reasons in counts["no_data"].items()
+            },
+            remarks=tuple(str(line) for line in document["remarks"]),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=amplitude,
             echo_width=echo_width,
@@ -180,6 +193,10 @@ def count_flags(flags: np.ndarray) -> dict[str, int]:
 
 def _add(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
     return {name: a.get(name, 0) + b.get(name, 0) for name in {**a, **b}}
+
+
+def _add_reasons(a: Mapping[str, Mapping[str, int]], b: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
+    return {column: _add(a.get(column, {}), b.get(column, {})) for column in {**a, **b}}
 
 
 def _histogram_json(bins: LogBins, counts: np.ndarray) -> dict[str, Any]:

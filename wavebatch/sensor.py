@@ -102,7 +102,8 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
         if found is not None:
             return found
     if request.height is not None:
-        return SensorSource("flight height", height=request.height, error=HEIGHT_ERROR * request.height)
+        error, facts = HEIGHT_ERROR * request.height, (("distance_m", request.height),)
+        return SensorSource("flight height", height=request.height, error=error, facts=facts)
     return NOBODY
 
 
@@ -135,8 +136,16 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
         "share_covered": round(share, 6),
         "gaps_s": [[round(a, 3), round(b, 3)] for a, b in known.gaps(start, stop)[:20]],
         "angle_to_packet_vectors_deg": round(float(np.degrees(angle)), 4),
+        "distance_m": _median_distance(known, rays),
     }
     return SensorSource("trajectory", known, facts=tuple(facts.items()))
+
+
+def _median_distance(known: Trajectory, rays: Rays) -> float | None:
+    off = rays.point - known.at(rays.time)
+    distance = np.sqrt((off * off).sum(axis=1))
+    distance = distance[np.isfinite(distance)]
+    return round(float(np.median(distance)), 2) if len(distance) else None
 
 
 def _disagreement(known: Trajectory, rays: Rays) -> float:

@@ -26,6 +26,7 @@ from wavebatch.record import (
     report_path,
     write_json,
 )
+from wavebatch.remarks import find_remarks
 from wavebatch.report import RunReport
 from wavebatch.work import Prepared, StripJob, prepare_strip, process_packed_unit
 from wavebatch.workers import Workers
@@ -128,6 +129,7 @@ class StripTask:
         options, job = self._options, self.job
         start = time.perf_counter()
         self._report.check(job.options.points, str(job.path))
+        self._report += RunReport(remarks=find_remarks(self.prepared, self._report))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
         cloud, beside = cloud_path(job, options.folder), report_path(job, options.folder)

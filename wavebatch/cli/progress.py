@@ -6,13 +6,14 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
 from wavebatch.cli.common import one_line
+from wavebatch.nodata import REASONS, NoData
 
 KINDS = ("auto", "bar", "json", "none")
 
@@ -61,6 +62,8 @@ class Progress:
             self._say(f"error: {_place(strip, one_line(error))}")
         elif kind == "written" and self._level >= 0:
             self._say(_summary(event, self._level > 0))
+            for line in [*_reasons(event["counts"]["no_data"])] * (self._level > 0) + event["remarks"]:
+                self._say(f"{strip}: {line}")
         elif kind == "skipped" and self._level >= 0:
             self._say(f"{strip}: is there already")
 
@@ -88,6 +91,15 @@ def _size(path: Path) -> int:
 def _place(strip: str, line: str) -> str:
     """The line with the strip in front, unless it names it already."""
     return line if strip in line else f"{strip}: {line}"
+
+
+def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
+    """Per column how many echoes lack a value, one line for each reason."""
+    for column, counts in sorted(no_data.items()):
+        total = sum(counts.values())
+        for name, number in counts.items():
+            if name != NoData.KNOWN.name:
+                yield f"{column}: no-data for {number} of {total} echoes: {REASONS[NoData[name]][0]}"
 
 
 def _summary(event: dict[str, Any], long: bool) -> str:

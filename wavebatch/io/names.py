@@ -76,6 +76,12 @@ _SHORT = {
     "backscatter_coefficient_err": "1 sigma of gamma",
     "incidence_angle": "ray to surface normal",
     "pulse_deviation": "Gauss-Hermite deviation",
+    "relative_backscatter": "relative to strip only",
+    "relative_cross_section": "relative to strip only",
+    "relative_reflectance": "relative to strip only",
+    "relative_backscatter_err": "1 sigma, relative",
+    "relative_cross_section_err": "1 sigma, relative",
+    "relative_reflectance_err": "1 sigma, relative",
 }
 """Meanings short enough for the 32 bytes of a description, where the column's own is not."""
 

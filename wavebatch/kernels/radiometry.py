@@ -12,6 +12,9 @@ import numpy as np
 ENERGY_CORRELATION = -1.0 / math.sqrt(3.0)
 """Of the errors of amplitude and sigma of an isolated Gaussian echo (2.1)."""
 
+STEEPEST = math.radians(85.0)
+"""Angle of incidence from which on nothing is said about reflectance."""
+
 
 def transmit(distance: np.ndarray, attenuation: float) -> np.ndarray:
     """Share of the light that the atmosphere leaves on its way to a target at `distance` [m] and back.
@@ -63,7 +66,7 @@ def cross_section(gamma: np.ndarray, distance: np.ndarray, divergence: float) ->
 def diffuse_reflectance(gamma: np.ndarray, incidence: np.ndarray) -> np.ndarray:
     """Reflectance of a Lambertian target that fills the beam, struck at `incidence` [rad]; NaN beyond 85 degrees."""
     facing = np.cos(incidence)
-    return np.asarray(gamma, np.float64) / (4.0 * np.where(facing > math.cos(math.radians(85.0)), facing, np.nan))
+    return np.asarray(gamma, np.float64) / (4.0 * np.where(facing > math.cos(STEEPEST), facing, np.nan))
 
 
 def energy_error(

@@ -1,6 +1,7 @@
 """The algorithms, each a plain function; importing this package fills `wavebatch.chain.STAGES`."""
 
 from wavebatch.stages import (
+    angle,
     attributes,
     decompose,
     decompose_loops,
@@ -14,6 +15,7 @@ from wavebatch.stages import (
 )
 
 __all__ = [
+    "angle",
     "attributes",
     "decompose",
     "decompose_loops",

@@ -1,32 +1,31 @@
-"""Attributes that mean something outside the file: range, backscatter, incidence angle; NaN where it cannot be known.
+"""Attributes that mean something outside the file: range and backscatter; NaN where it cannot be known, and the reason.
 
 They need the sensor's position (`--trajectory`, or the packets' own vectors), the calibration (`--calibration`) and the
-beam's divergence (SYSTEM.toml); without what they need they are no-data, never a guess. Source: ALGORITHMS 1.4, 5.
+beam's divergence (SYSTEM.toml); without what they need they are no-data, never a guess. What is only relative is called
+so, and made by stages of its own. Source: ALGORITHMS 5. LAS packets have no place for the emitted pulse, so that its
+energy, which varies from shot to shot, cannot be divided out.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.kernels import radiometry
-from wavebatch.kernels.incidence import angles_of_variance, paper_table, pulse_table, spread_variance
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
-
-LEAST_WIDTH = 0.85
-"""Width of the system pulse [samples] below which fitted widths depend on where the samples lie (1.4)."""
+from wavebatch.nodata import SUFFIX, NoData, explain
 
 _POSITION = ("x", "y", "z")
-_UNCLEAN = EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
 
 
 @stage("attribute", makes=("range",), needs=_POSITION)
 def range(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Distance from the sensor to each echo [m]; no-data where the sensor's position is not known."""
-    return echoes.with_attributes(range=_distance(block, echoes).astype(np.float32))
+    distance = sensor_distance(block, echoes)
+    return _with_reason(echoes.with_attributes(range=distance.astype(np.float32)), "range", _no_sensor(distance))
 
 
 @stage("attribute", makes=("backscatter_coefficient", "backscatter_coefficient_err"), needs=_POSITION)
@@ -36,8 +35,8 @@ def backscatter_coefficient(block: WaveformBlock, noise: Noise, system: SystemPu
     C' R^2 A sigma / eta(R). Echoes that share a pulse share its light: of those only the sum over the pulse is a gamma.
     Amplitudes that are guesses (saturated) give no-data.
     """
-    gamma, relative = _backscatter(block, system, echoes, 2)
-    return _with_error(echoes, "backscatter_coefficient", gamma, relative)
+    light = _measure_light(block, system, echoes, 2)
+    return _finish(echoes, "backscatter_coefficient", light.gamma, light.relative_error, *light.cases)
 
 
 @stage("attribute", makes=("cross_section", "cross_section_err"), needs=_POSITION)
@@ -46,10 +45,11 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
 
     C' pi divergence^2 / 4 R^4 A sigma / eta(R): an error of the range counts four times.
     """
-    gamma, relative = _backscatter(block, system, echoes, 4)
+    light = _measure_light(block, system, echoes, 4)
     divergence = np.nan if system.divergence is None else 1e-3 * system.divergence
-    section = radiometry.cross_section(gamma, _distance(block, echoes), divergence)
-    return _with_error(echoes, "cross_section", section, relative)
+    section = radiometry.cross_section(light.gamma, light.distance, divergence)
+    unknown = (NoData.NO_DIVERGENCE, system.divergence is None)
+    return _finish(echoes, "cross_section", section, light.relative_error, *light.cases[:2], unknown, *light.cases[2:])
 
 
 @stage("attribute", makes=("reflectance", "reflectance_err"), needs=_POSITION)
@@ -68,59 +68,51 @@ def reflectance(
     surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
         none), or every surface taken as facing the sensor.
     """
-    gamma, relative = _backscatter(block, system, echoes, 2)
-    angle, angle_err = _surface_angle(block, echoes, surface)
-    alone = _is_alone(block, echoes)
-    rho = np.where(alone, radiometry.diffuse_reflectance(gamma, angle), np.nan)
-    return _with_error(echoes, "reflectance", rho, radiometry.reflectance_error(relative, angle, angle_err))
+    return _reflectance(block, echoes, "reflectance", _measure_light(block, system, echoes, 2), surface)
 
 
-@stage("attribute", makes=("incidence_angle", "incidence_angle_err"), needs=_POSITION)
-def incidence_angle(
+@stage("attribute", makes=("relative_backscatter", "relative_backscatter_err"), needs=_POSITION)
+def relative_backscatter(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Backscatter of each echo in units of its own strip [DN ns m2], and its error: for strips without calibration.
+
+    R^2 A sigma / eta(R): gamma without the constant C', so that echoes compare with each other, with nothing else.
+    """
+    light = _measure_light(block, _relative(system), echoes, 2)
+    return _finish(echoes, "relative_backscatter", light.gamma, light.relative_error, *light.cases)
+
+
+@stage("attribute", makes=("relative_cross_section", "relative_cross_section_err"), needs=_POSITION)
+def relative_cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Cross section of each echo in units of its own strip [DN ns m4], and its error: for strips without calibration.
+
+    R^4 A sigma / eta(R): the cross section without C' pi divergence^2 / 4.
+    """
+    light = _measure_light(block, _relative(system), echoes, 4)
+    section = light.gamma * (light.distance * light.distance)
+    return _finish(echoes, "relative_cross_section", section, light.relative_error, *light.cases)
+
+
+@stage("attribute", makes=("relative_reflectance", "relative_reflectance_err"), needs=_POSITION)
+def relative_reflectance(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    mode: Literal["system", "pulse", "paper"] = "system",
-    divergence: float = 0.0,
-    max_error: float = 10.0,
-    reference_error: float = 0.003,
-    alone: bool = True,
+    surface: Literal["level", "echo", "facing"] = "level",
 ) -> EchoTable:
-    """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
+    """Reflectance of each echo alone in its waveform, in units of its own strip [DN ns m2], and its error.
 
-    A plane spreads the pulse by R divergence tan(alpha) / (2 c). No-data where the system pulse is shorter than 0.85
-    samples, where sensor or divergence are not known, and where the angle is more uncertain than max_error: with a
-    narrow beam and a long pulse that is everywhere. Echoes narrower than the system pulse have angle 0.
-    Source: Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
+    R^2 A sigma / (4 cos(alpha) eta(R)): the reflectance without the constant C', for strips without calibration.
 
-    mode: system takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
-        file's sampling; paper the printed formulas, which read angles too high.
-
-    divergence: full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
-
-    max_error: largest standard deviation of an angle that is written [deg].
-
-    reference_error: standard deviation of the system pulse's width, relative.
-
-    alone: only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
+    surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
+        none), or every surface taken as facing the sensor.
     """
-    beam = divergence or system.divergence or np.nan
-    if system.sigma_ref < LEAST_WIDTH * block.spacing:
-        beam = np.nan
-    variance, variance_err = _added_variance(block, system, echoes, mode, reference_error)
-    angle, error = angles_of_variance(variance, variance_err, _distance(block, echoes), 1e-3 * beam)
-    good = (echoes.flags & np.uint16(_UNCLEAN)) == 0
-    if alone:
-        good &= _is_alone(block, echoes)
-    with np.errstate(invalid="ignore"):
-        good &= error <= np.radians(max_error)
-    angle, error = (np.degrees(np.where(good, values, np.nan)).astype(np.float32) for values in (angle, error))
-    return echoes.with_attributes(incidence_angle=angle, incidence_angle_err=error)
+    light = _measure_light(block, _relative(system), echoes, 2)
+    return _reflectance(block, echoes, "relative_reflectance", light, surface)
 
 
-def _distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+def sensor_distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     """Sensor to echo [m], f8 (m,); NaN where it is not known."""
     if block.sensor is None:
         return np.full(len(echoes), np.nan)
@@ -133,16 +125,26 @@ def _distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return radiometry.known_distance(np.sqrt(squares))
 
 
-def _is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+    """Whether an echo is the only one of its waveform, bool (m,)."""
     return echoes.count(len(block))[echoes.waveform] == 1
 
 
-def _backscatter(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, power: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """gamma of each echo, and the relative error of what goes with R^power, f8 (m,)."""
-    distance = _distance(block, echoes)
-    constant = np.nan if system.calibration is None else system.calibration
+class _Light(NamedTuple):
+    """What echoes of a block return, f8 (m,) each."""
+
+    distance: np.ndarray
+    """[m]."""
+    gamma: np.ndarray
+    relative_error: np.ndarray
+    """Of what goes with R^power."""
+    cases: tuple[tuple[NoData, np.ndarray | bool], ...]
+    """Why gamma may be missing."""
+
+
+def _measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, power: int) -> _Light:
+    distance = sensor_distance(block, echoes)
+    constant, constant_err = system.calibrate(block.digitizer.index)
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     amplitude = np.where(guess, np.nan, echoes.amplitude.astype(np.float64))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -150,16 +152,42 @@ def _backscatter(
     energy = radiometry.energy_error(amplitude, echoes.sigma, echoes.amplitude_err, echoes.sigma_err)
     fit = echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
     away = np.hypot(system.sensor_error, fit)
-    relative = radiometry.backscatter_error(
-        energy, distance, away, system.calibration_err, system.attenuation, power=power
-    )
-    return gamma, relative
+    relative = radiometry.backscatter_error(energy, distance, away, constant_err, system.attenuation, power=power)
+    cases = (_no_sensor(distance), (NoData.NOT_CALIBRATED, constant != constant), (NoData.SATURATED, guess))
+    return _Light(distance, gamma, relative, cases)
 
 
-def _with_error(echoes: EchoTable, name: str, values: np.ndarray, relative: np.ndarray) -> EchoTable:
+def _relative(system: SystemPulse) -> SystemPulse:
+    """The system with a constant of 1, exactly."""
+    return replace(system, calibration=1.0, calibration_err=0.0, channels={})
+
+
+def _no_sensor(distance: np.ndarray) -> tuple[NoData, np.ndarray]:
+    return NoData.NO_SENSOR, np.isnan(distance)
+
+
+def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: _Light, surface: str) -> EchoTable:
+    angle, angle_err = _surface_angle(block, echoes, surface)
+    alone = is_alone(block, echoes)
+    rho = np.where(alone, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
+    relative = radiometry.reflectance_error(light.relative_error, angle, angle_err)
+    steep = angle >= radiometry.STEEPEST
+    more = (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)), (NoData.TOO_STEEP, steep)
+    return _finish(echoes, name, rho, relative, *light.cases, *more)
+
+
+def _finish(
+    echoes: EchoTable, name: str, values: np.ndarray, relative: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]
+) -> EchoTable:
+    """The echoes with a column, its error, and why it is missing where it is."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = (np.abs(values) * relative).astype(np.float32)
-        return echoes.with_attributes(**{name: values.astype(np.float32), f"{name}_err": error})
+        echoes = echoes.with_attributes(**{name: values.astype(np.float32), f"{name}_err": error})
+    return _with_reason(echoes, name, *cases)
+
+
+def _with_reason(echoes: EchoTable, name: str, *cases: tuple[NoData, np.ndarray | bool]) -> EchoTable:
+    return echoes.with_attributes(**{f"{name}{SUFFIX}": explain(echoes.attributes[name], *cases)})
 
 
 def _surface_angle(block: WaveformBlock, echoes: EchoTable, surface: str) -> tuple[np.ndarray, np.ndarray]:
@@ -176,35 +204,3 @@ def _surface_angle(block: WaveformBlock, echoes: EchoTable, surface: str) -> tup
     with np.errstate(divide="ignore", invalid="ignore"):
         down = -z / np.sqrt(x * x + y * y + z * z)
     return np.arccos(np.clip(down, -1.0, 1.0))[echoes.waveform], none
-
-
-def _added_variance(
-    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, mode: str, reference_error: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variance that the target adds to the pulse [ns2] and its standard deviation, f8 (m,)."""
-    width, error = echoes.sigma.astype(np.float64), echoes.sigma_err.astype(np.float64)
-    reference = system.sigma_ref
-    if mode == "pulse":
-        variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
-    elif mode == "paper":
-        variance = spread_variance(paper_table(system.sigma_ref), width)
-    else:
-        width, error, reference = _model_width(block.spacing, system, width, error)
-        variance = width * width - reference * reference
-    return variance, 2.0 * np.hypot(width * error, reference * reference * reference_error)
-
-
-def _model_width(
-    spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Width of the part of the fitted pulse that a target widens as a Gaussian does [ns], its error, the system's."""
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    if not shape.components:
-        return sigma, error, system.sigma_ref
-    one = np.ones_like(sigma)
-    near = 1e-3 * system.sigma_ref / spacing
-    whole = sigma / spacing
-    low, middle, high = (
-        model_parameters(shape, limits, np.stack([one, one, whole + step], axis=1))[:, 2] for step in (-near, 0.0, near)
-    )
-    return middle * spacing, error * (high - low) / (2.0 * near), limits.ref * spacing

@@ -1,0 +1,60 @@
+"""Whether echo widths of a sensor can tell angles of surfaces at all: the error to expect, and a sentence on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.blocks import SystemPulse
+from wavebatch.kernels.bounds import bound_time
+from wavebatch.kernels.incidence import angles_of_variance, spread_of_angle
+from wavebatch.stages.angle import LEAST_WIDTH
+
+SLOPE = 30.0
+"""Angle at which the error is predicted [deg]: where widths tell most (ALGORITHMS 1.4)."""
+
+REFERENCE_ERROR = 0.003
+"""Of the system pulse's width, relative, as stage incidence_angle takes it."""
+
+
+@dataclass(frozen=True, slots=True)
+class AngleOutlook:
+    """What angles from widths are worth on a strip."""
+
+    error: float
+    """Standard deviation of the angle of a plane at SLOPE [deg]; inf where nothing is learned from a width."""
+    max_error: float
+    """Largest one that is written [deg]."""
+    reason: str
+    """All of it in numbers."""
+
+    @property
+    def possible(self) -> bool:
+        """Whether angles at SLOPE would be written."""
+        return self.error <= self.max_error
+
+
+def predict_angles(
+    system: SystemPulse, spacing: float, distance: float, divergence: float, amplitude: float, max_error: float = 10.0
+) -> AngleOutlook:
+    """The outlook for echoes of a typical amplitude [count] from `distance` [m] under a beam of `divergence` [mrad].
+
+    spacing: between samples [ns]; max_error [deg]. Errors are those of the Cramer-Rao bound, in the system's noise.
+    """
+    own, width = system.sigma_ref, system.sigma_ref / spacing
+    if width < LEAST_WIDTH:
+        reason = f"the system pulse is {width:.2f} samples wide, {LEAST_WIDTH} are needed for widths to mean a slope"
+        return AngleOutlook(np.inf, max_error, reason)
+    added = float(spread_of_angle(np.radians(SLOPE), distance, 1e-3 * divergence))
+    sigma = float(np.hypot(own, added))
+    width_err = float(bound_time(amplitude, sigma, system.noise_std, spacing))
+    variance_err = 2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR)
+    values = (np.array([value]) for value in (added * added, variance_err, distance))
+    error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))
+    reason = (
+        f"from {distance:.0f} m a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse of "
+        f"{own:.3g} ns to {sigma:.4g} ns, which echoes of {amplitude:.0f} DN over a noise of {system.noise_std:.3g} DN "
+        f"tell to {width_err:.2g} ns: that is an angle to {error:.1f} degrees, and max_error is {max_error:g}"
+    )
+    return AngleOutlook(error, max_error, reason)

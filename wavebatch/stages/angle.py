@@ -1,0 +1,128 @@
+"""Angle between ray and surface from an echo's width, with its error; NaN where widths do not tell (ALGORITHMS 1.4)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.kernels.incidence import angle_of_spread, angles_of_variance, paper_table, pulse_table, spread_variance
+from wavebatch.nodata import SUFFIX, NoData, explain
+from wavebatch.stages.physics import is_alone, sensor_distance
+from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+
+LEAST_WIDTH = 0.85
+"""Width of the system pulse [samples] below which fitted widths depend on where the samples lie (1.4)."""
+
+NARROW_ERRORS = 3.0
+"""Errors by which the variance must be negative for an echo to be flagged as narrower than the system pulse."""
+
+CLEAR_ERRORS = 4.0
+"""Errors by which the variance must be positive for an echo to be sure to come from a slope."""
+
+_UNCLEAN = {
+    NoData.OVERLAPPED: EchoFlag.OVERLAPPED | EchoFlag.MERGED,
+    NoData.SATURATED: EchoFlag.SATURATED,
+    NoData.CUT: EchoFlag.NEAR_EDGE,
+    NoData.UNSETTLED: EchoFlag.NOT_CONVERGED | EchoFlag.AT_BOUND,
+}
+"""Flags of echoes whose widths say nothing about a surface."""
+
+_REASON = f"incidence_angle{SUFFIX}"
+
+
+@stage("attribute", makes=("incidence_angle", "incidence_angle_err"), needs=("x", "y", "z"))
+def incidence_angle(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    mode: Literal["system", "pulse", "paper"] = "system",
+    divergence: float = 0.0,
+    max_error: float = 10.0,
+    reference_error: float = 0.003,
+    alone: bool = True,
+) -> EchoTable:
+    """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
+
+    A plane spreads the pulse by R divergence tan(alpha) / (2 c). No-data where the system pulse is shorter than 0.85
+    samples, where sensor or divergence are not known, and where the angle is more uncertain than max_error: with a
+    narrow beam and a long pulse that is everywhere. Echoes narrower than the system pulse have angle 0, and
+    the flag NARROW where that is more than noise: three errors.
+    Source: Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
+
+    mode: system takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
+        file's sampling; paper the printed formulas, which read angles too high.
+
+    divergence: full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
+
+    max_error: largest standard deviation of an angle that is written [deg]; an echo that is not wider than the system
+        pulse by four errors must meet it even if its surface faces the sensor, where angles are least certain.
+
+    reference_error: standard deviation of the system pulse's width, relative.
+
+    alone: only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
+    """
+    beam = divergence or system.divergence
+    short = system.sigma_ref < LEAST_WIDTH * block.spacing
+    variance, variance_err = _added_variance(block, system, echoes, mode, reference_error)
+    distance = sensor_distance(block, echoes)
+    angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
+    steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
+    flat_error = angle_of_spread(np.sqrt(variance_err), distance, 1e-3 * beam if beam else np.nan)
+    with np.errstate(invalid="ignore"):
+        # Were each echo judged by its own error alone, those that noise has widened would pass and its peers would not.
+        decisive = np.where(variance > CLEAR_ERRORS * variance_err, error, np.maximum(error, flat_error))
+        uncertain = ~(decisive <= np.radians(max_error))
+        narrow = variance < -NARROW_ERRORS * variance_err
+    cases = (
+        (NoData.NO_SENSOR, np.isnan(distance)),
+        (NoData.NO_DIVERGENCE, not beam),
+        (NoData.SHORT_PULSE, short),
+        (NoData.SHARED_PULSE, ~is_alone(block, echoes) & alone),
+        *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
+        (NoData.TOO_STEEP, steep),
+        (NoData.OTHER, np.isnan(error)),
+        (NoData.UNCERTAIN, uncertain),
+    )
+    bad = np.zeros(len(echoes), bool)
+    for _, where in cases:
+        bad |= where
+    angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))
+    columns = {"incidence_angle": angle, "incidence_angle_err": error, _REASON: explain(angle, *cases)}
+    return echoes.with_attributes(**columns).with_flags(EchoFlag.NARROW, narrow)
+
+
+def _added_variance(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, mode: str, reference_error: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance that the target adds to the pulse [ns2] and its standard deviation, f8 (m,)."""
+    width, error = echoes.sigma.astype(np.float64), echoes.sigma_err.astype(np.float64)
+    reference = system.sigma_ref
+    if mode == "pulse":
+        variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
+    elif mode == "paper":
+        variance = spread_variance(paper_table(system.sigma_ref), width)
+    else:
+        width, error, reference = _model_width(block.spacing, system, width, error)
+        variance = width * width - reference * reference
+    return variance, 2.0 * np.hypot(width * error, reference * reference * reference_error)
+
+
+def _model_width(
+    spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Width of the part of the fitted pulse that a target widens as a Gaussian does [ns], its error, the system's."""
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    if not shape.components:
+        return sigma, error, system.sigma_ref
+    one = np.ones_like(sigma)
+    near = 1e-3 * system.sigma_ref / spacing
+    whole = sigma / spacing
+    low, middle, high = (
+        model_parameters(shape, limits, np.stack([one, one, whole + step], axis=1))[:, 2] for step in (-near, 0.0, near)
+    )
+    return middle * spacing, error * (high - low) / (2.0 * near), limits.ref * spacing
