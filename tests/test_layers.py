@@ -15,7 +15,7 @@ RANKS = [
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
      "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
-    {"angles", "auto", "trial", "choice", "sensor", "calibration", "matchup"},
+    {"angles", "auto", "trial", "choice", "sensor", "calibration", "matchup", "plots"},
     {"work", "targets", "voxels"},
     {"record", "remarks"},
     {"task", "workers"},
@@ -130,6 +130,7 @@ def test_no_other_dependency_at_run_time():
     import sys
 
     for path in MODULES:
-        peers = {"bench": {"gdecomp", "matplotlib"}, "slices": {"matplotlib"}}.get(_part(path), set())
+        peers = {"bench": {"gdecomp", "matplotlib"}, "pictures": {"matplotlib"}, "plots": {"matplotlib"}}
+        peers = peers.get(_part(path), set())
         peers |= {"pyproj"} if path.name == "trajectoryfile.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

@@ -7,6 +7,7 @@ import importlib
 import click
 
 from wavebatch import __version__
+from wavebatch.cli.common import NearestGroup
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("wavebatch.cli.run:run", "Strips in, enriched point clouds out: the main job."),
@@ -20,13 +21,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "synthesize": ("wavebatch.cli.synthesize:synthesize", "Waveforms modelled from discrete returns."),
     "slice": ("wavebatch.cli.slice:slice_", "Straight surface lines in the scan lines of a strip."),
     "voxelize": ("wavebatch.cli.voxelize:voxelize", "What came back from every voxel of a 3D grid."),
+    "plot": ("wavebatch.cli.plot:plot", "Pictures of waveforms with their fit, histograms and maps."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "The calibration constant, from targets of known reflectance."),
     "bench": ("wavebatch.cli.bench:bench", "Error against run time of chains on simulated truth."),
 }
 """Per command: where it is, `module:function`, and the line that the list of commands shows for it."""
 
 
-class LazyGroup(click.Group):
+class LazyGroup(NearestGroup):
     """A group that lists its commands from COMMANDS and imports only the one that is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -39,17 +41,6 @@ class LazyGroup(click.Group):
             return None
         module, _, function = COMMANDS[cmd_name][0].partition(":")
         return getattr(importlib.import_module(module), function)
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does it, with the nearest known command where there is none of that name."""
-        name = args[0] if args else ""
-        if name and not name.startswith("-") and name not in COMMANDS:
-            from wavebatch.words import nearest
-
-            ctx.fail(f"no command {name!r}; {nearest(name, COMMANDS)}")
-        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands, without importing any of them."""

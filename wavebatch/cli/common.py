@@ -19,6 +19,21 @@ EXIT_INTERRUPTED = 130
 """Ctrl-C or SIGTERM."""
 
 
+class NearestGroup(click.Group):
+    """A group of commands that names the nearest one where there is none of the name."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does it, with a better line."""
+        name = args[0] if args else ""
+        if name and not name.startswith("-") and name not in self.list_commands(ctx):
+            from wavebatch.words import nearest
+
+            ctx.fail(f"no command {name!r}; {nearest(name, self.list_commands(ctx))}")
+        return super().resolve_command(ctx, args)
+
+
 def talk(message: str) -> None:
     """One line on stderr."""
     click.echo(message, err=True)

@@ -142,7 +142,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     from wavebatch.task import BatchOptions
     from wavebatch.work import RunOptions, StripJob, choose_columns
 
-    chain, request = _choose_chain(options)
+    chain, request = choose_chain(options)
     calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
     sensor = SensorRequest(
         options["trajectory"], options["crs"], _read_lever_arm(options["lever_arm"]), options["flight_height"]
@@ -175,8 +175,11 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     return jobs, batch_options
 
 
-def _choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
-    """The chain, or the widest one that a strip's survey may choose, and the request that goes with it."""
+def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
+    """The chain, or the widest one that a strip's survey may choose, and the request that goes with it.
+
+    options: chain_file, profile, tolerance and system_file, each None where it was not given.
+    """
     from wavebatch.choice import Request, widest
     from wavebatch.config import list_profiles, load_chain, load_profile
     from wavebatch.systemfile import load_survey

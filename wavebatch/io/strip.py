@@ -174,7 +174,7 @@ class StripReader:
         owned_only: leave out packets whose first point lies in another unit.
         """
         rows = np.flatnonzero(unit.packets.owned) if owned_only else np.arange(len(unit.packets))
-        yield from self._read_rows(unit, rows, size)
+        yield from self.read_rows(unit, rows, size)
 
     def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
         """About `n_waveforms` waveforms spread evenly over the strip, the same ones every time."""
@@ -190,12 +190,13 @@ class StripReader:
             if len(rows) > share:
                 rows = rows[np.linspace(0, len(rows) - 1, share).round().astype(int)]
             left -= len(rows)
-            for block, _ in self._read_rows(unit, rows, size):
+            for block, _ in self.read_rows(unit, rows, size):
                 yield block
             if left <= 0:
                 return
 
-    def _read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+    def read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+        """As `read_blocks`, of the packets `rows` (k,) of the unit only."""
         geometry = _Geometry(unit, self.facts)
         table = unit.packets
         kinds = (table.digitizer[rows].astype(np.int64) << 32) | table.n_samples[rows]

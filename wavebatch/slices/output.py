@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from wavebatch.errors import ConfigError
 from wavebatch.io.publish import Draft, refuse_existing, reporting
+from wavebatch.pictures import open_picture
 from wavebatch.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")
@@ -85,36 +85,20 @@ def _round(place: Sequence[float]) -> list[float]:
 
 
 def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overwrite: bool = False) -> None:
-    """Writes a picture (PNG) of a slice with its segments; needs matplotlib (extra `plot`).
-
-    Raises ConfigError where matplotlib is missing, InputError where the target exists or cannot be written.
-    """
-    if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError(f"{target}: pictures need matplotlib: pip install 'wavebatch[plot]'")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    if not overwrite:
-        refuse_existing(target)
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    image, extent = _paint(piece)
-    shown = axes.imshow(image, extent=extent, origin="lower", aspect="auto", cmap="gray_r", interpolation="nearest")
-    figure.colorbar(shown, label="DN above the level without signal")
-    for segment in segments:
-        ends = np.array(segment.ends)
-        axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
-    plane = piece.geometry == "plane"
-    axes.set_xlabel("along the slice [m]" if plane else "time after the first sample [ns]")
-    axes.set_ylabel("height [m]" if plane else "pulse")
-    axes.set_title(f"scan line {piece.line.number}: {len(piece.line)} pulses, {len(segments)} segments")
-    draft = Draft(target, overwrite=overwrite)
-    try:
-        figure.savefig(draft.file, dpi=120, format="png")
-        draft.publish()
-    finally:
-        draft.discard()
+    """Writes a picture of a slice with its segments; raises as `pictures.open_picture` does."""
+    with open_picture(target, (12, 5), overwrite=overwrite, dpi=120) as figure:
+        axes = figure.subplots()
+        image, extent = _paint(piece)
+        axes.grid(visible=False)
+        shown = axes.imshow(image, extent=extent, origin="lower", aspect="auto", cmap="gray_r", interpolation="nearest")
+        figure.colorbar(shown, label="DN above the level without signal")
+        for segment in segments:
+            ends = np.array(segment.ends)
+            axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
+        plane = piece.geometry == "plane"
+        axes.set_xlabel("along the slice [m]" if plane else "time after the first sample [ns]")
+        axes.set_ylabel("height [m]" if plane else "pulse")
+        axes.set_title(f"scan line {piece.line.number}: {len(piece.line)} pulses, {len(segments)} segments")
 
 
 def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:

@@ -1,0 +1,1 @@
+"""What pictures of waveforms and clouds show, as arrays, and the pictures themselves."""
