@@ -191,6 +191,24 @@ def test_wrong_use_is_one_line_and_exit_code_2(mixed, monkeypatch, arguments, wo
     assert words in result.stderr.splitlines()[-1]
 
 
+def test_what_the_readme_says_of_the_real_strip(riegl):
+    """The after-pulse of nearly every echo is a second maximum: the ASDF passes over it, the pulse explains it."""
+    chains = {
+        "maxima": make_chain("maximum", "gaussian"),
+        "asdf": make_chain("asdf", "asdf_only"),
+        "adaptive": make_chain("maximum", "adaptive"),
+    }
+    one = match_sides(riegl, *(Contender(name, chains[name]) for name in ("maxima", "asdf")))
+    two = match_sides(riegl, *(Contender(name, chains[name]) for name in ("maxima", "adaptive")))
+    assert one.between.counts_a[2] > 0.8 * 2375 and one.between.counts_b[1] > 0.9 * 2375
+    for result in (one, two):
+        number, of = result.between.extra_by["flag"]["RINGING_SUSPECT"]
+        assert number > 0.97 * of and number > 0.9 * result.between.extra
+        assert result.between.completeness > 0.9 and result.between.differences["time"].nmad < 0.02
+    assert two.vendor["b"].missed < one.vendor["a"].missed < one.vendor["b"].missed
+    assert two.fit["b"]["all"].median < two.fit["a"]["all"].median < 0.5 * one.fit["b"]["all"].median
+
+
 def test_real_strip_as_its_cloud_has_it(riegl):
     result = match_sides(riegl, Contender("auto"), find_contender("balanced"))
     assert (result.waveforms, result.returns) == (2375, 2535)

@@ -11,7 +11,7 @@ import numpy as np
 from wavebatch.errors import ConfigError
 from wavebatch.polygons import Polygon, find_inside
 
-MOST_AREAS = 100_000
+MOST_AREAS = 50_000
 """Areas of all clouds together that are counted, so that memory is bounded."""
 
 MOST_NUMBER, MOST_COUNT = 15, 64
