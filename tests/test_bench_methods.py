@@ -5,8 +5,11 @@ import json
 from click.testing import CliRunner
 
 from wavebatch.bench.methods import list_methods
+from wavebatch.bench.stability import FAILURES, list_cases, measure_stability
+from wavebatch.bench.table import format_document
 from wavebatch.chain import STAGES
 from wavebatch.cli import main
+from wavebatch.config import load_profile
 
 
 def test_every_method_has_a_chain():
@@ -27,3 +30,26 @@ def test_all_methods_stand_in_one_table():
     assert set(list_methods()) | {"fast", "balanced", "accurate"} <= set(rows)
     for name in ("detect.maximum", "detect.asdf", "decompose.gauss_newton", "decompose.reference"):
         assert rows[name]["figures"]["completeness"]["value"] > 0.98, name
+
+
+def test_every_method_goes_through_the_stiff_cases(monkeypatch):
+    monkeypatch.setattr("wavebatch.bench.stability.GROUPS", 1)
+    few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.gauss_newton")
+    methods = {name: list_methods()[name] for name in few}
+    shown = {"accurate": load_profile("accurate"), **methods}
+    rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=list_cases(["H10", "H2"]), methods=methods)
+    assert len(rows) == 4 * len(shown)
+    for row in rows:
+        assert row["is_method"] == (row["chain"] != "accurate")
+        assert row["failures"] == dict.fromkeys(FAILURES, 0), (row["chain"], row["case"])
+    rows[-1]["failures"]["negative"] = 3
+    text = format_document({"version": "0", "seed": 3, "error_means": "", "scenes": [], "stability": rows})
+    assert text.count("constant 0, 12 or 255") == 1
+    table = text[text.index("every method") :].splitlines()
+    assert table[0].split()[-3:] == ["H2", "H10", "failures"]
+    assert [line.split()[0] for line in table[1:]] == list(methods)
+    assert table[-1].endswith("3 negative")
+    assert all(line.endswith("none") for line in table[1:-1])
+    for line in table[1:]:
+        pairs, empty = (float(cell) for cell in line.split()[1:3])
+        assert pairs < 50 < empty, line

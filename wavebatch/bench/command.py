@@ -54,7 +54,7 @@ class BenchOptions:
     chains: tuple[Path, ...] = ()
     """Chain files, besides the shipped chains."""
     all_methods: bool = False
-    """Measure every detector and decomposer in the scenes too, each in a chain of its own."""
+    """Measure every detector and decomposer too, each in a chain of its own."""
     seed: int = 0
     waveforms: int = 65_536
     """Simulated waveforms per scene."""
@@ -89,7 +89,8 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
         scenes.insert(0, shape_scene(options.strip, chains["accurate"]))
     if not scenes:
         raise ConfigError("nothing to measure: give a strip or --scene NAME")
-    measured = chains | (list_methods() if options.all_methods else {})
+    methods = list_methods() if options.all_methods else {}
+    measured = chains | methods
     sections = [_measure_scene(scene, measured, options, place, progress) for place, scene in enumerate(scenes)]
     document: dict[str, Any] = {
         "schema": SCHEMA,
@@ -101,11 +102,12 @@ def run_bench(options: BenchOptions, progress: Progress = lambda text: None) -> 
     if options.stability:
         document["failure_kinds"] = FAILURES
         document["stability"] = measure_stability(
-            lambda survey: choose_chains(chains, survey),
+            lambda survey: choose_chains(measured, survey),
             options.stability_waveforms,
             min(STABILITY_SURVEY, options.waveforms),
             options.seed,
             cases=cases,
+            methods=methods,
             progress=progress,
         )
     if options.tolerance_cm is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -46,12 +46,14 @@ def measure_stability(
     surveyed: int,
     seed: int,
     cases: Sequence[Case] = CASES,
+    methods: Collection[str] = (),
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[dict[str, Any]]:
     """A row per case and chain, plain values for JSON.
 
     choose: chains by name for a strip of that survey.
-    waveforms: per case. surveyed: waveforms of the ordinary scene that each survey sees.
+    waveforms: per case. surveyed: waveforms of the ordinary scene that each survey sees. methods: names of chains that
+    hold one method each, for comparison: their rows say so.
     """
     ordinary: dict[Recording, list[tuple[Survey, Mapping[str, Chain]]]] = {}
     rows = []
@@ -69,6 +71,7 @@ def measure_stability(
             if name == AUTO and twin:
                 continue
             told = {"hazard": case.hazard, "case": case.name, "chain": name, "is_auto": name in (AUTO, twin)}
+            told["is_method"] = name in methods
             rows.append({**told, **_measure([chains[name] for chains in chosen], groups)})
     return rows
 

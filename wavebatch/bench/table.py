@@ -141,9 +141,32 @@ def _format_stability(document: Mapping[str, Any]) -> str:
         "== stiff and extreme cases: s is the width of the system pulse, false the share of single echoes split or of "
         "empty waveforms with an echo, err the rms error / Cramer-Rao bound"
     ]
-    for chain in dict.fromkeys(row["chain"] for row in rows):
+    for chain in dict.fromkeys(row["chain"] for row in rows if not row["is_method"]):
         parts.append("\n".join(align(_stability_lines([row for row in rows if row["chain"] == chain], chain))))
+    methods = [row for row in rows if row["is_method"]]
+    if methods:
+        parts.append("\n".join(align(_method_lines(methods))))
     return "\n\n".join(parts)
+
+
+def _method_lines(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """A line per method: waveforms with the exact number of echoes, mean of the cases of each hazard, and failures."""
+    hazards = list(dict.fromkeys(row["hazard"] for row in rows))
+    lines = [["every method: exact %, mean of the cases", *hazards, "failures"]]
+    for name in dict.fromkeys(row["chain"] for row in rows):
+        own = [row for row in rows if row["chain"] == name]
+        cells = []
+        for hazard in hazards:
+            exact = [row["figures"]["exact_count"]["value"] for row in own if row["hazard"] == hazard]
+            cells.append(f"{100 * sum(exact) / len(exact):.1f}")
+        lines.append([name, *cells, _tell_failures(own)])
+    return lines
+
+
+def _tell_failures(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Sums per kind of failure over the rows; `none` without any."""
+    kinds = {name: sum(row["failures"][name] for row in rows) for name in rows[0]["failures"]}
+    return ", ".join(f"{number} {name}" for name, number in kinds.items() if number) or "none"
 
 
 def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list[str]]:
@@ -160,10 +183,9 @@ def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list
             *(("", f"{name}_ratio_{kind}", 1.0, 2) for _, name in QUANTITIES),
             ("", f"gross_{kind}", 100, 1),
         ]
-        failures = ", ".join(f"{number} {name}" for name, number in row["failures"].items() if number)
         cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
         figures = [figure_text(row, column) for column in columns]
-        lines.append([*cells, *figures, failures or "none", _tell_flags(row)])
+        lines.append([*cells, *figures, _tell_failures([row]), _tell_flags(row)])
     return lines
 
 
