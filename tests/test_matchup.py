@@ -12,7 +12,7 @@ from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
 from wavebatch.compare import compare_clouds
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.errors import InputError
 from wavebatch.io.strip import StripReader
 from wavebatch.matchup import ChainRun, Contender, find_contender, match_chains, match_sides
 
@@ -24,9 +24,9 @@ def make_chain(detector, decomposer, **parameters):
 
 @pytest.fixture(scope="module")
 def mixed(tmp_path_factory):
-    """A strip of 1500 pulses, and the clouds of two profiles."""
+    """A strip of 900 pulses, and the clouds of two profiles."""
     folder = tmp_path_factory.mktemp("mixed")
-    call("simulate", "mixed", "-o", folder / "s.las", "--pulses", 1500, "--seed", 5)
+    call("simulate", "mixed", "-o", folder / "s.las", "--pulses", 900, "--seed", 5)
     for profile in ("fast", "accurate"):
         call("run", folder / "s.las", "-o", folder / profile, "--profile", profile, "-q")
     return folder
@@ -130,7 +130,7 @@ def test_a_chain_and_its_own_cloud_are_identical(mixed):
         assert (result.between.missed, result.between.extra) == (0, 0)
         assert result.between.differences["echo_width"].rms < 1e-6
         chain, other = ("a", "b") if sides[0] == "accurate" else ("b", "a")
-        assert result.fit[other] == {} and result.fit[chain]["all"].waveforms > 1000
+        assert result.fit[other] == {} and result.fit[chain]["all"].waveforms > 600
         assert set(result.vendor) == {chain}
 
 
@@ -207,12 +207,7 @@ def test_what_the_readme_says_of_the_real_strip(riegl):
         assert result.between.completeness > 0.9 and result.between.differences["time"].nmad < 0.02
     assert two.vendor["b"].missed < one.vendor["a"].missed < one.vendor["b"].missed
     assert two.fit["b"]["all"].median < two.fit["a"]["all"].median < 0.5 * one.fit["b"]["all"].median
-
-
-def test_real_strip_as_its_cloud_has_it(riegl):
-    result = match_sides(riegl, Contender("auto"), find_contender("balanced"))
-    assert (result.waveforms, result.returns) == (2375, 2535)
-    assert result.vendor["a"].completeness > 0.99 and 0.03 < result.vendor["a"].gain < 0.12
-    assert result.fit["a"]["all"].median < 0.8 * result.fit["b"]["all"].median < 0.002
-    with pytest.raises((InputError, ConfigError)):
-        match_sides(riegl, find_contender("auto"), find_contender(str(riegl.with_suffix(".wdp"))))
+    assert (one.waveforms, one.returns) == (2375, 2535)
+    assert two.vendor["b"].completeness > 0.99 and 0.03 < two.vendor["b"].gain < 0.12
+    with pytest.raises(InputError):
+        match_sides(riegl, Contender("auto"), find_contender(str(riegl.with_suffix(".wdp"))))
