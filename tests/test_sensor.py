@@ -7,6 +7,7 @@ import pytest
 
 from wavebatch.blocks import WaveformBlock
 from wavebatch.errors import InputError
+from wavebatch.io.crs import CrsUnits
 from wavebatch.io.rays import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
 from wavebatch.io.strip import StripReader
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
@@ -153,11 +154,23 @@ def test_height_is_the_last_resort():
     assert NOBODY.fill(block).sensor is None
 
 
-def test_degrees_are_refused(wide_strip):
+@pytest.mark.parametrize(
+    ("units", "ratio", "message"),
+    [
+        (CrsUnits("geographic"), 1.0, "coordinates are degrees"),
+        (CrsUnits("geocentric"), 1.0, "coordinates are geocentric"),
+        (CrsUnits("projected", 1200 / 3937), 3.2804, "coordinates are US survey feet, in which"),
+        (CrsUnits("projected", 1.0, 0.3048), 1.0, "coordinates are metres with heights in international feet"),
+        (CrsUnits("projected", np.nan), 1.0, "coordinates are a unit that is not known"),
+        (CrsUnits(None), 3.2798, "packet vectors are 3.280 times c/2 long, as they are in feet"),
+    ],
+)
+def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
     with StripReader(wide_strip) as reader, reader.scan() as scan:
-        reader.facts = replace(reader.facts, crs='GEOGCS["WGS 84",DATUM["WGS_1984"]]')
-        with pytest.raises(InputError, match="coordinates are degrees"):
-            find_sensor(reader, scan, SensorRequest())
+        reader.facts = replace(reader.facts, units=(CrsUnits("projected", 1.0), units))
+        with pytest.raises(InputError, match=message) as caught:
+            find_sensor(reader, replace(scan, vector_ratio=ratio), SensorRequest())
+    assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
 
 
 def test_a_few_rays_of_every_place(wide_strip):

@@ -36,6 +36,9 @@ MARGIN = 30.0
 LARGEST_ANGLE = np.radians(2.0)
 """Between the packets' rays and those from a trajectory: above it the trajectory is of another strip, clock or CRS."""
 
+FOOT = 0.3048
+"""[m]."""
+
 HEIGHT_ERROR = 0.05
 """Of the range, relative, where only the height of the flight is known."""
 
@@ -91,9 +94,9 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     """Where the sensor of a strip was. Depends on nothing but the strip and the request.
 
     Raises InputError where a trajectory cannot be read, does not overlap, or contradicts the packets' vectors, and for
-    strips in degrees.
+    strips in degrees, feet or geocentric coordinates.
     """
-    _refuse_degrees(reader)
+    _refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
         return _from_file(reader, vectors, request)
@@ -107,12 +110,18 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     return NOBODY
 
 
-def _refuse_degrees(reader: StripReader) -> None:
-    crs = (reader.facts.crs or "").lstrip().upper()
-    if crs.startswith(("GEOGCS[", "GEOGCRS[", "GEOGRAPHICCRS[")):
+def _refuse_units(reader: StripReader, scan: StripScan) -> None:
+    """Raises InputError where coordinates are no metres, or nobody can be sure that they are."""
+    path, units, ratio = reader.facts.path, reader.facts.units, scan.vector_ratio
+    remedy = "project the strip to metres, or leave out the stages that need the sensor's position"
+    for said in units:
+        if not said.is_metric:
+            what = f"coordinates are {said.describe()}, in which nothing has a range in metres"
+            raise InputError(f"{path}: {what}: {remedy}")
+    if abs(ratio * FOOT - 1.0) < 0.05:
         raise InputError(
-            f"{reader.facts.path}: coordinates are degrees, in which nothing has a range: project the strip, or leave "
-            "out the stages that need the sensor's position"
+            f"{path}: packet vectors are {ratio:.3f} times c/2 long, as they are in feet, though no CRS of the strip "
+            f"says that its coordinates are: {remedy}"
         )
 
 

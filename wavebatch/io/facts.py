@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.blocks import Digitizer
-from wavebatch.io.header import EVLR_HEADER_SIZE, LasHeader, find_evlrs
+from wavebatch.io.crs import CrsUnits, read_crs
 from wavebatch.io.las import CheckedHeader
-from wavebatch.io.packets import MAX_EVLRS, Descriptors, PacketPlace
-
-_WKT_ID, _GEOTIFF_ID, _CITATION_ID = 2112, 34735, 34737
-_MAX_WKT = 1 << 20
+from wavebatch.io.packets import Descriptors, PacketPlace
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,12 +43,15 @@ class StripFacts:
     direction_option: str
     extra_dimensions: tuple[str, ...]
     crs: str | None
+    units: tuple[CrsUnits, ...]
+    """What WKT and GeoTIFF keys say of them, as far as either is there."""
     warnings: tuple[str, ...]
 
 
 def collect_facts(checked: CheckedHeader, found: Descriptors, place: PacketPlace, direction: str) -> StripFacts:
     """The facts of a strip whose header, descriptors and packets have been looked at."""
     header = checked.header
+    crs, units = read_crs(checked.path, header)
     return StripFacts(
         path=checked.path,
         size=checked.size,
@@ -72,24 +72,7 @@ def collect_facts(checked: CheckedHeader, found: Descriptors, place: PacketPlace
         packet_end=place.end,
         direction_option=direction,
         extra_dimensions=tuple(record.name for record in checked.records),
-        crs=_read_crs(checked.path, header),
+        crs=crs,
+        units=units,
         warnings=(*checked.warnings, *found.warnings, *place.warnings),
     )
-
-
-def _read_crs(path: Path, header: LasHeader) -> str | None:
-    """The WKT of the strip, else the names its GeoTIFF keys give, else None."""
-    texts = {vlr.record_id: vlr.payload for vlr in header.vlrs if vlr.user == "LASF_Projection"}
-    if _WKT_ID not in texts:
-        evlrs, _ = find_evlrs(path, replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS)))
-        for evlr in evlrs:
-            if (evlr.user, evlr.record_id) == ("LASF_Projection", _WKT_ID) and evlr.length <= _MAX_WKT:
-                with open(path, "rb") as file:
-                    file.seek(evlr.start + EVLR_HEADER_SIZE)
-                    texts[_WKT_ID] = file.read(evlr.length)
-    if _WKT_ID in texts:
-        return texts[_WKT_ID].split(b"\0")[0].decode("utf-8", "replace") or None
-    if _GEOTIFF_ID in texts:
-        citation = texts.get(_CITATION_ID, b"").split(b"\0")[0].decode("latin-1").strip("| ")
-        return f"GeoTIFF: {citation}" if citation else "GeoTIFF keys"
-    return None

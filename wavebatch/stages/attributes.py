@@ -10,7 +10,7 @@ from wavebatch.kernels.gate import residual_moments
 from wavebatch.kernels.match import match_returns
 from wavebatch.kernels.render import render_echoes
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
-from wavebatch.units import FWHM_PER_SIGMA, SQRT_2PI
+from wavebatch.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 
 
 @stage("attribute", makes=("amplitude", "amplitude_err"))
@@ -90,6 +90,8 @@ def position(
     along = echoes.time - offset[waveform]
     xyz = block.origin[waveform] + block.direction[waveform] * along[:, None]
     speed = np.sqrt(np.sum(block.direction**2, axis=1))
+    # Vectors of strips in feet or degrees are no speeds in metres; the error is in metres whatever the strip is in.
+    speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
     echoes = echoes.with_attributes(
         x=xyz[:, 0],
         y=xyz[:, 1],
