@@ -16,7 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "survey": ("wavebatch.cli.survey:survey", "What sensor and scene of a strip are, and the chain they need."),
     "stages": ("wavebatch.cli.stages:stages", "The algorithms: all of them, or one with its parameters."),
     "simulate": ("wavebatch.cli.simulate:simulate", "A strip with known echoes."),
-    "compare": ("wavebatch.cli.compare:compare", "Two results on one strip, or a result with the truth."),
+    "compare": ("wavebatch.cli.compare:compare", "Two results or chains on one strip, or a result with the truth."),
     "stats": ("wavebatch.cli.stats:stats", "Return numbers, separations and flags of point clouds."),
     "synthesize": ("wavebatch.cli.synthesize:synthesize", "Waveforms modelled from discrete returns."),
     "slice": ("wavebatch.cli.slice:slice_", "Straight surface lines in the scan lines of a strip."),
