@@ -6,25 +6,25 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import EchoTable, Noise, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.kernels import render
 from wavebatch.kernels.bounds import crlb
 from wavebatch.kernels.pulse import GAUSSIAN
+from wavebatch.simulate import Recording, known_noise, known_system, simulate_echoes
 
-SYSTEM = SystemPulse(2.0, baseline=20.0, noise_std=1.041)
-STD = float(np.hypot(1, np.sqrt(1 / 12)))
+RECORDING = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)
+SYSTEM = known_system(RECORDING)
+STD = RECORDING.recorded_noise
 
 
-def record(n, *echoes, seed=1, s=64):
-    """Waveforms of noise 1 with echoes (amplitude, time), rounded; the noise known; a time per waveform."""
+def record(n, *echoes, seed=1):
+    """Waveforms of noise 1 with echoes (amplitude, time), rounded; the noise known; a phase per waveform."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(-0.5, 0.5, n)
-    y = 20 + rng.standard_normal((n, s))
-    for amplitude, time in echoes:
-        y += amplitude * np.exp(-0.5 * ((np.arange(s) - time - phase[:, None]) / 2) ** 2)
-    block = WaveformBlock.from_samples(np.clip(np.rint(y), 0, 65535).astype(np.uint16))
-    return block, Noise(np.full(n, 20, np.float32), np.full(n, STD, np.float32)), phase
+    amplitude, time = np.array(echoes, float).T
+    block, _ = simulate_echoes(RECORDING, time + phase[:, None], amplitude, 2.0, rng)
+    return block, known_noise(RECORDING, n), phase
 
 
 def decompose(name, block, noise, **parameters):

@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import PULSE_SIGMA as SIGMA
 
-SYSTEM = SystemPulse(SIGMA, baseline=500.0, noise_std=100.0)
+SYSTEM = known_system(fine_recording(1.0, SIGMA))
 
 
 def record(n, *echoes, std=1.0, seed=0, s=80):
     """Waveforms with echoes (amplitude in counts of noise 1, time), in steps of 0.01; the noise known."""
-    rng = np.random.default_rng(seed)
-    y = std * rng.standard_normal((n, s))
-    for amplitude, time in echoes:
-        y += amplitude * np.exp(-0.5 * ((np.arange(s) - np.asarray(time)[..., None]) / SIGMA) ** 2)
-    block = WaveformBlock.from_samples(np.rint(500 + 100 * np.maximum(y, -5)).astype(np.uint16))
-    return block, Noise(np.full(n, 500, np.float32), np.full(n, 100, np.float32))
+    recording = fine_recording(std, SIGMA, n_samples=s)
+    time = np.stack([np.broadcast_to(time, n) for _, time in echoes] or [np.full(n, np.nan)], axis=1)
+    amplitude = FINE * np.stack([np.broadcast_to(height, n) for height, _ in echoes] or [np.zeros(n)], axis=1)
+    block, _ = simulate_echoes(recording, time, amplitude, SIGMA, np.random.default_rng(seed))
+    return block, known_noise(recording, n, FINE)
 
 
 def detect(name, block, noise, **parameters):
@@ -47,7 +47,7 @@ def test_isolated_echoes_are_found_at_their_peak(name, parameters):
 
 
 def test_the_edge_itself_walks_with_the_amplitude():
-    block, noise = record(2, (np.array([[20.0], [200.0]]), np.array([40.0, 40.0])), std=0.0)
+    block, noise = record(2, ([20.0, 200.0], 40.0), std=0.0)
     edge = detect("threshold", block, noise, correct_walk=False).time
     wide = np.sqrt(SIGMA**2 + 0.5)
     trigger = 4 * np.sqrt(6) / 4 / (np.array([20, 200]) * SIGMA / wide)

@@ -5,17 +5,7 @@ import pytest
 
 from wavebatch.kernels.hough import THETA_STEP, _Accumulator, find_lines
 from wavebatch.kernels.sweep import LAG, find_sweeps
-
-
-def paint(rng, lines, *, height=320, width=400, sigma=8.0, snr=15.0):
-    """An image of lines (column at the middle row, columns per row, first row, row behind the last)."""
-    image = rng.standard_normal((height, width))
-    row = np.arange(height)
-    for column, slope, first, behind in lines:
-        centre = column + slope * (row - height // 2)
-        band = snr * np.exp(-0.5 * ((np.arange(width) - centre[:, None]) / sigma) ** 2)
-        image += np.where(((row >= first) & (row < behind))[:, None], band, 0)
-    return image
+from wavebatch.simulate.papers import paint_slice
 
 
 def detect(image, sigma=8.0, **options):
@@ -30,7 +20,7 @@ def test_position_and_angle_meet_the_acceptance(slope):
     for seed in range(4):
         rng = np.random.default_rng(1000 + seed)
         column = 200 + rng.uniform(-3, 3)
-        (line,) = detect(paint(rng, [(column, slope, 0, 320)]))
+        (line,) = detect(paint_slice(rng, [(column, slope, 0, 320)]))
         x, y = np.add(line.start, line.end) / 2
         off.append((x - slope * (y - 160) - column) / np.hypot(1, slope))
         turn.append((line.theta - np.degrees(np.arctan2(-slope, 1)) + 90) % 180 - 90)
@@ -42,27 +32,27 @@ def test_position_and_angle_meet_the_acceptance(slope):
 
 
 def test_segments_of_one_line_are_told_apart_by_their_gap(rng):
-    image = paint(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
+    image = paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
     lines = detect(image)
     assert sorted(round(line.length / 10) for line in lines) == [14, 14]
     assert len(detect(image, gap=60.0)) == 1
 
 
 def test_crossing_lines_are_both_found(rng):
-    lines = detect(paint(rng, [(200, 0.6, 0, 320), (200, -0.6, 0, 320)]))
+    lines = detect(paint_slice(rng, [(200, 0.6, 0, 320), (200, -0.6, 0, 320)]))
     angles = sorted(line.theta for line in lines[:2])
     assert angles == pytest.approx([-30.96, 30.96], abs=0.6)
 
 
 def test_short_pieces_and_noise_are_no_segments(rng):
-    assert detect(paint(rng, [(200, 0.0, 100, 112)])) == []
+    assert detect(paint_slice(rng, [(200, 0.0, 100, 112)])) == []
     assert detect(rng.standard_normal((100, 100)), sigma=2.0, gap=3.0) == []
     assert find_lines(np.empty(0), np.empty(0), np.empty(0), sigma=1.0) == []
     assert find_lines(np.ones(3), np.ones(3), np.ones(3), sigma=1.0) == []
 
 
 def test_pixels_belong_to_one_segment_and_coordinates_may_lie_anywhere(rng):
-    image = paint(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
+    image = paint_slice(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
     roi = image > 2 * image.std()
     row, column = np.nonzero(roi)
     lines = find_lines(column + 5.4e6, row + 5e5, image[roi], sigma=8.0)
@@ -73,7 +63,7 @@ def test_pixels_belong_to_one_segment_and_coordinates_may_lie_anywhere(rng):
 
 
 def test_most_limits_the_segments(rng):
-    image = paint(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
+    image = paint_slice(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
     assert len(detect(image, most=1)) == 1
 
 
@@ -90,7 +80,7 @@ def test_votes_are_split_between_bins_and_can_be_taken_back(rng):
 
 
 def test_wide_slices_have_coarse_steps_and_the_same_lines(rng):
-    image = paint(rng, [(200, 0.1, 0, 320)])
+    image = paint_slice(rng, [(200, 0.1, 0, 320)])
     roi = image > 2 * image.std()
     row, column = np.nonzero(roi)
     far_x, far_y = np.append(column, 90_000.0), np.append(row, 0.0)

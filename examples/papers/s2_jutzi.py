@@ -19,7 +19,7 @@ from wavebatch.kernels.fit import Limits, Windows, fit_windows
 from wavebatch.kernels.gauss_newton import step_undamped
 from wavebatch.kernels.pulse import GAUSSIAN
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.simulate.papers import PULSE_SIGMA
+from wavebatch.simulate.papers import PULSE_SIGMA, paint_slice
 from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments
 from wavebatch.stages.decompose_models import gauss_newton
 from wavebatch.stages.detect import matched_filter
@@ -138,19 +138,15 @@ def table_of_basins(number: int, seed: int) -> Table:
     return table
 
 
-def paint_slice(rng: np.random.Generator, pieces, height: int = 320, width: int = 400) -> ScanLine:
-    """A slice of SNR 15 with straight surfaces, 8 samples wide: (time at the middle pulse, slope, first, behind)."""
-    image = rng.standard_normal((height, width))
-    pulse, x = np.arange(height)[:, None], np.arange(width)
-    for middle, slope, first, behind in pieces:
-        band = 15 * np.exp(-0.5 * ((x - middle - slope * (pulse - height // 2)) / 8.0) ** 2)
-        image += np.where((pulse >= first) & (pulse < behind), band, 0)
-    row, time = np.divmod(np.arange(height * width), width)
-    origin = np.stack([0.5 * np.arange(height), np.zeros(height), np.full(height, 100.0)], axis=1)
-    direction = np.tile([0.0, 0.0, -HALF_C], (height, 1))
+def scan_line(image: np.ndarray) -> ScanLine:
+    """An image, a pulse per row and a sample of 1 ns per column, as a scan line."""
+    height, width = image.shape
     number = np.arange(height)
+    row, sample = np.divmod(np.arange(height * width), width)
+    origin = np.stack([0.5 * number, 0 * number, 0 * number + 100.0], axis=1)
+    direction = np.tile([0.0, 0.0, -HALF_C], (height, 1))
     values = image.reshape(-1).astype(np.float32)
-    return ScanLine(0, number, number * 1e-5, origin, direction, 1.0, row, time.astype(np.float64), values)
+    return ScanLine(0, number, number * 1e-5, origin, direction, 1.0, row, sample.astype(np.float64), values)
 
 
 def table_of_lines(number: int, seed: int) -> Table:
@@ -162,7 +158,7 @@ def table_of_lines(number: int, seed: int) -> Table:
         off, turn, alone = [], [], []
         for _ in range(max(number // 500, 2)):
             middle = 200 + rng.uniform(-3, 3)
-            line = paint_slice(rng, [(middle, slope, 0, 320)])
+            line = scan_line(paint_slice(rng, [(middle, slope, 0, 320)]))
             segments = find_segments(cut_slice(line, options), options)
             alone.append(len(segments) == 1)
             time, pulse = np.mean(segments[0].ends, axis=0)
@@ -171,7 +167,7 @@ def table_of_lines(number: int, seed: int) -> Table:
         table.add(f"slope {slope:g}: rms position [px]", np.sqrt(np.mean(np.square(off))), 0, 0.05, spec=0.02)
         table.add(f"slope {slope:g}: rms angle [deg]", np.sqrt(np.mean(np.square(turn))), 0, 0.1, spec=0.04)
         table.near(f"slope {slope:g}: slices with one segment [%]", 100 * np.mean(alone), 100)
-    line = paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
+    line = scan_line(paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)]))
     segments = find_segments(cut_slice(line, options), options)
     table.near("a line with a gap of 40 px: segments", len(segments), 2)
     table.near("  pulses of the shorter one", min(segment.pulses for segment in segments), 140, within=4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from wavebatch.blocks import EchoTable, WaveformBlock
@@ -56,3 +58,25 @@ RETURN_TABLES: dict[str, tuple[float, tuple[float, ...]]] = {
     "gemini-24": (2.0, (18.9, 42.3, 29.0, 9.9)),
 }
 """Ussyshkin and Theriault (2011): dead zone [m] and shares of pulses with exactly 1, 2, 3, 4 returns [%], by stand."""
+
+
+def paint_slice(
+    rng: np.random.Generator,
+    surfaces: Sequence[tuple[float, float, int, int]],
+    *,
+    height: int = 320,
+    width: int = 400,
+    sigma: float = 8.0,
+    snr: float = 15.0,
+) -> np.ndarray:
+    """A slice of noise 1, (height, width): a waveform per row, with straight surfaces `snr` high and `sigma` wide.
+
+    surfaces: column at the middle row, columns per row, first row and row behind the last. Source: the slices of Jutzi
+    and Stilla (2005) as in ALGORITHMS.md 1.3.
+    """
+    image = rng.standard_normal((height, width))
+    row, column = np.arange(height)[:, None], np.arange(width)
+    for middle, slope, first, behind in surfaces:
+        band = snr * np.exp(-0.5 * ((column - middle - slope * (row - height // 2)) / sigma) ** 2)
+        image += np.where((row >= first) & (row < behind), band, 0)
+    return image
