@@ -1,18 +1,23 @@
 """Calibration from targets: files of targets, what lies in them, and a constant that gives their reflectance back."""
 
 import json
+from dataclasses import replace
 
 import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.calibration import load_calibration
+from wavebatch.calibration import format_calibration, load_calibration, parse_calibration
 from wavebatch.cli import main
 from wavebatch.errors import ConfigError
-from wavebatch.simulate import simulate_strip
-from wavebatch.simulate.geometry import EAST, NORTH
+from wavebatch.io.fullwave import FullwaveWriter
+from wavebatch.io.strip import StripReader
+from wavebatch.simulate import find_scene, simulate_strip, strip
+from wavebatch.simulate.geometry import EAST, GROUND, NORTH
+from wavebatch.simulate.scenes import GROUND_REFLECTS
 from wavebatch.targets import Target, fit_normal, load_targets
+from wavebatch.units import MAD_TO_STD
 
 
 def call(*arguments):
@@ -110,3 +115,86 @@ def test_targets_off_the_strip(tmp_path, ground):
     assert done.exit_code == 1
     assert "no target has 10 clean single echoes (target 1 0)" in done.stderr
     assert not (tmp_path / "cal.toml").exists()
+
+
+@pytest.fixture(scope="module")
+def two_channels(tmp_path_factory, edit_points):
+    """A village whose every third pulse was recorded by a second digitizer, with half the gain."""
+    folder = tmp_path_factory.mktemp("channels")
+    path, copy = folder / "one.las", folder / "two.las"
+    scene = find_scene("village")
+    open_writer = strip._open_writer
+
+    def open_with_two(target, scene, options, overwrite):
+        both = [scene.recording.digitizer, replace(scene.recording.digitizer, index=2)]
+        return FullwaveWriter(target, version="1.3", point_format=4, internal=True, digitizers=both,
+                              scales=(0.001,) * 3, offsets=(EAST, NORTH, 0.0), overwrite=overwrite)  # fmt: skip
+
+    strip._open_writer = open_with_two
+    try:
+        strip.simulate_strip(scene, path, pulses=9000, seed=5)
+    finally:
+        strip._open_writer = open_writer
+    with StripReader(path) as reader:
+        base = reader.facts.packet_base
+    length = scene.recording.n_samples
+    weak: set[int] = set()
+
+    def change(points):
+        second = (points["wavepacket_offset"] // length % 3 == 0) & (points["wavepacket_index"] > 0)
+        points["wavepacket_index"][second] = 2
+        weak.update(points["wavepacket_offset"][second].tolist())
+        return points
+
+    edit_points(path, copy, change)
+    content = bytearray(copy.read_bytes())
+    for offset in weak:
+        samples = np.frombuffer(content[base + offset : base + offset + length], np.uint8).astype(float)
+        content[base + offset : base + offset + length] = np.rint(12 + (samples - 12) / 2).astype(np.uint8).tobytes()
+    copy.write_bytes(content)
+    return copy
+
+
+def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_channels):
+    cloud = laspy.read(two_channels)
+    x, y = float(np.median(cloud.x)), NORTH
+    targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
+    ground = f"{GROUND_REFLECTS},{x - 60} {y + 0.2} {x + 60} {y + 0.2} {x + 60} {y + 5.8} {x - 60} {y + 5.8}"
+    targets.write_text(f"reflectance,vertices\n{ground}\n")
+    done = call("calibrate", two_channels, "--targets", targets, "-o", cal)
+    assert done.exit_code == 0, done.output
+    assert "digitizer 1:" in done.stderr and "digitizer 2:" in done.stderr
+    found = load_calibration(cal)
+    strong, weak = found.channels
+    assert (strong["digitizer"], weak["digitizer"]) == (1, 2)
+    true = 4 / find_scene("village").light
+    assert strong["constant"] == pytest.approx(true, rel=0.01)
+    assert weak["constant"] == pytest.approx(2 * true, rel=0.02)
+    assert 0 < strong["spread"] < 0.05 and strong["echoes"] > weak["echoes"] >= 10
+    assert found.relative_error > 0.2
+    assert parse_calibration(format_calibration(found), "cal").channels == found.channels
+    assert found.describe()["channels"] == [strong, weak]
+    assert call("run", two_channels, "-o", folder, "--profile", "fast", "--calibration", cal).exit_code == 0
+    cloud = laspy.read(next(folder.glob("*.laz")))
+    rho, index = np.asarray(cloud["reflectance"]), np.asarray(cloud.z) < GROUND + 0.5
+    assert np.median(rho[index & (rho != -9999)]) == pytest.approx(GROUND_REFLECTS, rel=0.02)
+    level = rho[index & (rho != -9999)]
+    assert MAD_TO_STD * np.median(np.abs(level / GROUND_REFLECTS - 1)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("digitizer = 1.5\nconstant = 1e-8\nrelative_error = 0.1", "digitizer must be a whole number"),
+        ("digitizer = 0\nconstant = 1e-8\nrelative_error = 0.1", "must lie between 1 and 255"),
+        ("digitizer = 1\nrelative_error = 0.1", "key 'constant' is missing"),
+        ("digitizer = 1\nconstant = 1e-8\nerror = 0.1", "unknown key 'error'"),
+        ("digitizer = 1\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\ndigitizer = 1\nconstant = 1e-8\n"
+         "relative_error = 0.1", "2: digitizer 1 has a channel already"),
+    ],
+)  # fmt: skip
+def test_wrong_channels_are_one_line(table, message):
+    text = f'schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\n{table}\n'
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse_calibration(text, "cal")
+    assert "\n" not in str(caught.value)

@@ -27,8 +27,14 @@ _NUMBERS = {
     "attenuation_db_km": (0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
     "divergence_mrad": (1e-3, 100.0, math.nan, "full angle of the beam between the 1/e^2 points; needed for m2"),
 }
+_MORE_NUMBERS = {
+    "digitizer": (1, 255, None, "index of the wave packet descriptor"),
+    "spread": (0.0, 1e6, 0.0, "of the echoes' constants, relative, robust standard deviation"),
+    "echoes": (0, 1e12, 0, "that it comes from"),
+}
+_CHANNEL = ("digitizer", "constant", "relative_error", "spread", "echoes")
 _TEXTS = ("schema", "version", "strip", "date", "conditions")
-_TABLES = ("fingerprint", "target")
+_TABLES = ("fingerprint", "target", "channel")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +53,8 @@ class Calibration:
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     targets: tuple[Mapping[str, Any], ...] = ()
     """What each reference target gave: name, reflectance, echoes, constant, spread."""
+    channels: tuple[Mapping[str, Any], ...] = ()
+    """Digitizers with a constant of their own: digitizer, constant, relative_error, spread, echoes."""
 
     def apply(self, system: SystemPulse) -> SystemPulse:
         """The system with this calibration; a divergence of its own stays."""
@@ -54,6 +62,7 @@ class Calibration:
             system,
             calibration=self.constant,
             calibration_err=self.relative_error,
+            channels={row["digitizer"]: (row["constant"], row["relative_error"]) for row in self.channels},
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -67,6 +76,7 @@ class Calibration:
             "divergence_mrad": self.divergence,
             "strip": self.strip,
             "date": self.date,
+            "channels": [dict(row) for row in self.channels],
         }
 
 
@@ -96,8 +106,9 @@ def format_calibration(found: Calibration) -> str:
     for (key, (*_, meaning)), value in zip(_NUMBERS.items(), values, strict=True):
         if value is not None:
             lines.append(f"{key} = {float(value)!r}  # {meaning}")
-    for target in found.targets:
-        lines += ["", "[[target]]", *(f"{key} = {json.dumps(value)}" for key, value in target.items())]
+    for word, tables in (("channel", found.channels), ("target", found.targets)):
+        for table in tables:
+            lines += ["", f"[[{word}]]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
     plain = {key: value for key, value in found.fingerprint.items() if not isinstance(value, Mapping)}
     if plain:
         lines += ["", "[fingerprint]", *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
@@ -128,11 +139,31 @@ def parse_calibration(text: str, name: str) -> Calibration:
         raise ConfigError(f"{name}: schema is {document.get('schema')!r}, this version reads {CALIBRATION_SCHEMA!r}")
     constant, error, attenuation, divergence = (_read_number(document, key, name) for key in _NUMBERS)
     texts = {key: str(document.get(key, "")) for key in ("strip", "date", "conditions")}
-    return Calibration(constant, error, attenuation, None if math.isnan(divergence) else divergence, **texts)
+    divergence = None if math.isnan(divergence) else divergence
+    channels = _read_channels(document.get("channel", []), name)
+    return Calibration(constant, error, attenuation, divergence, **texts, channels=channels)
+
+
+def _read_channels(rows: Any, name: str) -> tuple[dict[str, Any], ...]:
+    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
+        raise ConfigError(f"{name}: channel must be written as [[channel]] tables")
+    channels: dict[int, dict[str, Any]] = {}
+    for number, row in enumerate(rows, 1):
+        where = f"{name}: [[channel]] {number}"
+        for key in row:
+            if key not in _CHANNEL:
+                raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, _CHANNEL)}")
+        index = int(_read_number(row, "digitizer", where))
+        if index != row["digitizer"]:
+            raise ConfigError(f"{where}: digitizer must be a whole number, it is {row['digitizer']!r}")
+        if index in channels:
+            raise ConfigError(f"{where}: digitizer {index} has a channel already")
+        channels[index] = {"digitizer": index, **{key: _read_number(row, key, where) for key in _CHANNEL[1:]}}
+    return tuple(channels.values())
 
 
 def _read_number(document: Mapping[str, Any], key: str, name: str) -> float:
-    low, high, default, meaning = _NUMBERS[key]
+    low, high, default, meaning = {**_NUMBERS, **_MORE_NUMBERS}[key]
     value = document.get(key, default)
     if value is None:
         raise ConfigError(f"{name}: key {key!r} is missing: {meaning}")

@@ -19,6 +19,7 @@ from wavebatch.config import load_profile
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.strip import StripReader
+from wavebatch.kernels.planes import fit_normal
 from wavebatch.kernels.radiometry import calibrate_echoes
 from wavebatch.polygons import find_inside, read_features
 from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
@@ -107,7 +108,7 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
 
 @dataclass(slots=True)
 class _Found:
-    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, one row each."""
+    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, digitizer, one row each."""
 
     rows: list[np.ndarray] = field(default_factory=list)
     number: int = 0
@@ -143,19 +144,25 @@ def calibrate_strip(
         found = _collect(reader, scan, targets, source, pulse)
         fingerprint = take_fingerprint(path, reader.facts.packet_file)
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
-    good = [result for result in results if result["echoes"] >= LEAST_ECHOES]
-    if not good:
-        told = ", ".join(f"{result['name']} {result['echoes']}" for result in results)
+    whole = _combine([result for result, _ in results], reflectance_error)
+    if whole is None:
+        told = ", ".join(f"{result['name']} {result['echoes']}" for result, _ in results)
         raise InputError(f"{path}: no target has {LEAST_ECHOES} clean single echoes ({told}); check their coordinates")
-    constants = np.array([result["constant"] for result in good])
-    constant = float(np.median(constants))
-    inner = float(np.median([result["spread"] / np.sqrt(result["echoes"]) for result in good]))
-    between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
-    error = float(np.sqrt(reflectance_error**2 / len(good) + inner**2 + between**2))
-    conditions = f"sensor from {source.kind}, pulse {pulse.sigma_ref:.4g} ns, {sum(r['echoes'] for r in good)} echoes"
-    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    channels = _calibrate_channels(results, reflectance_error)
+    # What has no constant of its own gets that of all together, which then is as uncertain as they differ.
+    apart = float(np.std([row["constant"] for row in channels])) / whole["constant"] if channels else 0.0
+    conditions = f"sensor from {source.kind}, pulse {pulse.sigma_ref:.4g} ns, {whole['echoes']} echoes"
     return Calibration(
-        constant, error, attenuation, divergence, Path(path).name, today, conditions, fingerprint, tuple(results)
+        constant=whole["constant"],
+        relative_error=float(np.hypot(whole["relative_error"], apart)),
+        attenuation=attenuation,
+        divergence=divergence,
+        strip=Path(path).name,
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        conditions=conditions,
+        fingerprint=fingerprint,
+        targets=tuple(result for result, _ in results),
+        channels=channels,
     )
 
 
@@ -184,36 +191,68 @@ def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Targe
     ray = xyz - block.sensor[echoes.waveform]
     distance = np.sqrt((ray * ray).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
-        table = np.column_stack([xyz, distance, echoes.amplitude, echoes.sigma, ray / distance[:, None]])
+        columns = [xyz, distance, echoes.amplitude, echoes.sigma, ray / distance[:, None]]
+    table = np.column_stack([*columns, np.full(len(echoes), block.digitizer.index)])
     known = np.isfinite(table).all(axis=1)
     for target, place in zip(targets, found, strict=True):
         place.add(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
 
 
-def _evaluate(target: Target, found: _Found, attenuation: float) -> dict[str, Any]:
-    """What one target gave: echoes, median of the constant, its relative spread, the angle that was used."""
-    result: dict[str, Any] = {"name": target.name, "reflectance": target.reflectance, "echoes": found.number}
+def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[dict[str, Any], np.ndarray]:
+    """What one target gave - echoes, median of the constant, its relative spread, the angle that was used - and the
+    digitizer and constant of every echo, f8 (n, 2)."""
+    named = {"name": target.name, "reflectance": target.reflectance}
     if found.number < LEAST_ECHOES:
-        return result
+        return {**named, "echoes": found.number}, np.empty((0, 2))
     rows = np.concatenate(found.rows)
-    xyz, (distance, amplitude, sigma), unit = rows[:, :3], rows[:, 3:6].T, rows[:, 6:]
+    xyz, (distance, amplitude, sigma), unit = rows[:, :3], rows[:, 3:6].T, rows[:, 6:9]
     if target.incidence is None:
         angle = np.arccos(np.clip(np.abs(unit @ fit_normal(xyz)), 0.0, 1.0))
     else:
         angle = np.full(len(rows), np.radians(target.incidence))
     constant = calibrate_echoes(target.reflectance, angle, distance, amplitude, sigma, attenuation)
+    measured = {**named, **_summarise(constant), "incidence_deg": float(np.degrees(np.median(angle)))}
+    return measured, np.column_stack([rows[:, 9], constant])
+
+
+def _summarise(constant: np.ndarray) -> dict[str, Any]:
+    """Number, median and relative robust spread of constants (n,); the number alone where they are too few."""
+    if len(constant) < LEAST_ECHOES:
+        return {"echoes": len(constant)}
     middle = float(np.median(constant))
     spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
-    return {**result, "constant": middle, "spread": spread, "incidence_deg": float(np.degrees(np.median(angle)))}
+    return {"echoes": len(constant), "constant": middle, "spread": spread}
 
 
-def fit_normal(xyz: np.ndarray) -> np.ndarray:
-    """Unit normal of the plane through points (n, 3), what lies four robust standard deviations off left out."""
-    kept = xyz
-    for _ in range(4):
-        centre = kept.mean(axis=0)
-        normal = np.linalg.svd(kept - centre, full_matrices=False)[2][2]
-        off = np.abs((xyz - centre) @ normal)
-        near = off <= 4 * MAD_TO_STD * max(float(np.median(off)), 1e-3)
-        kept = xyz[near] if near.sum() >= 3 else xyz
-    return normal
+def _combine(results: Sequence[Mapping[str, Any]], reflectance_error: float) -> dict[str, Any] | None:
+    """Constant of several targets, its relative error, the targets' typical spread, and how many echoes they had."""
+    good = [result for result in results if "constant" in result]
+    if not good:
+        return None
+    constants = np.array([result["constant"] for result in good])
+    constant = float(np.median(constants))
+    inner = float(np.median([result["spread"] / np.sqrt(result["echoes"]) for result in good]))
+    between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
+    return {
+        "constant": constant,
+        "relative_error": float(np.sqrt(reflectance_error**2 / len(good) + inner**2 + between**2)),
+        "spread": float(np.median([result["spread"] for result in good])),
+        "echoes": sum(result["echoes"] for result in good),
+    }
+
+
+def _calibrate_channels(
+    results: Sequence[tuple[dict[str, Any], np.ndarray]], reflectance_error: float
+) -> tuple[dict[str, Any], ...]:
+    """The same per digitizer, of a strip whose targets were seen by several; those with too few echoes are left out."""
+    every = np.concatenate([echoes for _, echoes in results])
+    digitizers = np.unique(every[:, 0]).astype(int).tolist()
+    if len(digitizers) < 2:
+        return ()
+    rows = []
+    for digitizer in digitizers:
+        own = [_summarise(echoes[echoes[:, 0] == digitizer, 1]) for _, echoes in results]
+        found = _combine(own, reflectance_error)
+        if found is not None:
+            rows.append({"digitizer": digitizer, **found})
+    return tuple(rows)
