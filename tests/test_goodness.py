@@ -128,3 +128,15 @@ def test_floor_of_the_specification():
     misfit, floor = measure_fit(block, noise, SystemPulse(2.123), Step(STAGES["decompose.gaussian"]), echo)
     assert floor[0] == pytest.approx(0.00159, abs=1e-5)
     assert misfit[0] < 1e-6
+
+
+def test_many_waveforms_are_thinned_evenly():
+    quality, step = FitQuality(1000), 137
+    misfit = np.random.default_rng(3).permutation(20_000) / 20_000
+    for begin in range(0, 20_000, step):
+        part = misfit[begin : begin + step]
+        quality.add(part, 2 * part, np.ones(len(part), int), np.ones(len(part), bool))
+    found = quality.result()["single"]
+    assert sum(len(part["misfit"]) for part in quality.parts) <= 1000
+    assert found.waveforms == 20_000 and found.mean == pytest.approx(misfit.mean())
+    assert found.median == pytest.approx(0.5, abs=0.06) and found.floor_median == 2 * found.median

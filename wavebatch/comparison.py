@@ -72,16 +72,17 @@ class Comparison:
 class Pairing:
     """Pairs echoes of a and b (records of io.cloud.CLOUD_DTYPE), part by part, and sums up what they have in common.
 
-    tolerance_ns: largest distance of the same echo along the ray. meta: of the truth where b is one.
+    tolerance_ns: largest distance of the same echo along the ray. meta: of the truth where b is one. limit: most pairs
+    that are kept for medians.
     """
 
-    def __init__(self, tolerance_ns: float, meta: dict | None = None) -> None:
+    def __init__(self, tolerance_ns: float, meta: dict | None = None, limit: int | None = None) -> None:
         self.tolerance, self.tolerance_ns = tolerance_ns * SPEED, tolerance_ns
         self.meta = meta
         self.pulses = self.exact = self.matched = 0
         self.echoes = [0, 0]
         self.counts = [np.zeros(1, np.int64), np.zeros(1, np.int64)]
-        self.differences = Differences()
+        self.differences = Differences(limit)
         self.breakdowns = (Breakdown(), Breakdown())
 
     def pair_by_time(self, a: np.ndarray, b: np.ndarray, packets: np.ndarray) -> None:

@@ -33,9 +33,10 @@ class EvenSample:
     """Rows of columns, every `step`-th of all that were seen: enough for medians, whatever their number."""
 
     LIMIT = 1_000_000
-    """Most rows that are kept; then every second one is dropped."""
+    """Most rows that are kept, unless told otherwise; then every second one is dropped."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: int | None = None) -> None:
+        self.limit = limit or self.LIMIT
         self.step, self.seen = 1, 0
         self.parts: list[dict[str, np.ndarray]] = []
 
@@ -45,7 +46,7 @@ class EvenSample:
         self.seen += number
         # Copies, because slices would keep the whole records alive.
         self.parts.append({name: values[start :: self.step].copy() for name, values in part.items()})
-        while sum(map(_length, self.parts)) > self.LIMIT:
+        while sum(map(_length, self.parts)) > self.limit:
             whole = self.join()
             self.parts = [{name: values[::2].copy() for name, values in whole.items()}]
             self.step *= 2
@@ -66,8 +67,8 @@ def _length(part: dict[str, np.ndarray]) -> int:
 class Differences(EvenSample):
     """Collects matched pairs (records of io.cloud.CLOUD_DTYPE): sums of all, an even sample of them for medians."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, limit: int | None = None) -> None:
+        super().__init__(limit)
         self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:

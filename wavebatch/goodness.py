@@ -48,8 +48,8 @@ def measure_fit(
 class FitQuality(EvenSample):
     """Collects E and E0 of waveforms: sums of all, an even sample of them for medians."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, limit: int | None = None) -> None:
+        super().__init__(limit)
         self._sums = {name: np.zeros(3) for name in ("all", "single", "multi", "both")}
 
     def add(self, misfit: np.ndarray, floor: np.ndarray, number: np.ndarray, both: np.ndarray) -> None:

@@ -28,6 +28,9 @@ AUTO = "auto"
 _BLOCK = 8192
 """Waveforms that go through the chains at a time."""
 
+_KEPT = 200_000
+"""Waveforms and pairs per chain that medians are taken of, beside those of the two sides."""
+
 
 @dataclass(frozen=True, slots=True)
 class Contender:
@@ -235,7 +238,7 @@ class ChainRun:
         placed = [step for step in chain.steps if step.stage.name == "attribute.position"]
         ending = [Step(STAGES["attribute.echo_width"]), *(placed or [Step(STAGES["attribute.position"])])[:1]]
         self.chain, self.system = Chain((*chain.steps[:3], *ending), chain.name), system
-        self.fit, self.vendor = FitQuality(), Pairing(tolerance_ns)
+        self.fit, self.vendor = FitQuality(_KEPT), Pairing(tolerance_ns, limit=_KEPT)
 
     def find(self, block: WaveformBlock) -> _Found:
         """What the chain makes of a block."""
