@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.errors import InputError
+from wavebatch.io import sums as module
 from wavebatch.io.sums import KeyedSums
 
 
@@ -25,21 +26,32 @@ def draw_parts(seed, spread, number=40):
     ]
 
 
-@pytest.mark.parametrize("held", [3, 50, 400, 100_000])
+@pytest.mark.parametrize("held", [3, 300, 2000, 100_000])
 @pytest.mark.parametrize("spread", [1, 30, 100_000])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_sums_are_those_of_a_dictionary(held, spread, seed):
-    parts = draw_parts(seed, spread)
+@pytest.mark.parametrize(("seed", "stride"), [(1, 256), (2, 4), (3, 1)])
+def test_sums_are_those_of_a_dictionary(held, spread, seed, stride, monkeypatch):
+    monkeypatch.setattr(module, "STRIDE", stride)
+    parts = draw_parts(seed, spread, 40 if held > 3 else 6)
     with KeyedSums(3, held=held) as sums:
         for key, value in parts:
             sums.add(key, value)
         pieces = list(sums.pieces())
-        assert bool(sums.spilled) == (min(spread, 4000) > held // 2)
+        assert bool(sums.spilled) == (min(spread, 3000) > held // 2)
     keys = np.concatenate([key for key, _ in pieces])
     values = np.concatenate([value for _, value in pieces])
     expected = slow_sums(parts)
     assert keys.tolist() == sorted(expected)
     assert values.tolist() == [expected[key] for key in keys.tolist()]
+
+
+def test_pieces_of_many_runs_are_small(monkeypatch):
+    monkeypatch.setattr(module, "STRIDE", 8)
+    with KeyedSums(3, held=400) as sums:
+        for key, value in draw_parts(5, 2**23, 400):
+            sums.add(key, value)
+        runs = sums.spilled
+        sizes = [len(key) for key, _ in sums.pieces()]
+    assert runs > 50 and sum(sizes) > 30_000 and max(sizes) <= 400 + 8 * runs and min(sizes) > 0
 
 
 def test_pieces_can_be_read_twice_and_may_be_none():

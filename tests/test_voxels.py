@@ -27,6 +27,7 @@ from wavebatch.survey import Survey
 from wavebatch.systemfile import SavedSurvey
 from wavebatch.units import HALF_C, SQRT_2PI
 from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
+from wavebatch.voxels.ceiling import Ceiling
 from wavebatch.voxels.profile import deconvolve_block
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.05)
@@ -36,9 +37,10 @@ DOWN = np.array([0.0, 0.0, -HALF_C])
 
 def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=None, point_format=4, wkt=None, bits=8,
                 noise=0.5, seed=1, returns=True):  # fmt: skip
-    """A strip of pulses whose echoes are lists of (height [m], amplitude); sample 0 lies at `height`."""
+    """A strip of pulses whose echoes are lists of (height [m], amplitude); sample 0 lies at `height` (n,)."""
     rng, s = np.random.default_rng(seed), 160
     n = len(echoes)
+    height = np.broadcast_to(height, n)
     xy = np.stack([np.arange(n) * 0.3 + 0.1, np.full(n, 0.4)], axis=1) if xy is None else np.asarray(xy)
     directions = np.tile(DOWN, (n, 1)) if directions is None else np.asarray(directions)
     time = np.arange(s)
@@ -47,7 +49,7 @@ def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=No
     for row, pairs in enumerate(echoes):
         shift = rng.uniform(-0.5, 0.5) if returns else 0.0
         for number, (z, amplitude) in enumerate(pairs or [(100.0, 0.0)]):
-            at = (z - height) / directions[row, 2]
+            at = (z - height[row]) / directions[row, 2]
             signal[row] += amplitude * np.exp(-0.5 * ((time - at) / sigma) ** 2)
             points.append((row, number + 1, max(len(pairs), 1), at, at + shift))
     counts = np.clip(np.rint(signal + noise * rng.standard_normal(signal.shape)), 0, 2**bits - 1)
@@ -61,7 +63,7 @@ def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=No
         rows = np.zeros(len(points), writer.dtype)
         table = np.array(points)
         row = table[:, 0].astype(int)
-        start = np.column_stack([xy, np.full(n, height)])
+        start = np.column_stack([xy, height])
         place = start[row] + directions[row] * table[:, 3:4]
         for axis, name in enumerate("XYZ"):
             rows[name] = np.rint(place[:, axis] / 0.001)
@@ -83,7 +85,7 @@ def load(path):
         return {name: file[name] for name in file}
 
 
-def voxelize(strip, target, size, *, headroom=0.0, all_crossed=False, deconvolution=None, **options):
+def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, **options):
     settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed)
     summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), **options)
     return summary, load(target) if target.suffix == ".npz" else laspy.read(target)
@@ -238,6 +240,75 @@ def test_rays_through_voxels_are_those_of_a_slow_tracer(tmp_path, headroom):
     assert all(mine[one] - slow.get(one, 0) == 1 for one in off) and len(off) < 0.03 * len(mine)
     top = found["index"][:, 2].max() * 0.7 + found["origin"][2]
     assert top <= 110.2 + headroom <= top + 0.85
+
+
+def test_every_ray_that_crossed_a_voxel_with_signal_counts(tmp_path):
+    """A tree of 20 m between oblique rays whose waveforms begin 4 m above the ground."""
+    tree, ground = [[(120.5, 60.0)]] * 30, [[(100.5, 60.0)]] * 30
+    unit = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0) * HALF_C
+    x = np.concatenate([np.full(30, 0.5), np.full(30, 0.5 + 0.3 * (120.5 - 104.0))])
+    strip = write_strip(
+        tmp_path / "tree.las", tree + ground, xy=np.column_stack([x, np.full(60, 0.5)]),
+        height=[125.0] * 30 + [104.0] * 30, directions=[DOWN] * 30 + [unit] * 30,
+    )  # fmt: skip
+    crowns = []
+    for headroom in (0.0, None, 300.0):
+        _, found = voxelize(strip, tmp_path / "v.npz", 1.0, headroom=headroom, overwrite=True)
+        z = found["origin"][2] + found["index"][:, 2]
+        row = np.flatnonzero((z == 120.0) & (found["index"][:, 0] == -found["origin"][0]))
+        assert len(row) == 1
+        crowns.append({name: float(found[name][row[0]]) for name in ("rays", "light", "path", "share")})
+    assert crowns[0]["rays"] == 30 and crowns[1]["rays"] == 60 and crowns[1] == crowns[2]
+    assert crowns[0]["share"] > 0.9 and crowns[1]["share"] == pytest.approx(crowns[0]["share"] / 2, abs=0.01)
+
+
+def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_path):
+    strip = tmp_path / "hills.las"
+    flight = Flight(half_angle=3.0, pulse_rate=30_000.0)
+    simulate_strip("urban", strip, pulses=1500, seed=4, flight=flight)
+    near, far = (
+        voxelize(strip, tmp_path / "v.npz", 0.8, headroom=headroom, overwrite=True)[1] for headroom in (None, 300.0)
+    )
+    for name in ("index", "energy"):
+        assert np.array_equal(near[name], far[name])
+    # Signal high above all returns is rare, and noise.
+    for name in ("rays", "light", "path", "share"):
+        assert np.mean(near[name] != far[name]) < 0.01
+
+
+@pytest.mark.parametrize("most", [8, 100, 1 << 18])
+def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
+    monkeypatch.setattr("wavebatch.voxels.ceiling.MOST_CELLS", most)
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
+    ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
+    for part in (points[:100], points[100:101], points[101:]):
+        ceiling.add(part)
+    ceiling.add(np.array([[np.nan, 0, 1], [1e300, 0, 1], [0, 0, np.inf]]))
+    ceiling.finish()
+    assert len(ceiling._key) <= 9 * most
+    start = np.column_stack([rng.uniform(0, 120, (80, 2)), np.zeros(80)])
+    step = np.column_stack([rng.normal(0, 0.05, (80, 2)), np.full(80, -0.1)])
+    start[0, 0], step[1], step[2, 2] = np.nan, 0.0, 0.001
+    headroom = ceiling.measure_headroom(start, step)
+    assert headroom[:3].tolist() == [0.0, 0.0, 0.0]
+    unit = -step / np.linalg.norm(np.where(step == 0, 1e-30, step), axis=1)[:, None]
+    for row in range(3, 80):
+        way = np.arange(0, 60, 0.25)
+        place = start[row] + unit[row] * way[:, None]
+        gap = np.abs(place[:, None, :2] - points[None, :, :2]).max(axis=2)
+        # Whatever lies in the same cell lies within a cell; whatever is higher there needs the ray.
+        needed = (np.where(gap < 0.5 * ceiling.cell, points[:, 2], -np.inf).max(axis=1) > place[:, 2])
+        assert headroom[row] >= (way[needed].max() if needed.any() else 0.0)
+        assert headroom[row] <= 39.0 / unit[row, 2] + 2 * ceiling.cell
+
+
+def test_strips_in_degrees_are_refused(tmp_path):
+    wkt = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],' \
+        'UNIT["degree",0.0174532925199433]]'  # fmt: skip
+    strip = write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30, point_format=9, wkt=wkt)
+    with pytest.raises(InputError, match="degrees"):
+        voxelize(strip, tmp_path / "v.npz", 1.0)
 
 
 def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tmp_path):

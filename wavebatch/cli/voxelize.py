@@ -30,9 +30,9 @@ _SENSOR = ("trajectory", "crs", "flight_height")
               help="Amplitude over noise that the filter of --method wiener is made for.  [default: 20]")
 @click.option("--threshold", type=click.FloatRange(0), default=4.27, show_default=True, metavar="STD",
               help="Less signal in a row than a lone echo of this many standard deviations is noise, and left out.")
-@click.option("--headroom", type=click.FloatRange(0, 100_000), default=0.0, show_default=True, metavar="M",
-              help="Count rays over this length before their first sample too, where sensors record from just above "
-                   "the first echo: the canopy's height.")
+@click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
+              help="Count rays over this length before their first sample, too: they crossed it, whether recorded or "
+                   "not.  [default: up to the highest return near them]")
 @click.option("--all-crossed", is_flag=True, help="Write voxels that rays crossed without any signal, too.")
 @click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
               help="A saved survey (of `wavebatch survey -o`) in place of one of the strip.")
@@ -65,7 +65,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
 
     Every sample is spread over its own way, so that voxels smaller than a sample's 15 cm have no holes. A ray ends at
     its last signal: what lies behind is not seen. What is not in the file was not seen, or (without --all-crossed)
-    seen to be empty. Memory does not grow with the strip; TMPDIR needs room for large ones.
+    seen to be empty. An .npz holds index (n, 3), a column per value, origin, size, crs and meta; voxel i lies between
+    origin + i size and origin + (i + 1) size. Memory does not grow with the strip; TMPDIR needs room for large ones.
 
     Exit code: 0, 1 where the strip cannot be read or the output not be written, 2 wrong usage.
     """  # fmt: skip

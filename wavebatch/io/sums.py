@@ -8,14 +8,17 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Iterator
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 
 from wavebatch.errors import InputError
 
-HELD = 1 << 20
+HELD = 1 << 18
 """Rows that are held in memory before they are sorted and spilled."""
+
+STRIDE = 256
+"""Every so many rows of what was spilled, a key stays in memory."""
 
 
 class KeyedSums:
@@ -31,8 +34,7 @@ class KeyedSums:
         self._parts: list[np.ndarray] = []
         self._number = 0
         self._file: IO[bytes] | None = None
-        self._runs: list[tuple[int, int]] = []
-        """First row and number of rows of every sorted run in the file."""
+        self._runs: list[_Run] = []
 
     def __enter__(self) -> KeyedSums:
         return self
@@ -73,31 +75,16 @@ class KeyedSums:
                     yield rows["key"], rows["value"]
             return
         self._spill()
-        yield from self._merge()
+        for low, high in self._cut_ranges():
+            parts = [self._read_range(run, low, high) for run in self._runs if run.touches(low, high)]
+            rows = self._sum(np.concatenate(parts))
+            yield rows["key"], rows["value"]
 
-    def _merge(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        piece = max(self._held // len(self._runs), 256)
-        places = list(self._runs)
-        heads: list[np.ndarray] = [np.empty(0, self._dtype) for _ in places]
-        while True:
-            for number, (first, left) in enumerate(places):
-                if left and not len(heads[number]):
-                    taken = min(left, piece)
-                    heads[number] = self._read(first, taken)
-                    places[number] = (first + taken, left - taken)
-            # Up to the least of the last keys at hand of runs that go on, nothing more can come.
-            more = [head["key"][-1] for head, (_, left) in zip(heads, places, strict=True) if left]
-            border = min(more, default=None)
-            taken_rows = []
-            for number, head in enumerate(heads):
-                cut = len(head) if border is None else int(np.searchsorted(head["key"], border, side="right"))
-                taken_rows.append(head[:cut])
-                heads[number] = head[cut:]
-            rows = self._sum(np.concatenate(taken_rows))
-            if len(rows):
-                yield rows["key"], rows["value"]
-            if border is None:
-                return
+    def _cut_ranges(self) -> Iterator[tuple[int, int]]:
+        """Ranges of keys, ascending and none without rows, that hold about as many rows each as are held."""
+        marks = np.sort(np.concatenate([run.marks for run in self._runs]))
+        borders = np.unique(marks[:: max(self._held // STRIDE, 1)]).tolist()
+        yield from zip(borders, [*borders[1:], 1 << 64], strict=True)
 
     def _shrink(self) -> None:
         """All rows that are held, summed."""
@@ -113,16 +100,24 @@ class KeyedSums:
             for rows in self._parts:
                 first = self._file.seek(0, 2) // self._dtype.itemsize
                 self._file.write(rows.tobytes())
-                self._runs.append((first, len(rows)))
+                self._runs.append(_Run(first, len(rows), rows["key"][::STRIDE].copy(), int(rows["key"][-1])))
         self._parts, self._number = [], 0
 
-    def _read(self, first: int, number: int) -> np.ndarray:
+    def _read_range(self, run: _Run, low: int, high: int) -> np.ndarray:
+        """The rows of a run whose keys lie in [low, high)."""
+        begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * STRIDE
+        end = run.number
+        if high <= run.last:
+            end = min(int(np.searchsorted(run.marks, np.uint64(high))) * STRIDE, end)
+        size = self._dtype.itemsize
         with _reported():
-            self._file.seek(first * self._dtype.itemsize)
-            data = self._file.read(number * self._dtype.itemsize)
-        if len(data) != number * self._dtype.itemsize:
+            self._file.seek((run.first + begin) * size)
+            data = self._file.read((end - begin) * size)
+        if len(data) != (end - begin) * size:
             raise InputError(f"{tempfile.gettempdir()}: a temporary file of sums ends too early; run again")
-        return np.frombuffer(data, self._dtype)
+        rows = np.frombuffer(data, self._dtype)
+        last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
+        return rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
 
     def _sum(self, rows: np.ndarray) -> np.ndarray:
         """Rows sorted by key, those of one key added up."""
@@ -132,6 +127,21 @@ class KeyedSums:
         key = rows["key"][order]
         first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
         return _rows(self._dtype, key[first], np.add.reduceat(rows["value"][order], first, axis=0))
+
+
+class _Run(NamedTuple):
+    """Rows in the file, sorted by key."""
+
+    first: int
+    number: int
+    marks: np.ndarray
+    """Keys of its rows 0, STRIDE, 2 STRIDE ..., u8."""
+    last: int
+    """Its largest key."""
+
+    def touches(self, low: int, high: int) -> bool:
+        """Whether any of its keys may lie in [low, high)."""
+        return int(self.marks[0]) < high and self.last >= low
 
 
 def _rows(dtype: np.dtype, key: np.ndarray, value: np.ndarray) -> np.ndarray:

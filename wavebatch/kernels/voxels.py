@@ -19,7 +19,7 @@ MOST_STEPS = 1 << 18
 TOUCH = 1e-6
 """Time [ns] below which a voxel counts as touched by an edge only: what lies in it goes to the one before."""
 
-AT_A_TIME = 1 << 20
+AT_A_TIME = 1 << 16
 """Crossings that are sorted together."""
 
 

@@ -38,12 +38,12 @@ class RayTable:
 
 
 def trace_profiles(
-    block: WaveformBlock, profiles: Profiles, *, headroom: float = 0.0, system: SystemPulse | None = None
+    block: WaveformBlock, profiles: Profiles, *, headroom: np.ndarray | float = 0.0, system: SystemPulse | None = None
 ) -> RayTable:
     """The rays of a block with what their profiles say.
 
-    A ray begins half a sample before its first one, or `headroom` [m] earlier, and ends behind its last signal: what
-    lies behind that got no light that is known of. Rays without any signal end with their waveform.
+    A ray begins half a sample before its first one, or `headroom` [m] (n,) earlier, and ends behind its last signal:
+    what lies behind that got no light that is known of. Rays without any signal end with their waveform.
     system: calibrated, for cross sections; None: without them.
     """
     n, s = profiles.value.shape

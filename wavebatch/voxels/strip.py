@@ -21,6 +21,7 @@ from wavebatch.kernels.voxels import fits_keys
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
 from wavebatch.systemfile import SavedSurvey, describe_system
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.voxels.output import LasVoxels, NpzVoxels, check_target
 from wavebatch.voxels.profile import Deconvolution, deconvolve_block
@@ -42,15 +43,16 @@ class VoxelOptions:
     size: float
     """Of a voxel [m]."""
     deconvolution: Deconvolution = field(default_factory=Deconvolution)
-    headroom: float = 0.0
-    """Way before the first sample of every waveform on which its ray counts too [m]."""
+    headroom: float | None = None
+    """Way before the first sample of every waveform on which its ray counts too [m]; None: up to the highest return
+    near it."""
     all_crossed: bool = False
     """Voxels that rays crossed without any signal are written too."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= _LARGEST:
             raise ConfigError(f"--size {self.size:g}: the size of a voxel must lie above 0 and up to {_LARGEST:g} m")
-        if not 0 <= self.headroom < 1e5:
+        if self.headroom is not None and not 0 <= self.headroom < 1e5:
             raise ConfigError(f"--headroom {self.headroom:g}: must lie between 0 and 100000 m")
 
 
@@ -126,10 +128,12 @@ def voxelize_strip(
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         pulse = _find_pulse(reader, scan, system, calibration)
         source = NOBODY if calibration is None else _find_sensor(reader, scan, sensor)
-        with _open_grid(reader, scan, options, calibration is not None, held) as grid:
+        middle = _find_middle(reader, scan, options)
+        ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
+        with _open_grid(reader, middle, options, calibration is not None, held) as grid:
             counts = _Counts()
             for block in _read_blocks(reader, scan, block_size):
-                _add_block(grid, counts, source.fill(block), pulse, options)
+                _add_block(grid, counts, source.fill(block), pulse, options, ceiling)
                 if progress is not None:
                     progress(len(block), scan.packets)
             voxels = _write(grid, reader, target, _describe(strip, options, pulse, calibration), overwrite)
@@ -180,30 +184,40 @@ def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | 
     return source
 
 
-def _open_grid(
-    reader: StripReader, scan: StripScan, options: VoxelOptions, sections: bool, held: int
-) -> VoxelGrid:
-    """The grid, its middle where most rays are; ConfigError where its voxels are too small for the strip."""
-    digitizers = reader.facts.digitizers.values()
-    unit = energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples))
+def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
+    """A place in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
+    path, size = reader.facts.path, options.size
+    for said in reader.facts.units:
+        if not said.is_metric:
+            raise InputError(f"{path}: coordinates are {said.describe()}; voxels need metres: project the strip")
     blocks = list(reader.sample_blocks(scan, _SAMPLED))
     start = np.concatenate([block.origin for block in blocks])
     step = np.concatenate([block.direction for block in blocks])
     end = np.concatenate([np.full(len(block), block.samples.shape[1] * block.spacing) for block in blocks])
     known = np.isfinite(start).all(axis=1)
     middle = np.median(start[known], axis=0) if known.any() else np.zeros(3)
-    size = options.size
-    while True:
-        anchor = np.floor(middle / size)
-        good = fits_keys(start - anchor * size, step, -options.headroom / HALF_C + 0 * end, end, size)
-        if np.mean(good) >= _MOST_FITTING:
-            break
+    begin = np.full(len(end), -(options.headroom or 0.0) / HALF_C)
+    while np.mean(fits_keys(start - middle, step, begin, end, size)) < _MOST_FITTING:
         size *= 2
         if size > _LARGEST:
-            raise InputError(f"{reader.facts.path}: its coordinates are spread over more than a grid can hold: damaged")
+            raise InputError(f"{path}: its coordinates are spread over more than a grid can hold: damaged")
     if size > options.size:
         raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
-    return VoxelGrid(size, anchor.astype(np.int64), unit, sections=sections, everything=options.all_crossed, held=held)
+    return middle
+
+
+def _open_grid(
+    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, held: int
+) -> VoxelGrid:
+    digitizers = reader.facts.digitizers.values()
+    return VoxelGrid(
+        options.size,
+        np.floor(middle / options.size).astype(np.int64),
+        energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
+        sections=sections,
+        everything=options.all_crossed,
+        held=held,
+    )
 
 
 def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iterator[WaveformBlock]:
@@ -216,11 +230,19 @@ def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iter
 
 
 def _add_block(
-    grid: VoxelGrid, counts: _Counts, block: WaveformBlock, pulse: SystemPulse, options: VoxelOptions
+    grid: VoxelGrid,
+    counts: _Counts,
+    block: WaveformBlock,
+    pulse: SystemPulse,
+    options: VoxelOptions,
+    ceiling: Ceiling | None,
 ) -> None:
     profiles = deconvolve_block(block, pulse, options.deconvolution)
     rays = trace_profiles(
-        block, profiles, headroom=options.headroom, system=pulse if pulse.calibration is not None else None
+        block,
+        profiles,
+        headroom=options.headroom if ceiling is None else ceiling.measure_headroom(block.origin, block.direction),
+        system=pulse if pulse.calibration is not None else None,
     )
     grid.add(rays, block.spacing)
     counts.waveforms += len(block)
