@@ -379,7 +379,7 @@ def test_pictures_say_what_they_show(tmp_path, cloud):
     pytest.importorskip("matplotlib")
     expected = {
         "histogram": ["cloud.laz", "amplitude: peak of the echo above the baseline [DN]", "without data", "median"],
-        "flags": ["SATURATED", "no flag", "5,000 points"],
+        "flags": ["cloud.laz", "SATURATED", "no flag", "5,000 points"],
         "map": ["x [m]", "y [m]", "median of amplitude: peak of the echo above the baseline [DN]"],
         "density": ["points per area [1/m2]"],
     }

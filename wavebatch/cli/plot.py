@@ -166,7 +166,7 @@ def histogram(clouds: tuple[Path, ...], column: str, output: Path, **options: An
         counted = count_flags(clouds, selection)
         from wavebatch.plots.draw_cloud import draw_flags
 
-        draw_flags(counted, output, **how)
+        draw_flags(counted, output, names=tuple(path.name for path in clouds), **how)
         told = f"{counted.total.values} points, {counted.clean} without a flag"
     else:
         found = count_values(

@@ -35,6 +35,7 @@ def draw_histogram(found: Histogram, target: Path, *, log: bool = False, overwri
         else:
             axes.yaxis.set_major_formatter(lambda value, _: _count_text(value) if value == round(value) else "")
             axes.set_ylim(bottom=0)
+        axes.ticklabel_format(axis="x", useOffset=False)
         axes.set_xlim(found.edges[0], found.edges[-1])
         axes.set_xlabel(plain_text(found.facts.label, 110))
         unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
@@ -45,30 +46,41 @@ def draw_histogram(found: Histogram, target: Path, *, log: bool = False, overwri
 
 def _draw_series(axes: Axes, found: Histogram, series: int, counts: np.ndarray) -> None:
     color = SERIES[series % len(SERIES)]
-    low, median, high = found.percentiles[series]
+    low_end, middle, high_end = found.percentiles[series]
     alone = len(found.counts) == 1
     label = f"{plain_text(found.names[series], 40)}: " if not alone else ""
     if alone:
         axes.stairs(counts, found.edges, fill=True, color=color, alpha=0.35)
     unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
-    told = f"{label}{found.tallies[series].values:,} values, median {median:.5g}{unit}"
+    low, median, high = (_value_text(value, found.edges) for value in found.percentiles[series])
+    told = f"{label}{found.tallies[series].values:,} values, median {median}{unit}"
     axes.stairs(counts, found.edges, color=color, linewidth=1.2, label=told)
-    if math.isnan(median):
+    if math.isnan(middle):
         return
-    axes.axvline(median, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
+    axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
     if alone:
-        axes.axvspan(low, high, color="#222222", alpha=0.06, linewidth=0, zorder=0,
-                     label=f"{PERCENTILES[0]:g} to {PERCENTILES[2]:g} %: {low:.5g} to {high:.5g}{unit}")  # fmt: skip
+        axes.axvspan(low_end, high_end, color="#222222", alpha=0.06, linewidth=0, zorder=0,
+                     label=f"{PERCENTILES[0]:g} to {PERCENTILES[2]:g} %: {low} to {high}{unit}")  # fmt: skip
 
 
-def draw_flags(found: FlagCounts, target: Path, *, log: bool = False, overwrite: bool = False) -> None:
-    """Writes a picture of how many points have which flag; log: a logarithmic axis of counts."""
+def _value_text(value: float, edges: np.ndarray) -> str:
+    """A value with digits down to a tenth of a bin."""
+    digits = 1 - math.floor(math.log10(edges[1] - edges[0]))
+    if math.isnan(value) or digits > 12 or abs(value) >= 1e15:
+        return f"{value:.5g}"
+    return f"{value:.{max(digits, 0)}f}"
+
+
+def draw_flags(
+    found: FlagCounts, target: Path, *, names: tuple[str, ...], log: bool = False, overwrite: bool = False
+) -> None:
+    """Writes a picture of how many points have which flag; names: of the clouds; log: a logarithmic axis of counts."""
     with open_picture(target, (8.0, 5.2), overwrite=overwrite) as figure:
         axes = figure.subplots()
-        names, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
-        place = np.arange(len(names))
+        flags, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
+        place = np.arange(len(flags))
         axes.barh(place, counts, color=["#8a8a8a", *[SERIES[0]] * len(found.names)], height=0.7)
-        axes.set_yticks(place, names)
+        axes.set_yticks(place, flags)
         axes.invert_yaxis()
         axes.grid(axis="y", visible=False)
         total = max(found.total.values, 1)
@@ -80,7 +92,8 @@ def draw_flags(found: FlagCounts, target: Path, *, log: bool = False, overwrite:
         axes.set_xlim(0, max(int(counts.max(initial=1)), 1) * (10.0 if log else 1.25))
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
-        axes.set_title(f"{found.total.values:,} points, by flag; a point may have several")
+        name = _name_clouds(names)
+        axes.set_title(f"{name}   {found.facts.name}\n{found.total.values:,} points; a point may have several flags")
 
 
 def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: bool = False) -> None:
@@ -101,7 +114,7 @@ def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: 
         low, high = found.shown if found.shown[1] > found.shown[0] else (found.shown[0] - 0.5, found.shown[0] + 0.5)
         shown = axes.imshow(
             found.values.astype(np.float32), extent=grid.extent, origin="lower", cmap="viridis", vmin=low, vmax=high,
-            interpolation="nearest", aspect="equal",
+            interpolation="nearest", interpolation_stage="data", aspect="equal",
         )  # fmt: skip
         known = found.values[np.isfinite(found.values)]
         ends = (known.min(initial=low) < low) + 2 * (known.max(initial=high) > high)
@@ -131,7 +144,6 @@ def _place_ticks(axes: Axes, width: float, height: float) -> None:
 
 def _title(names: tuple[str, ...], total: Tally, column: str, outside: int) -> str:
     """Whose values these are, and how many points are not shown and why."""
-    name = plain_text(names[0], 60) if len(names) == 1 else f"{len(names)} clouds"
     parts = [f"{total.values:,} values"]
     if total.no_data:
         parts.append(f"{total.no_data:,} without data")
@@ -139,7 +151,11 @@ def _title(names: tuple[str, ...], total: Tally, column: str, outside: int) -> s
         parts.append(f"{total.left_out:,} left out by flags")
     if outside:
         parts.append(f"{outside:,} outside the picture")
-    return f"{name}   {plain_text(column, 40)}\n{', '.join(parts)}"
+    return f"{_name_clouds(names)}   {plain_text(column, 40)}\n{', '.join(parts)}"
+
+
+def _name_clouds(names: tuple[str, ...]) -> str:
+    return plain_text(names[0], 60) if len(names) == 1 else f"{len(names)} clouds"
 
 
 def _count_text(value: float) -> str:

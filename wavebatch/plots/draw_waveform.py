@@ -44,7 +44,7 @@ def draw_waveforms(
 
     strip, chain: names for the title. times: the part to show [ns]. Raises as pictures.open_picture does.
     """
-    columns = math.ceil(math.sqrt(len(views)))
+    columns = len(views) if len(views) <= 3 else math.ceil(math.sqrt(len(views)))
     rows = -(-len(views) // columns)
     table = _list_echoes(views[0]) if len(views) == 1 else ""
     # A table takes a row of its own, as high as its lines.
@@ -80,8 +80,7 @@ def _draw_panels(
     _draw_residual(lower, view)
     upper.set_title(_title(view, short=small))
     lower.set_xlim(times or (-0.5 * view.spacing, view.time[-1] + 0.5 * view.spacing))
-    if times:
-        _fit_height(upper, view, times)
+    _fit_height(upper, view, times or (-math.inf, math.inf))
     return upper, lower
 
 
@@ -118,8 +117,6 @@ def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
     for place in view.returns:
         axes.axvline(place, color=VENDOR, linewidth=1.0, linestyle=(0, (4, 2)), zorder=1)
     _draw_echoes(axes, view, small=small)
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.12 * (high - low))
 
 
 def _draw_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
@@ -155,11 +152,15 @@ def _draw_residual(axes: Axes, view: WaveformView) -> None:
 
 
 def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
-    """Scales the signal to the samples that are shown."""
-    inside = (view.time >= times[0]) & (view.time <= times[1])
-    values = [view.samples[inside], [view.baseline - view.std, view.baseline + view.std]]
+    """Scales the signal to the samples and the fit that are shown; long error bars do not count."""
+
+    def inside(time: np.ndarray) -> np.ndarray:
+        return (time >= times[0]) & (time <= times[1])
+
+    values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std]]
+    values.append(view.baseline + view.echoes.amplitude[inside(view.echoes.time)].astype(np.float64))
     if view.fit is not None:
-        values.append(view.fit[(view.fine >= times[0]) & (view.fine <= times[1])])
+        values.append(view.fit[inside(view.fine)])
     shown = np.concatenate(values)
     span = float(shown.max() - shown.min())
     axes.set_ylim(shown.min() - 0.05 * span, shown.max() + 0.17 * span)

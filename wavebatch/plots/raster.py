@@ -249,8 +249,10 @@ class _Cells:
 
     def _take_medians(self, placed: np.ndarray) -> None:
         """Median of every cell of a bucket; of an even number of values the mean of the middle two."""
-        order = np.lexsort((placed["value"], placed["cell"]))
-        cell, value = placed["cell"][order], placed["value"][order]
+        pairs = np.empty(len(placed), np.complex128)  # sorted by their real, then their imaginary parts
+        pairs.real, pairs.imag = placed["cell"], placed["value"]
+        pairs.sort()
+        cell, value = pairs.real.astype(np.int64), pairs.imag
         first = np.flatnonzero(np.r_[True, np.diff(cell) != 0]) if len(cell) else np.empty(0, np.int64)
         count = np.diff(np.append(first, len(cell)))
         low, high = value[first + (count - 1) // 2], value[first + count // 2]
