@@ -17,7 +17,7 @@ RANKS = [
      "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
     {"angles", "auto", "trial", "choice", "sensor", "calibration", "matchup", "plots"},
     {"work", "targets", "voxels"},
-    {"record", "remarks"},
+    {"record", "remarks", "secondpass"},
     {"task", "workers"},
     {"plan"},
     {"batch"},

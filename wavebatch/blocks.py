@@ -83,10 +83,12 @@ COLUMNS: dict[str, Column] = _columns(
     Column("relative_cross_section", "f4", "DN ns m4", "not calibrated: cross section in units of its own strip"),
     Column("relative_reflectance", "f4", "DN ns m2", "not calibrated: reflectance in units of its own strip"),
     Column("incidence_angle", "f4", "deg", "angle between ray and surface normal"),
+    Column("incidence_angle_normals", "f4", "deg", "angle between ray and normal of the plane of the points around"),
     Column("range_err", "f4", "m", "one standard deviation of the echo along the ray, from the fit"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
     Column("echo_width_err", "f4", "ns", "one standard deviation of echo_width, from the fit"),
     Column("incidence_angle_err", "f4", "deg", "one standard deviation of incidence_angle"),
+    Column("incidence_angle_normals_err", "f4", "deg", "one standard deviation of incidence_angle_normals"),
     Column("cross_section_err", "f4", "m2", "one standard deviation of cross_section"),
     Column("backscatter_coefficient_err", "f4", "-", "one standard deviation of gamma"),
     Column("reflectance_err", "f4", "-", "one standard deviation of reflectance"),
@@ -98,7 +100,13 @@ COLUMNS: dict[str, Column] = _columns(
     Column("x", "f8", "m", "easting of the echo", extra_bytes=False),
     Column("y", "f8", "m", "northing of the echo", extra_bytes=False),
     Column("z", "f8", "m", "height of the echo", extra_bytes=False),
+    Column("ray_x", "f4", "-", "east component of the unit vector away from the sensor", extra_bytes=False),
+    Column("ray_y", "f4", "-", "north component of the unit vector away from the sensor", extra_bytes=False),
+    Column("ray_z", "f4", "-", "upward component of the unit vector away from the sensor", extra_bytes=False),
 )
+
+RAY = ("ray_x", "ray_y", "ray_z")
+"""Columns of a stage with a second pass: the direction in which each echo was seen."""
 
 
 @dataclass(frozen=True, slots=True)

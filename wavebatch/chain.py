@@ -48,6 +48,12 @@ class Stage:
     """Names of the attribute columns that the stage adds."""
     needs: tuple[str, ...] = ()
     """Names of the attribute columns that must be there before."""
+    second_pass: Callable[..., Any] | None = None
+    """Kernel that fills the stage's columns once all points of the strip are there; the stage itself, which sees one
+    block only, makes no-data and the columns `ray_x`, `ray_y`, `ray_z`.
+
+    It is called with points (n, 3) [m], rays (n, 3), kernels.normals.Surroundings and the stage's parameters, of which
+    `radius` [m] is how far away points matter; it returns values of the columns, and a kernels.normals.Gap each."""
 
     @property
     def summary(self) -> str:
@@ -59,7 +65,13 @@ STAGES: dict[str, Stage] = {}
 """Every registered stage by name; filled when `wavebatch.stages` is imported."""
 
 
-def stage(kind: str, *, makes: tuple[str, ...] = (), needs: tuple[str, ...] = ()) -> Callable:
+def stage(
+    kind: str,
+    *,
+    makes: tuple[str, ...] = (),
+    needs: tuple[str, ...] = (),
+    second_pass: Callable[..., Any] | None = None,
+) -> Callable:
     """Decorator that registers a function as stage `kind.<function name>` and checks its signature."""
     if kind not in KINDS:
         raise StageError(f"stage kind {kind!r} is not one of {', '.join(KINDS)}")
@@ -68,7 +80,10 @@ def stage(kind: str, *, makes: tuple[str, ...] = (), needs: tuple[str, ...] = ()
         name = f"{kind}.{function.__name__}"
         if name in STAGES:
             raise StageError(f"stage {name} is registered twice")
-        STAGES[name] = Stage(name, kind, function, _read_parameters(name, kind, function), makes, needs)
+        parameters = _read_parameters(name, kind, function)
+        if second_pass is not None and "radius" not in parameters:
+            raise StageError(f"stage {name} has a second pass, but no parameter radius")
+        STAGES[name] = Stage(name, kind, function, parameters, makes, needs, second_pass)
         return function
 
     return register
@@ -161,6 +176,11 @@ class Chain:
     def makes(self) -> tuple[str, ...]:
         """Attribute columns that the chain computes, in order."""
         return tuple(dict.fromkeys(name for step in self.steps for name in step.stage.makes))
+
+    @property
+    def second_step(self) -> Step | None:
+        """The last step that needs a second pass over the strip's points; None where no step does."""
+        return next((step for step in reversed(self.steps) if step.stage.second_pass is not None), None)
 
     def run(
         self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None

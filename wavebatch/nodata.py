@@ -28,6 +28,9 @@ class NoData(IntEnum):
     TOO_STEEP = 11
     UNCERTAIN = 12
     OTHER = 13
+    NO_RAY = 14
+    FEW_NEIGHBOURS = 15
+    NO_PLANE = 16
 
 
 REASONS: dict[NoData, tuple[str, str]] = {
@@ -59,6 +62,9 @@ REASONS: dict[NoData, tuple[str, str]] = {
         "raise max_error, or take angles from the points of the surface instead of the width",
     ),
     NoData.OTHER: ("its fit gave no usable value", "see its flags"),
+    NoData.NO_RAY: ("its packet has no direction, or it is no point of the cloud", "write --points echoes"),
+    NoData.FEW_NEIGHBOURS: ("fewer points around it than min_points", "raise radius"),
+    NoData.NO_PLANE: ("the points around it are no plane that it lies in", "lower radius; plants have none"),
 }
 """Per reason what it means, and what can be done about it."""
 

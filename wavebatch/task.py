@@ -28,6 +28,7 @@ from wavebatch.record import (
 )
 from wavebatch.remarks import find_remarks
 from wavebatch.report import RunReport
+from wavebatch.secondpass import SecondPass, process_tile
 from wavebatch.work import Prepared, StripJob, prepare_strip, process_packed_unit
 from wavebatch.workers import Workers
 
@@ -57,6 +58,7 @@ class StripTask:
         self._submitted = 0
         self._blob = b""
         self._writer: CloudWriter | None = None
+        self._second: SecondPass | None = None
         self._report = RunReport()
         self._described: dict[str, Any] = {}
         self._files: list[Path] = []
@@ -82,17 +84,24 @@ class StripTask:
         """Whether something can be submitted now."""
         if self.prepared is None:
             return not self.pending
-        return self._submitted < self.prepared.units
+        if self._submitted < self.prepared.units:
+            return True
+        return self._second is not None and self._second.has_more
 
     @property
     def is_complete(self) -> bool:
-        """Whether all units are written."""
-        return self.prepared is not None and self.written == self.prepared.units
+        """Whether all units are written, and all tiles of a second pass are done."""
+        if self.prepared is None or self.written < self.prepared.units:
+            return False
+        return self._second is None or self._second.is_complete
 
     def submit(self, workers: Workers) -> None:
-        """The next piece of work: the preparation, then unit by unit."""
+        """The next piece of work: the preparation, then unit by unit, then the tiles of a second pass."""
         if self.prepared is None:
             self.pending.append(workers.submit(prepare_strip, self.job))
+            return
+        if self._submitted == self.prepared.units:
+            self.pending.append(workers.submit(process_tile, *self._second.next_tile()))
             return
         arguments = (self._blob, self._submitted, self._options.block_size)
         self.pending.append(workers.submit(process_packed_unit, *arguments))
@@ -106,11 +115,16 @@ class StripTask:
             self.prepared = result
             self._report += result.report
             self._open()
+        elif self.written == self.prepared.units:
+            self._report += self._second.take(result)
             return
-        rows, report = result
-        self._writer.write(rows)
-        self.written += 1
-        self._report += report + RunReport(timing={"write": time.perf_counter() - start})
+        else:
+            rows, report = result
+            (self._writer.write if self._second is None else self._second.add)(rows)
+            self.written += 1
+            self._report += report + RunReport(timing={"write": time.perf_counter() - start})
+        if self._second is not None and self.written == self.prepared.units:
+            self._report += self._second.cut()
 
     def _open(self) -> None:
         options, prepared = self._options, self.prepared
@@ -123,10 +137,23 @@ class StripTask:
             provenance=provenance,
             overwrite=options.overwrite or options.resume,
         )
+        if prepared.second_step is not None:
+            self._second = SecondPass(prepared.second_step, prepared.layout, cloud_path(self.job, options.folder))
+
+    def _fill(self) -> None:
+        """Writes the rows that waited for a second pass."""
+        start = time.perf_counter()
+        for rows in self._second.rows():
+            self._writer.write(rows)
+        self._second.close()
+        no_data = self._second.count_reasons(self._report.count("echoes"))
+        self._report += RunReport(no_data=no_data, timing={"write": time.perf_counter() - start})
 
     def finish(self) -> RunReport:
         """Publishes the cloud, then its report, which says that the cloud is complete."""
         options, job = self._options, self.job
+        if self._second is not None:
+            self._fill()
         start = time.perf_counter()
         self._report.check(job.options.points, str(job.path))
         self._report += RunReport(remarks=find_remarks(self.prepared, self._report))
@@ -151,6 +178,8 @@ class StripTask:
         self.pending.clear()
         if self._writer is not None:
             self._writer.abort()
+        if self._second is not None:
+            self._second.close()
         if self.prepared is not None:
             self.prepared.scan.close()
 

@@ -8,14 +8,15 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.auto import without_columns
-from wavebatch.blocks import COLUMNS, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import COLUMNS, RAY, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.chain import STAGES, Chain
+from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import Choice, Request, make_choice
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
@@ -93,6 +94,18 @@ class Prepared:
         """The pulse that the strip is run with, its calibration, and the error of the sensor's position."""
         system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
         return system if self.job.calibration is None else self.job.calibration.apply(system)
+
+
+    @property
+    def second_step(self) -> Step | None:
+        """The step whose columns are filled in a second pass over the strip's points; None where none is written."""
+        step = self.job.chain.second_step
+        return step if step is not None and set(step.stage.makes) & set(self.job.options.columns) else None
+
+    @property
+    def row_layout(self) -> OutputLayout:
+        """The layout of a unit's rows: the cloud's, and behind it what a second pass needs."""
+        return self.layout if self.second_step is None else self.layout.extended(RAY)
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
@@ -184,7 +197,7 @@ def process_unit(prepared: Prepared, number: int, block_size: int | None = None)
         echoes = gather_echoes(unit, _run_blocks(prepared, blocks, stages))
     gathered = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
-    rows, report = assemble(unit, echoes, prepared.layout)
+    rows, report = assemble(unit, echoes, prepared.row_layout)
     timing = {
         **stages,
         "read points": opened - start,
@@ -195,13 +208,14 @@ def process_unit(prepared: Prepared, number: int, block_size: int | None = None)
 
 
 @functools.lru_cache(maxsize=4)
-def _unpack(blob: bytes) -> Prepared:
+def unpack(blob: bytes) -> Any:
+    """What was pickled, unpickled once per process for the strips that are under way."""
     return pickle.loads(blob)
 
 
 def process_packed_unit(blob: bytes, number: int, block_size: int | None) -> tuple[np.ndarray, RunReport]:
     """`process_unit` of a pickled Prepared, which is unpickled once per process and strip."""
-    return process_unit(_unpack(blob), number, block_size)
+    return process_unit(unpack(blob), number, block_size)
 
 
 def _block_size(unit: Unit) -> int:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wavebatch.blocks import COLUMNS
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.carry import Carried, PacketSource, find_packets, plan_carried
 from wavebatch.io.convert import choose_format, copy_standard
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.header import LasHeader, find_evlrs, has_record, read_header
-from wavebatch.io.names import WrittenColumn, name_columns
+from wavebatch.io.names import Naming, WrittenColumn, describe, name_columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +54,15 @@ class OutputLayout:
     def extra_fields(self) -> tuple[str, ...]:
         """Names of the fields of `dtype` that hold the extra bytes, in their order."""
         return self.dtype.names[len(self.dtype.names) - len(self.carried) - len(self.written) :]
+
+    def extended(self, columns: Sequence[str]) -> OutputLayout:
+        """The layout with columns that never leave the program behind: for rows that are still on their way."""
+        more = []
+        for name in columns:
+            column = COLUMNS[name]
+            more.append(WrittenColumn(name, ExtraRecord.build(name, column.dtype, describe(column)), Naming(name)))
+        dtype = build_dtype(self.point_format, [*self.extra_records, *(column.record for column in more)])
+        return replace(self, dtype=dtype, written=(*self.written, *more))
 
     def rows(
         self,

@@ -118,8 +118,8 @@ def _reported() -> Iterator[None]:
     except OSError as error:
         folder = tempfile.gettempdir()
         raise InputError(
-            f"{folder}: the temporary file for packets shared over the whole strip cannot be used "
-            f"({error.strerror or error}); free space there or set TMPDIR to another folder"
+            f"{folder}: the temporary file for what does not fit memory cannot be used ({error.strerror or error}); "
+            "free space there or set TMPDIR to another folder"
         ) from error
 
 

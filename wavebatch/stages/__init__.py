@@ -11,6 +11,7 @@ from wavebatch.stages import (
     detect_edges,
     detect_wavelet,
     noise,
+    normals,
     physics,
 )
 
@@ -25,5 +26,6 @@ __all__ = [
     "detect_edges",
     "detect_wavelet",
     "noise",
+    "normals",
     "physics",
 ]

@@ -1,0 +1,205 @@
+"""Robust planes, neighbourhoods and tiles: against slow twins, known surfaces, and whatever points there may be."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from wavebatch.kernels import normals
+from wavebatch.kernels.normals import MOST_PER_CELL, Gap, Surroundings, measure_normals, thin_out
+from wavebatch.kernels.planes import (
+    LEAST_SPREAD,
+    OUTLYING,
+    SMOOTH,
+    TIGHT,
+    fit_normal,
+    fit_planes,
+    is_flat,
+    measure_angles,
+)
+from wavebatch.kernels.tiles import cut_tiles, is_inside, sort_into_tiles
+from wavebatch.units import MAD_TO_STD
+
+SETTINGS = {"radius": 1.5, "min_points": 8, "max_error": 5.0}
+
+
+def slope(rng, n, degrees, noise=0.02, side=1.5):
+    """Points of a plane that rises towards the east, around 0."""
+    xyz = rng.uniform(-side, side, (n, 3))
+    xyz[:, 2] = np.tan(np.radians(degrees)) * xyz[:, 0] + noise * rng.standard_normal(n)
+    return xyz
+
+
+def naive_plane(xyz):
+    """fit_planes of one set: points that count, by a loop with singular values and sorted distances."""
+    kept = np.ones(len(xyz), bool)
+    for number in range(8):
+        centre = xyz[kept].mean(axis=0)
+        _, singular, axes = np.linalg.svd(xyz[kept] - centre, full_matrices=False)
+        variance = singular**2 / kept.sum()
+        off = np.abs((xyz - centre) @ axes[2])
+        middle = max(sorted(off)[len(off) // 2], LEAST_SPREAD)
+        tight = number < 3 and variance[2] > SMOOTH * variance[1]
+        factor = TIGHT if tight else OUTLYING * MAD_TO_STD * (1 + 5 / max(len(xyz) - 3, 1))
+        near = off <= factor * middle
+        if (near == kept).all() and not tight:
+            break
+        kept = near
+    centre = xyz[kept].mean(axis=0)
+    _, singular, axes = np.linalg.svd(xyz[kept] - centre, full_matrices=False)
+    return kept.sum(), axes[2], np.sort(singular**2 / kept.sum())
+
+
+def test_many_planes_at_once_are_those_of_a_loop(rng):
+    sets = [slope(rng, rng.integers(8, 60), rng.uniform(0, 70)) for _ in range(150)]
+    for xyz in sets[::2]:
+        xyz[: len(xyz) // 4, 2] += rng.uniform(0.5, 2)
+    sets += [rng.uniform(-1, 1, (30, 3)) for _ in range(20)]
+    group = np.repeat(np.arange(len(sets)), [len(xyz) for xyz in sets])
+    planes = fit_planes(np.concatenate(sets), group, len(sets))
+    for number, xyz in enumerate(sets):
+        kept, normal, spreads = naive_plane(xyz)
+        assert planes.kept[number] == kept
+        assert abs(planes.normal[number] @ normal) == pytest.approx(1, abs=1e-9)
+        assert planes.spreads[number] == pytest.approx(spreads, rel=1e-6, abs=1e-12)
+
+
+def test_a_plane_does_not_depend_on_the_others(rng):
+    sets = [slope(rng, 20, 30) for _ in range(40)]
+    group = np.repeat(np.arange(40), 20)
+    whole = fit_planes(np.concatenate(sets), group, 40)
+    for number in (0, 7, 39):
+        alone = fit_planes(sets[number], group[:20], 1)
+        for a, b in zip(whole, alone, strict=True):
+            np.testing.assert_array_equal(a[number], b[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_quarter_of_outliers_is_left_out_or_leaves_no_plane(seed):
+    rng = np.random.default_rng(seed)
+    n, k = 400, 40
+    xyz = np.stack([slope(rng, k, 25) for _ in range(n)])
+    xyz[:, : k // 4, 2] += 1.5
+    planes = fit_planes(xyz.reshape(-1, 3), np.repeat(np.arange(n), k), n)
+    angle, _ = measure_angles(planes, np.tile([0, 0, -1.0], (n, 1)))
+    assert is_flat(planes.spreads).mean() > 0.6
+    wrong = np.abs(np.degrees(angle) - 25) > 3
+    assert wrong[is_flat(planes.spreads)].mean() < 0.01
+
+
+@pytest.mark.parametrize("degrees", [0, 1, 10, 60])
+@pytest.mark.parametrize("seed", range(2))
+def test_errors_are_what_they_say(degrees, seed):
+    rng = np.random.default_rng(seed)
+    n, k = 1500, 30
+    xyz = np.concatenate([slope(rng, k, degrees, noise=0.05) for _ in range(n)])
+    planes = fit_planes(xyz, np.repeat(np.arange(n), k), n)
+    angle, error = measure_angles(planes, np.tile([0, 0, -1.0], (n, 1)))
+    off = np.degrees(angle) - degrees
+    assert 0.58 < (np.abs(off) <= np.degrees(error)).mean() < 0.80
+    assert abs(np.median(off)) < 0.3 or degrees < 2
+
+
+def test_angles_are_folded_and_of_the_ray():
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.3, 0]])
+    planes = fit_planes(np.tile(flat, (4, 1)), np.repeat(np.arange(4), 5), 4)
+    rays = np.array([[0, 0, -1], [0, 0, 1], [0.6, 0, -0.8], [0, -1, 0.0]])
+    angle, error = measure_angles(planes, rays)
+    assert np.degrees(angle) == pytest.approx([0, 0, np.degrees(np.arcsin(0.6)), 90], abs=1e-6)
+    assert (error > 0).all() and (error < 0.01).all()
+
+
+def test_points_in_line_have_no_certain_angle():
+    line = np.outer(np.linspace(-1, 1, 12), [1, 0.3, 0.1])
+    _, error = measure_angles(fit_planes(line, np.zeros(12, int), 1), np.array([[0, 0, -1.0]]))
+    assert error[0] > 1
+
+
+def test_one_normal(rng):
+    normal = fit_normal(slope(rng, 500, 20) + [5e5, 5e6, 100])
+    assert np.degrees(np.arccos(abs(normal[2]))) == pytest.approx(20, abs=0.3)
+
+
+def test_neighbours_are_those_of_a_loop(rng):
+    around, points = rng.uniform(0, 5, (400, 3)).round(1), rng.uniform(0, 5, (70, 3)).round(1)
+    point, offset = Surroundings(around).find(points, 1.0)
+    expected = []
+    for number, place in enumerate(points):
+        expected += [(number, *step) for step in around - place if (step * step).sum() <= 1.0]
+    np.testing.assert_array_equal(np.column_stack([point, offset]), np.array(expected))
+
+
+def test_reasons():
+    rng = np.random.default_rng(5)
+    flat = np.column_stack([rng.uniform(0, 20, (1500, 2)), 0.01 * rng.standard_normal(1500)])
+    plants = rng.uniform(0, 6, (600, 3)) + [0, 40, 0]
+    sweep = np.column_stack([np.full(300, 60.0), rng.uniform(0, 10, 300), rng.uniform(0, 10, 300)])
+    line = np.column_stack([np.linspace(0, 10, 100), np.full(100, 80.0), np.zeros(100)])
+    above, lonely = [[10, 10, 0.8]], [[100, 100, 0]]
+    parts = [flat, plants, sweep, line, above, lonely, [[np.nan, 0, 0]], flat[:2]]
+    points = np.concatenate(parts)
+    ray = np.tile([0, 0.2, -1.0], (len(points), 1))
+    ray[-2:] = [[0, 0, 0], [np.nan, 0, 1]]
+    around = Surroundings(points[np.isfinite(points).all(axis=1)])
+    (angle, error), gap = measure_normals(points, ray, around, **SETTINGS)
+    gaps = np.split(gap, np.cumsum([len(part) for part in parts])[:-1])
+    assert (gaps[0] == Gap.KNOWN).mean() > 0.95
+    assert (gaps[1] == Gap.NO_PLANE).mean() > 0.95
+    assert (gaps[2] == Gap.TOO_STEEP).mean() > 0.9
+    assert (gaps[3] == Gap.UNCERTAIN).mean() > 0.9
+    assert gaps[4] == Gap.NO_PLANE and gaps[5] == Gap.FEW_NEIGHBOURS and gaps[6] == Gap.NO_RAY
+    assert (gaps[7] == Gap.NO_RAY).all()
+    np.testing.assert_array_equal(np.isnan(angle), gap != Gap.KNOWN)
+    np.testing.assert_array_equal(np.isnan(error), gap != Gap.KNOWN)
+    assert angle.dtype == error.dtype == np.float32
+    assert np.nanmedian(angle) == pytest.approx(np.degrees(np.arctan(0.2)), abs=0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_points_and_one(count):
+    points = np.zeros((count, 3))
+    (angle, _), gap = measure_normals(points, np.ones((count, 3)), Surroundings(points), **SETTINGS)
+    assert len(angle) == count and (gap == Gap.FEW_NEIGHBOURS).all()
+
+
+def test_a_point_does_not_depend_on_what_is_asked_with_it(rng, monkeypatch):
+    points = np.column_stack([rng.uniform(0, 30, (3000, 2)), rng.normal(0, 0.05, 3000)]).round(2)
+    ray = rng.normal(0, 0.2, (3000, 3)) - [0, 0, 1]
+    around = Surroundings(points)
+    (angle, error), gap = measure_normals(points, ray, around, **SETTINGS)
+    monkeypatch.setattr(normals, "PAIRS", 1000)
+    some = rng.permutation(3000)[:500]
+    (again, error_again), gap_again = measure_normals(points[some], ray[some], around, **SETTINGS)
+    np.testing.assert_array_equal(again, angle[some])
+    np.testing.assert_array_equal(error_again, error[some])
+    np.testing.assert_array_equal(gap_again, gap[some])
+
+
+def test_dense_points_are_thinned_alike_whatever_else_is_there(rng):
+    xyz, row = rng.uniform(0, 4, (20_000, 3)), np.arange(20_000)
+    kept = thin_out(xyz, row, 1.0)
+    cells, number = np.unique(np.floor(xyz[kept] / 0.25), axis=0, return_counts=True)
+    assert number.max() == MOST_PER_CELL and len(cells) == len(np.unique(np.floor(xyz / 0.25), axis=0))
+    part = np.flatnonzero(xyz[:, 0] < 2.0)
+    np.testing.assert_array_equal(thin_out(xyz[part], row[part], 1.0), kept[part])
+    assert thin_out(xyz[:200], row[:200], 0.1).all()
+
+
+def test_every_point_lies_in_one_tile_and_its_neighbours_are_listed(rng):
+    xyz = np.concatenate([rng.uniform(0, 100, (4000, 3)), rng.normal(50, 0.5, (2000, 3)), [[1e7, -1e7, 0]]])
+    xyz[:500, 0] = 10.0
+    tiles = cut_tiles(xyz[::2], 60, 8.0)
+    inside = np.array([is_inside(tiles, number, xyz) for number in range(len(tiles))])
+    assert len(tiles) > 20
+    np.testing.assert_array_equal(inside.sum(axis=0), 1)
+    rows, numbers = sort_into_tiles(tiles, xyz, 1.0)
+    assert len(rows) < 8 * len(xyz)
+    pairs = cKDTree(xyz).query_pairs(1.0, output_type="ndarray")
+    listed = set(zip(numbers.tolist(), rows.tolist(), strict=True))
+    own = inside.argmax(axis=0)
+    assert all((own[i], j) in listed and (own[j], i) in listed for i, j in pairs.tolist())
+
+
+def test_points_that_cannot_be_cut_apart_are_one_tile():
+    assert len(cut_tiles(np.zeros((1000, 3)), 10, 0.0)) == 1
+    assert len(cut_tiles(np.empty((0, 3)), 10, 1.0)) == 1
+    assert len(cut_tiles(np.repeat([[0, 0, 0], [0, 0, 9.0]], [1000, 1], axis=0), 10, 0.0)) == 2

@@ -1,0 +1,143 @@
+"""Angles between rays and the surface that the points around say there is, for many points at once."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from wavebatch.kernels.incidence import STEEPEST
+from wavebatch.kernels.planes import fit_planes, is_flat, measure_angles
+
+PAIRS = 500_000
+"""Neighbours that are worked on at a time, about: 100 bytes each."""
+
+FINENESS = 4.0
+"""Radius of a neighbourhood by the side of the cells in which dense points are thinned out."""
+
+MOST_PER_CELL = 4
+"""Points of a cell that count as neighbours: a surface has at most 200, however dense the points are."""
+
+LEAST_KEPT = 0.6
+"""Least share of the neighbours that lies in the plane."""
+
+_LARGEST_CHUNK = 4096
+
+
+class Gap(IntEnum):
+    """Why a point has no angle, or that it has one."""
+
+    NO_RAY = 0
+    """No waveform, no echo, or a direction that is none."""
+    KNOWN = 1
+    FEW_NEIGHBOURS = 2
+    NO_PLANE = 3
+    TOO_STEEP = 4
+    UNCERTAIN = 5
+
+
+def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
+    """Which points count as neighbours within `radius` [m] of others, bool (n,): at most MOST_PER_CELL in each cell.
+
+    xyz: (n, 3) [m]; row: their places in the file, i8 (n,), which decide as if by lot. A cell whose points are all
+    there keeps the same ones, whatever else is there; cells that hold few keep all.
+    """
+    side = radius / FINENESS
+    cell = [np.floor(xyz[:, axis] / side) for axis in range(3)]
+    lot = row.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    order = np.lexsort((lot, *cell))
+    new = np.ones(len(order), bool)
+    new[1:] = False
+    for values in cell:
+        new[1:] |= values[order[1:]] != values[order[:-1]]
+    start = np.flatnonzero(new)
+    rank = np.arange(len(order)) - np.repeat(start, np.diff(np.append(start, len(order))))
+    kept = np.zeros(len(order), bool)
+    kept[order[rank < MOST_PER_CELL]] = True
+    return kept
+
+
+class Surroundings:
+    """Points (m, 3) [m], finite, that others are neighbours of; their order decides in which order sums run."""
+
+    def __init__(self, xyz: np.ndarray) -> None:
+        self._xyz = np.ascontiguousarray(xyz, np.float64)
+        self._tree = cKDTree(self._xyz, balanced_tree=False, compact_nodes=False)
+
+    def find(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs (point, neighbour) at most `radius` apart, sorted: numbers of points (k,), and offsets [m] (k, 3)."""
+        if not len(points) or not len(self._xyz):
+            return np.empty(0, np.int64), np.empty((0, 3))
+        # The tree rounds distances as its own boxes make it; the exact test below is the same in every tree.
+        near = cKDTree(points).sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
+        key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])
+        point, neighbour = np.divmod(key, len(self._xyz))
+        offset = self._xyz[neighbour] - points[point]
+        x, y, z = offset.T
+        within = x * x + y * y + z * z <= radius * radius
+        return point[within], offset[within]
+
+
+def measure_normals(
+    points: np.ndarray,
+    ray: np.ndarray,
+    around: Surroundings,
+    *,
+    radius: float,
+    min_points: int,
+    max_error: float,
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Angle between ray and surface normal, and its standard deviation, f4 (n,) [deg]; and what became of each point.
+
+    points: f8 (n, 3) [m]; ray: directions of any length, (n, 3). The surface is the robust plane through the neighbours
+    within `radius` [m]. NaN where the second result, a Gap u1 (n,), is not KNOWN: fewer than min_points neighbours; no
+    plane (less than 60 % of them in it, thicker than a fifth of its width, or the point itself not in it); a plane that
+    the ray all but lies in (plants struck by one sweep of the scanner are such a plane, and no surface); or the angle
+    more uncertain than max_error [deg].
+    """
+    angle, error = np.full((2, len(points)), np.nan, np.float32)
+    gap = np.full(len(points), Gap.NO_RAY, np.uint8)
+    unit = _normalise(ray)
+    able = _by_place(points, np.isfinite(unit).all(axis=1) & np.isfinite(points).all(axis=1), 8 * radius)
+    at, size = 0, 512
+    while at < len(able):
+        rows = able[at : at + size]
+        at += len(rows)
+        point, offset = around.find(points[rows], radius)
+        angles, errors, gap[rows] = _judge(offset, point, unit[rows], min_points, np.radians(max_error))
+        angle[rows], error[rows] = np.degrees(angles), np.degrees(errors)
+        size = int(np.clip(PAIRS * len(rows) // max(len(point), 1), 64, _LARGEST_CHUNK))
+    return (angle, error), gap
+
+
+def _by_place(points: np.ndarray, wanted: np.ndarray, side: float) -> np.ndarray:
+    """The wanted points cell by cell: those that are looked up together should lie together."""
+    rows = np.flatnonzero(wanted)
+    return rows[np.lexsort(tuple(np.floor(points[rows, axis] / side) for axis in (2, 1, 0)))]
+
+
+def _normalise(ray: np.ndarray) -> np.ndarray:
+    """Unit vectors, NaN where there is no direction."""
+    x, y, z = np.ascontiguousarray(ray.T, np.float64)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        length = np.sqrt(x * x + y * y + z * z)
+        return np.stack([x / length, y / length, z / length], axis=1)
+
+
+def _judge(
+    offset: np.ndarray, point: np.ndarray, unit: np.ndarray, min_points: int, max_error: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angles and errors [rad] of some points from their neighbours, NaN where the Gap is not KNOWN."""
+    n = len(unit)
+    count = np.bincount(point, minlength=n)
+    planes = fit_planes(offset, point, n)
+    angle, error = measure_angles(planes, unit)
+    surface = is_flat(planes.spreads) & (planes.kept >= LEAST_KEPT * count) & (planes.kept >= min_points)
+    surface &= planes.offset() <= planes.limit
+    gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
+    gap = np.where(angle > STEEPEST, Gap.TOO_STEEP, gap)
+    gap = np.where(surface, gap, Gap.NO_PLANE)
+    gap = np.where(count < min_points, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
+    known = gap == Gap.KNOWN
+    return np.where(known, angle, np.nan), np.where(known, error, np.nan), gap

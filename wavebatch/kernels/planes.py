@@ -1,0 +1,185 @@
+"""Robust planes through many sets of points at once, and the angle at which rays meet them.
+
+A set is a run of rows that have the same `group`. Sums run over a set's rows in their order and over nothing else, so
+that a plane does not depend on which other sets are fitted with it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.units import MAD_TO_STD
+
+OUTLYING = 4.0
+"""Points further from the plane than this many robust standard deviations do not count."""
+
+LEAST_SPREAD = 1e-3
+"""Points lie no nearer to a plane than this [m], median or standard deviation: coordinates are rounded."""
+
+FLAT = 0.04
+"""Largest variance across a plane by the lesser one within it: beyond this, points are no surface."""
+
+SMOOTH = 0.0025
+"""The same ratio for sets that may be more than one surface, and are looked at more closely."""
+
+TIGHT = 1.5
+"""While a set is not smooth, points further off than this many medians are left out: two surfaces (a ridge), or one and
+its plants, pull a plane through all their points so far off that none of these is an outlier."""
+
+FOLDED = 1.515
+"""Standard deviations of two tilts within which 68.3 % of all angles lie whose true value is 0."""
+
+_TIGHT_ROUNDS = 3
+_ROUNDS = 8
+_PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class Planes(NamedTuple):
+    """A plane per set of points."""
+
+    axes: np.ndarray
+    """Unit vectors as columns: normal, shorter and longer direction within the plane, f8 (n, 3, 3)."""
+    spreads: np.ndarray
+    """Variance of the points that count along these axes [m2], ascending, f8 (n, 3)."""
+    centre: np.ndarray
+    """Mean of the points that count [m], f8 (n, 3)."""
+    kept: np.ndarray
+    """Points that count, i8 (n,)."""
+    limit: np.ndarray
+    """Distance from the plane beyond which points do not count [m], f8 (n,)."""
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Unit normals, either way up, f8 (n, 3)."""
+        return self.axes[:, :, 0]
+
+    def offset(self) -> np.ndarray:
+        """Distance between plane and the origin of each set's coordinates [m], f8 (n,)."""
+        return np.abs(_dot(self.centre, self.normal))
+
+
+def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
+    """Planes through n sets of points by least squares; what lies four robust standard deviations off is left out.
+
+    xyz: f8 (k, 3) [m], relative to somewhere in their set. group: number of the set, ascending, i8 (k,).
+    Points are left out, and the plane fitted anew, until nothing changes or eight times; in the first three rounds of
+    sets that are not smooth only the nearer points count (see TIGHT). A set without three points that are not in line
+    has any plane: its spreads say so. Source: trimmed least squares with concentration steps (Rousseeuw).
+    """
+    count = np.bincount(group, minlength=n)
+    x = np.ascontiguousarray(xyz.T)
+    whole = _sum_moments(x, group, n)
+    kept = np.ones(len(group), bool)
+    centre, spreads, axes = _solve(whole)
+    limit = np.full(n, np.inf)
+    active = np.flatnonzero(count > 0)
+    for number in range(_ROUNDS):
+        if not len(active):
+            break
+        rows, local = _rows_of(active, count)
+        at = group[rows]
+        off = (x[0][rows] - centre[at, 0]) * axes[at, 0, 0]
+        off += (x[1][rows] - centre[at, 1]) * axes[at, 1, 0]
+        off += (x[2][rows] - centre[at, 2]) * axes[at, 2, 0]
+        off = np.abs(off)
+        tight = (number < _TIGHT_ROUNDS) & (spreads[active, 0] > SMOOTH * spreads[active, 1])
+        factor = np.where(tight, TIGHT, OUTLYING * MAD_TO_STD * _spread_lost(count[active]))
+        limit[active] = factor * np.maximum(_medians(off, local, count[active]), LEAST_SPREAD)
+        near = off <= limit[at]
+        changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
+        kept[rows] = near
+        # What is left out is little: taking it off costs less than adding up all the rest.
+        out = np.flatnonzero(changed[local] & ~near)
+        left_out = _sum_moments(x[:, rows[out]], local[out], len(active))
+        active, moved = active[changed | tight], active[changed]
+        if len(moved):
+            rest = [total[moved] - part[changed] for total, part in zip(whole, left_out, strict=True)]
+            centre[moved], spreads[moved], axes[moved] = _solve(rest)
+    left = np.bincount(group, kept, minlength=n).astype(np.int64)
+    return Planes(axes, spreads, centre, left, limit)
+
+
+def is_flat(spreads: np.ndarray) -> np.ndarray:
+    """Whether points with these variances along their axes (n, 3) lie in a plane, bool (n,)."""
+    return spreads[:, 0] <= FLAT * spreads[:, 1]
+
+
+def fit_normal(xyz: np.ndarray) -> np.ndarray:
+    """Unit normal of the robust plane through points (k, 3), k > 0."""
+    return fit_planes(xyz - xyz.mean(axis=0), np.zeros(len(xyz), np.int64), 1).normal[0]
+
+
+def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Angle between rays and planes' normals, 0 to pi/2 [rad], and its standard deviation, f8 (n,).
+
+    ray: unit vectors, f8 (n, 3). The error follows from how uncertain the plane's two tilts are: points scatter about
+    it by s, so that a tilt along an axis with spread l has s / sqrt(k l). It is infinite where the points are in line.
+    Three points have no scatter to judge by; the least one is assumed. Angles that may be 0 have an error that reaches
+    there: an angle is never negative, so that 0 is found as 1.25 standard deviations of a tilt.
+    """
+    facing, short, long = (_dot(ray, planes.axes[:, :, axis]) for axis in range(3))
+    sine = np.hypot(short, long)
+    angle = np.arctan2(sine, np.abs(facing))
+    kept = planes.kept.astype(np.float64)
+    flat, low, high = (np.ascontiguousarray(planes.spreads[:, axis]) for axis in range(3))
+    scatter = np.maximum(flat, 0.0) * kept / np.maximum(kept - 3.0, 1.0) + LEAST_SPREAD**2
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        tilts = [scatter / (kept * np.maximum(spread, 0.0)) for spread in (low, high)]
+        # A ray along the normal sees both tilts alike, one far off it only the tilt in its own direction.
+        blur = np.minimum(0.5 * (tilts[0] + tilts[1]), 1.0)
+        weights = [part * part + blur for part in (short, long)]
+        variance = (weights[0] * tilts[0] + weights[1] * tilts[1]) / (weights[0] + weights[1])
+        error = np.sqrt(np.where(np.isnan(variance), np.inf, variance))
+        return angle, np.where(angle < FOLDED * error, np.maximum(angle, error), error)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+
+
+def _sum_moments(x: np.ndarray, group: np.ndarray, n: int) -> list[np.ndarray]:
+    """Number, sums (three) and sums of products (six) of each set, f8 (n,) each."""
+    sums = [np.bincount(group, minlength=n).astype(np.float64)]
+    sums += [np.bincount(group, x[axis], minlength=n) for axis in range(3)]
+    return sums + [np.bincount(group, x[a] * x[b], minlength=n) for a, b in _PRODUCTS]
+
+
+def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centre, spreads and axes of sets by their moments."""
+    number = np.maximum(moments[0], 1.0)
+    centre = np.stack([total / number for total in moments[1:4]], axis=1)
+    covariance = np.empty((len(number), 3, 3))
+    for (a, b), total in zip(_PRODUCTS, moments[4:], strict=True):
+        covariance[:, a, b] = covariance[:, b, a] = total / number - centre[:, a] * centre[:, b]
+    spreads, axes = np.linalg.eigh(covariance)
+    return centre, spreads, axes
+
+
+def _spread_lost(count: np.ndarray) -> np.ndarray:
+    """By how much the median distance from a plane fitted to few points is too small (Rousseeuw and Leroy 1987)."""
+    return 1.0 + 5.0 / np.maximum(count - 3, 1)
+
+
+def _rows_of(sets: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the points of some sets (ascending), and to which of these each belongs."""
+    start = np.cumsum(count) - count
+    number = count[sets]
+    local = np.repeat(np.arange(len(sets)), number)
+    begin = np.cumsum(number) - number
+    return np.arange(len(local)) + (start[sets] - begin)[local], local
+
+
+def _medians(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Upper median of each set; every set has a value.
+
+    Rows of a table, filled up with as many values below all others as above: the middle is in one place for all.
+    """
+    width = int(count.max())
+    start = np.cumsum(count) - count
+    below = width // 2 - count // 2
+    table = np.full((len(count), width), np.inf)
+    table[np.arange(width) < below[:, None]] = -np.inf
+    table[group, np.arange(len(values)) - start[group] + below[group]] = values
+    return np.partition(table, width // 2, axis=1)[:, width // 2]

@@ -1,0 +1,52 @@
+"""Angle between ray and surface from the points around an echo: what angles from widths are to be compared with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.blocks import RAY, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.chain import stage
+from wavebatch.errors import ConfigError
+from wavebatch.kernels.normals import measure_normals
+
+
+@stage(
+    "attribute",
+    makes=("incidence_angle_normals", "incidence_angle_normals_err", *RAY),
+    needs=("x", "y", "z"),
+    second_pass=measure_normals,
+)
+def incidence_angle_normals(
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    radius: float = 1.5,
+    min_points: int = 8,
+    max_error: float = 5.0,
+) -> EchoTable:
+    """Angle between the packet's ray and the normal of the plane of the points around each echo [deg]; its error.
+
+    `run` fills it in a second pass, when all points of the strip are there; the echoes of a block alone have no-data.
+    The plane is fitted to all points within the radius that are not outliers. No-data where there are fewer than
+    min_points, where they are no plane (plants, ridges: less than 60 % of them in it, thicker than a fifth of its
+    width, or the echo not in it), where the angle is beyond 80 degrees (plants struck by one sweep of the scanner make
+    a plane that its rays lie in), and where it is more uncertain than max_error. It needs neither sensor nor
+    divergence. Source: the comparison of Rhomberg-Kauert et al. 2024, Fig. 6; ALGORITHMS 1.4.
+
+    radius: of the neighbourhood [m], in all directions; three times the distance between points is a good start.
+
+    min_points: least number of points in the neighbourhood, and in the plane.
+
+    max_error: largest standard deviation of an angle that is written [deg].
+    """
+    if not 1e-3 <= radius <= 1e3 or min_points < 4 or not max_error > 0:
+        raise ConfigError("radius must lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")
+    x, y, z = block.direction.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        length = np.sqrt(x * x + y * y + z * z)
+        unit = [(part / length).astype(np.float32) for part in (x, y, z)]
+    none = np.full(len(echoes), np.nan, np.float32)
+    rays = {name: part[echoes.waveform] for name, part in zip(RAY, unit, strict=True)}
+    return echoes.with_attributes(incidence_angle_normals=none, incidence_angle_normals_err=none, **rays)
