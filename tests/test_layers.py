@@ -15,7 +15,7 @@ RANKS = [
     {"stages", "assemble"},
     {"config", "measuring", "survey", "systemfile", "inspection", "simulate", "evaluate", "differences", "breakdown",
      "comparison", "compare", "goodness", "areas", "polygons", "returns", "slices", "synthesize"},
-    {"angles", "auto", "trial", "choice", "sensor", "calibration", "matchup", "plots"},
+    {"angles", "levels", "outlook", "auto", "trial", "choice", "sensor", "calibration", "matchup", "plots"},
     {"work", "targets", "voxels"},
     {"record", "remarks", "secondpass"},
     {"task", "workers"},

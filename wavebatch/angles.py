@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from wavebatch.blocks import SystemPulse
+from wavebatch.chain import Chain
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.incidence import angles_of_variance, spread_of_angle
 from wavebatch.stages.angle import LEAST_WIDTH
@@ -35,6 +37,12 @@ class AngleOutlook:
         return self.error <= self.max_error
 
 
+def angle_parameters(chain: Chain) -> dict[str, Any] | None:
+    """Parameters with which a chain takes angles from widths; None where it takes none."""
+    steps = [step for step in chain.steps if step.stage.name == "attribute.incidence_angle"]
+    return steps[-1].effective() if steps else None
+
+
 def predict_angles(
     system: SystemPulse, spacing: float, distance: float, divergence: float, amplitude: float, max_error: float = 10.0
 ) -> AngleOutlook:
@@ -42,13 +50,15 @@ def predict_angles(
 
     spacing: between samples [ns]; max_error [deg]. Errors are those of the Cramer-Rao bound, in the system's noise.
     """
-    own, width = system.sigma_ref, system.sigma_ref / spacing
+    width = system.sigma_ref / spacing
+    own = float(np.sqrt(max(system.sigma_ref**2 + system.level_variance, 1e-12)))
     if width < LEAST_WIDTH:
         reason = f"the system pulse is {width:.2f} samples wide, {LEAST_WIDTH} are needed for widths to mean a slope"
         return AngleOutlook(np.inf, max_error, reason)
     added = float(spread_of_angle(np.radians(SLOPE), distance, 1e-3 * divergence))
     sigma = float(np.hypot(own, added))
-    width_err = float(bound_time(amplitude, sigma, system.noise_std, spacing))
+    bound = float(bound_time(max(amplitude, 1e-3), sigma, system.noise_std, spacing))
+    width_err = float(np.hypot(bound, system.width_scatter))
     variance_err = 2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR)
     values = (np.array([value]) for value in (added * added, variance_err, distance))
     error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))

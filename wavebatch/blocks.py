@@ -267,6 +267,10 @@ class SystemPulse:
     """Count at which the survey saw samples clipped; None: only the digitizer's largest count is."""
     acceptance: float = 15.0
     """Least fall of chi2 for which an echo is added."""
+    level_variance: float = 0.0
+    """Of level ground's echoes seen from above, less the system pulse's [ns2]; not positive: surveys see slopes too."""
+    width_scatter: float = 0.0
+    """Scatter of echo widths of one and the same surface beyond what fits say [ns]: what no model of the pulse tells."""
     divergence: float | None = None
     """Full angle of the beam between the 1/e^2 points [mrad]; None where nobody knows it."""
     calibration: float | None = None

@@ -73,9 +73,13 @@ def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = No
 
     The same ones every time. waveforms: how many to read; without it as many as a survey looks at.
     """
+    return survey.join_largest(reader.sample_blocks(scan, waveforms or sample_size(reader)))
+
+
+def sample_size(reader: StripReader) -> int:
+    """Waveforms of a strip that a survey looks at."""
     longest = max((digitizer.n_samples for digitizer in reader.facts.digitizers.values()), default=0)
-    most = int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, survey.SAMPLE))
-    return survey.join_largest(reader.sample_blocks(scan, waveforms or most))
+    return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, survey.SAMPLE))
 
 
 def survey_sample(block: WaveformBlock | None) -> Survey:

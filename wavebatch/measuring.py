@@ -116,7 +116,7 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
         widths = widths[free]
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
-    return float(np.clip(_mode_of_narrow(widths), 0.5, 50.0))
+    return float(np.clip(find_mode(widths), 0.5, 50.0))
 
 
 def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -131,7 +131,7 @@ def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
     return order[first], second[waveform[first]]
 
 
-def _mode_of_narrow(widths: np.ndarray) -> float:
+def find_mode(widths: np.ndarray) -> float:
     """Width of the system pulse: centre of the shortest interval that holds a third of the widths.
 
     Flat targets give the system width again and again, slopes and vegetation scatter above it; a mode is not moved by
@@ -172,7 +172,7 @@ def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     echoes = echoes.take(np.flatnonzero(good))
-    distance = np.abs(echoes.sigma - _mode_of_narrow(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
+    distance = np.abs(echoes.sigma - find_mode(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
     order = np.argsort(distance, kind="stable")[: max(len(echoes) // 2, ENOUGH_TO_LEARN)]
     return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from wavebatch.angles import AngleOutlook, predict_angles
+from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.nodata import REASONS, NoData
 from wavebatch.report import AMPLITUDE_BINS, RunReport
 from wavebatch.work import Prepared
@@ -34,16 +32,11 @@ def _explain(prepared: Prepared, report: RunReport, column: str, counts: dict[st
 
 def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:
     """What the strip's widths are worth; None where distance or divergence is not known."""
-    parameters = _parameters(prepared)
-    divergence = parameters["divergence"] or prepared.system.divergence
+    parameters = angle_parameters(prepared.job.chain) or {}
+    divergence = parameters.get("divergence") or prepared.system.divergence
     distance = prepared.sensor.describe().get("distance_m")
     amplitude = AMPLITUDE_BINS.quantile(report.amplitude, 0.5)
     spacing = prepared.choice.survey.figures.get("spacing_ns")
     if not (divergence and distance and amplitude and spacing):
         return None
     return predict_angles(prepared.system, spacing, distance, divergence, amplitude, parameters["max_error"])
-
-
-def _parameters(prepared: Prepared) -> dict[str, Any]:
-    steps = [step for step in prepared.job.chain.steps if _ANGLE in step.stage.makes]
-    return steps[-1].effective()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,12 @@ from wavebatch.measuring import (
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
+
+
+_UNCLEAN = (
+    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
+    | EchoFlag.AT_BOUND
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +101,25 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
         system = measure_residuals(part, system, decompose_sample(part, system))
         system = choose_acceptance(block, system, main)
     echoes = decompose_sample(block, system)
+    system = replace(system, width_scatter=_measure_scatter(block, system, echoes))
     figures.update(_describe(block, system, echoes))
     return Survey(system, len(block), figures, _decide(system, block.spacing, figures))
+
+
+def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
+    """Scatter of the widths of clear echoes of one and the same width beyond the errors of their fits [ns].
+
+    From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
+    """
+    clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    clear &= (echoes.flags & np.uint16(_UNCLEAN)) == 0
+    below = clear & (echoes.sigma < system.sigma_ref)
+    if np.count_nonzero(below) < ENOUGH_TO_LEARN:
+        return 0.0
+    lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
+    # Medians of squares: 0.455 is that of a squared standard normal number.
+    excess = np.median(lack**2) / 0.455 - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
+    return float(np.sqrt(max(excess, 0.0)))
 
 
 def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> dict[str, float]:
@@ -120,6 +143,7 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
         "single_share": float((number == 1).mean()),
         "overlapped_share": float(overlapped.mean()),
         "echoes_per_waveform": float(number.mean()),
+        "amplitude_50": float(np.median(echoes.amplitude)) if len(echoes) else 0.0,
         "amplitude_99": float(np.quantile(echoes.amplitude, 0.99)) if len(echoes) else 0.0,
         "saturated_share": saturated,
         "system_width_share": float((np.abs(deviation[narrow]) < 3).mean()) if narrow.any() else 0.0,

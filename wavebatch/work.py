@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.angles import angle_parameters
 from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.auto import without_columns
 from wavebatch.blocks import COLUMNS, RAY, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.chain import STAGES, Chain, Step
-from wavebatch.choice import Choice, Request, make_choice
+from wavebatch.choice import Choice, Request, make_choice, sample_size
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
+from wavebatch.levels import measure_level
 from wavebatch.report import RunReport
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
 from wavebatch.words import nearest
@@ -172,6 +174,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
             surveyed = time.perf_counter()
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else NOBODY
+            choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
@@ -179,6 +182,20 @@ def prepare_strip(job: StripJob) -> Prepared:
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
     return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor)
+
+
+def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
+    """The choice with the widths of level ground, where angles are taken and no saved survey says them."""
+    parameters = angle_parameters(job.chain)
+    if parameters is None or sensor is NOBODY or job.request.system is not None:
+        return choice
+    system = choice.survey.system
+    used = system if job.calibration is None else job.calibration.apply(system)
+    used = replace(used, divergence=parameters["divergence"] or used.divergence)
+    blocks = (sensor.fill(block) for block in reader.sample_blocks(scan, sample_size(reader)))
+    seen = measure_level(blocks, used, choice.survey.figures.get("spacing_ns", 0.0))
+    system = replace(system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
+    return replace(choice, survey=replace(choice.survey, system=system))
 
 
 def process_unit(prepared: Prepared, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
               help="Waveforms to look at, spread over the strip.  [default: 8192, fewer where they are long]")
 @click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
               help="Where packet vectors point: decided from the file, or toward or away from the sensor.")
+@click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
+              help="Full angle of the beam between the 1/e^2 points: says what angles its widths tell; kept in -o.")
 @click.option("--headerless", is_flag=True, help="Take a .wdp that lacks its 60-byte header.")
 @click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
@@ -65,16 +67,20 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.errors import InputError
     from wavebatch.io.fingerprint import take_fingerprint
     from wavebatch.io.strip import StripReader
+    from wavebatch.outlook import survey_angles
     from wavebatch.systemfile import SavedSurvey
 
     with StripReader(strip, direction=options["direction"], headerless=options["headerless"]) as reader:
         with reader.scan() as scan:
             block = read_sample(reader, scan, options["waveforms"])
             facts = _describe_strip(reader, scan)
+            if block is None:
+                raise InputError(f"{strip}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
+            found = survey_sample(block)
+            if options["divergence"] is not None:
+                found = survey_angles(reader, scan, found, options["divergence"])
         packet_file = reader.facts.packet_file
-    if block is None:
-        raise InputError(f"{strip}: holds no waveform that could be surveyed; `wavebatch check` says what it holds")
-    return SavedSurvey(survey_sample(block), strip.name, take_fingerprint(strip, packet_file)), facts
+    return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
 
 
 def _describe_strip(reader: StripReader, scan: StripScan) -> dict[str, Any]:

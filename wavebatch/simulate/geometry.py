@@ -117,7 +117,7 @@ def _beach(x: np.ndarray, y: np.ndarray):
 def _village(x: np.ndarray, y: np.ndarray):
     """Houses 12 m wide every 24 m, eaves 4 m high, gable roofs of 0, 10, 20 ... 60 degrees, ridges along or across."""
     i, j = np.floor((x - EAST) / 24.0), np.floor((y - NORTH) / 24.0)
-    along, across = (x - EAST) - 24.0 * i - 12.0, (y - NORTH) - 24.0 * j - 12.0
+    along, across = (x - EAST) - 24.0 * i - 6.0, (y - NORTH) - 24.0 * j - 12.0
     roof = (np.abs(along) < 6.0) & (np.abs(across) < 6.0)
     steep = np.where(roof, np.tan(np.radians(10.0 * ((i + 3.0 * j) % 7))), 0.0)
     turned = (i + j) % 2 == 1

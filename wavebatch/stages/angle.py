@@ -68,7 +68,7 @@ def incidence_angle(
     """
     beam = divergence or system.divergence
     short = system.sigma_ref < LEAST_WIDTH * block.spacing
-    variance, variance_err = _added_variance(block, system, echoes, mode, reference_error)
+    variance, variance_err = added_variance(block, system, echoes, mode, reference_error)
     distance = sensor_distance(block, echoes)
     angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
     steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
@@ -96,11 +96,15 @@ def incidence_angle(
     return echoes.with_attributes(**columns).with_flags(EchoFlag.NARROW, narrow)
 
 
-def _added_variance(
+def added_variance(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, mode: str, reference_error: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance that the target adds to the pulse [ns2] and its standard deviation, f8 (m,)."""
-    width, error = echoes.sigma.astype(np.float64), echoes.sigma_err.astype(np.float64)
+    """Variance that the target adds to the pulse [ns2] and its standard deviation, f8 (m,).
+
+    mode, reference_error: as those of stage incidence_angle.
+    """
+    width = echoes.sigma.astype(np.float64)
+    error = np.hypot(echoes.sigma_err.astype(np.float64), system.width_scatter)
     reference = system.sigma_ref
     if mode == "pulse":
         variance = spread_variance(pulse_table(system.sigma_ref, block.spacing), width)
@@ -108,7 +112,7 @@ def _added_variance(
         variance = spread_variance(paper_table(system.sigma_ref), width)
     else:
         width, error, reference = _model_width(block.spacing, system, width, error)
-        variance = width * width - reference * reference
+        variance = width * width - reference * reference - system.level_variance
     return variance, 2.0 * np.hypot(width * error, reference * reference * reference_error)
 
 

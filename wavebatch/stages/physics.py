@@ -200,7 +200,12 @@ def _surface_angle(block: WaveformBlock, echoes: EchoTable, surface: str) -> tup
         angle = echoes.attributes.get("incidence_angle", unknown)
         error = echoes.attributes.get("incidence_angle_err", unknown)
         return np.radians(angle.astype(np.float64)), np.radians(error.astype(np.float64))
+    return level_angle(block)[echoes.waveform], none
+
+
+def level_angle(block: WaveformBlock) -> np.ndarray:
+    """Angle at which each ray strikes level ground [rad], f8 (n,)."""
     x, y, z = block.direction.T
     with np.errstate(divide="ignore", invalid="ignore"):
         down = -z / np.sqrt(x * x + y * y + z * z)
-    return np.arccos(np.clip(down, -1.0, 1.0))[echoes.waveform], none
+    return np.arccos(np.clip(down, -1.0, 1.0))
