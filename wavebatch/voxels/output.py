@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import tempfile
@@ -24,15 +25,15 @@ from wavebatch.voxels.grid import VoxelColumn
 SUFFIXES = (".npz", ".las", ".laz")
 _PIECE = 1 << 18
 _WKT = 2112
-_MOST_INDEX = 2**31 - 1
 
 
 def check_target(target: Path, strip: Path) -> None:
-    """Raises ConfigError for a name that says no format, InputError where the output is the strip itself."""
+    """Raises ConfigError for a name that says no format, InputError where the output is the strip, or cannot be."""
     if target.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if target.exists() and strip.exists() and target.samefile(strip):
         raise InputError(f"{target}: is the strip itself; choose another output")
+    Draft(target, overwrite=True).discard()
 
 
 class NpzVoxels:
@@ -44,22 +45,21 @@ class NpzVoxels:
 
     def __init__(self, target: Path, columns: Sequence[VoxelColumn], *, overwrite: bool) -> None:
         self.target = target
-        self._draft = Draft(target, overwrite=overwrite)
         self._dtypes = {"index": np.dtype("<i4")} | {column.name: np.dtype(f"<{column.dtype}") for column in columns}
         self._number = 0
-        with reporting(target):
+        with contextlib.ExitStack() as stack, reporting(target):
+            self._draft = Draft(target, overwrite=overwrite)
+            stack.callback(self._draft.discard)
             self._spools: dict[str, IO[bytes]] = {
-                name: tempfile.TemporaryFile(dir=target.parent)  # noqa: SIM115 - closed in `__exit__`
-                for name in self._dtypes
+                name: stack.enter_context(tempfile.TemporaryFile(dir=target.parent)) for name in self._dtypes
             }
+            self._opened = stack.pop_all()
 
     def __enter__(self) -> NpzVoxels:
         return self
 
     def __exit__(self, *error: object) -> None:
-        for spool in self._spools.values():
-            spool.close()
-        self._draft.discard()
+        self._opened.close()
 
     def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
         """Appends voxels (m, 3) and their columns."""
@@ -71,9 +71,7 @@ class NpzVoxels:
     def commit(self, origin: np.ndarray, size: float, crs: str | None, meta: Mapping[str, Any]) -> None:
         """Completes and publishes the file."""
         single = {"origin": origin, "size": size, "crs": crs or "", "meta": json.dumps(meta, sort_keys=True)}
-        with reporting(self.target), zipfile.ZipFile(
-            self._draft.file, "w", zipfile.ZIP_DEFLATED, allowZip64=True, compresslevel=1
-        ) as archive:
+        with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
             for name, spool in self._spools.items():
                 with _open_member(archive, name) as member:
                     shape = (self._number, 3) if name == "index" else (self._number,)
@@ -89,9 +87,7 @@ class NpzVoxels:
 
 def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
     """A member with a fixed date, so that the same voxels give the same bytes."""
-    info = zipfile.ZipInfo(f"{name}.npy")
-    info.compress_type = zipfile.ZIP_DEFLATED
-    return archive.open(info, "w", force_zip64=True)
+    return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
 
 
 class LasVoxels:
