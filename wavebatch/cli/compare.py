@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from wavebatch.cli.angles import list_lines, measure
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.compare import Comparison, compare_clouds, compare_truth
 
@@ -31,6 +32,7 @@ EXIT_VIOLATED = 1
 @click.option("--limit", type=click.IntRange(1), metavar="N",
               help="About N waveforms spread over the strip, in place of all.")
 @click.option("--truth", type=click.Path(path_type=Path), help="Truth of a simulated strip, in place of B.")
+@click.option("--angles", is_flag=True, help="Angles from widths against those from normals: of A, or A against B.")
 @click.option("--tolerance", type=float, help="Largest difference of the same echo [ns].  [default: 1; truth: 1.5]")
 @click.option("--min-completeness", type=float, help="Least share of B's echoes that A has.")
 @click.option("--min-correctness", type=float, help="Least share of A's echoes that B has.")
@@ -41,7 +43,9 @@ EXIT_VIOLATED = 1
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
 @debug_option
 @report_errors(failure=2)
-def compare(a: Path, b: Path | None, strip: Path | None, truth: Path | None, as_json: bool, **options) -> None:
+def compare(
+    a: Path, b: Path | None, strip: Path | None, truth: Path | None, angles: bool, as_json: bool, **options
+) -> None:
     """Compare the echoes of cloud A with those of B: another result, or the strip itself with the vendor's returns.
 
     Echoes of a pulse are the same when they lie within the tolerance along the ray. Points that were passed through
@@ -49,8 +53,15 @@ def compare(a: Path, b: Path | None, strip: Path | None, truth: Path | None, as_
 
     With --strip, A and B are chains that are run on it (one of them may be a cloud), and are compared waveform by
     waveform, also with the vendor's returns and by their goodness of fit; without B, A with the vendor's returns.
+
+    With --angles, incidence_angle is compared with incidence_angle_normals: of A's points that have both, or of one
+    cloud with the other of the other one.
     Exit code: 0 fine, 1 a threshold is not met, 2 wrong usage or a file unreadable.
     """  # fmt: skip
+    if angles:
+        agreement = measure(a, b, {**options, "strip": strip, "truth": truth})
+        print_json(_finite(agreement.to_dict())) if as_json else click.echo("\n".join(list_lines(agreement)))
+        return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     if as_json:
