@@ -19,7 +19,7 @@ RANKS = [
     {"angles", "levels", "outlook", "auto", "trial", "choice", "sensor", "calibration", "matchup", "plots"},
     {"work", "targets", "voxels"},
     {"record", "remarks", "secondpass"},
-    {"task", "workers"},
+    {"task", "workers", "cluster"},
     {"plan"},
     {"batch"},
     {"bench"},
@@ -107,7 +107,7 @@ def test_only_io_knows_laspy():
 def test_only_batch_knows_executors():
     for path in MODULES:
         if _outside(path) & {"concurrent", "multiprocessing"}:
-            assert _part(path) in {"batch", "task", "workers"}, path
+            assert _part(path) in {"batch", "task", "workers", "cluster"}, path
 
 
 SCRIPTS = {ROOT / "io" / "laszip_child.py"}
@@ -134,4 +134,5 @@ def test_no_other_dependency_at_run_time():
         peers = {"bench": {"gdecomp", "matplotlib"}, "pictures": {"matplotlib"}, "plots": {"matplotlib"}}
         peers = peers.get(_part(path), set())
         peers |= {"pyproj"} if path.name == "trajectoryfile.py" else set()
+        peers |= {"dask", "distributed"} if path.name == "cluster.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

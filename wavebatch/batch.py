@@ -6,13 +6,14 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures import BrokenExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
+from wavebatch.cluster import Cluster
 from wavebatch.errors import InputError
 from wavebatch.io.publish import remove_stale, reporting
 from wavebatch.plan import check_outputs
@@ -78,16 +79,18 @@ def run_batch(
 ) -> BatchResult:
     """Writes cloud and report of every strip into the folder; a strip that fails does not stop the others.
 
-    on_event: told what happens, as dictionaries with a key `event`: start, unit, written, skipped, failed.
+    on_event: told what happens, as dictionaries with a key `event`: start, unit, written, skipped, failed. A failure
+    that is not the strip's own and has been told of another one has `again`.
     Raises ConfigError before anything is started, KeyboardInterrupt after cleaning up; failures are in the result.
     """
     start = time.perf_counter()
     check_outputs(jobs, options)
-    with reporting(options.folder):
-        options.folder.mkdir(parents=True, exist_ok=True)
-    remove_stale(options.folder)
-    with Workers(options.jobs) as workers, contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
-        batch.run()
+    with Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs) as workers:
+        with reporting(options.folder):
+            options.folder.mkdir(parents=True, exist_ok=True)
+        remove_stale(options.folder)
+        with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
+            batch.run()
         outcomes = tuple(batch.outcomes[job.path] for job in jobs)
     return BatchResult(outcomes, time.perf_counter() - start)
 
@@ -99,7 +102,7 @@ class _Batch:
         self,
         jobs: Sequence[StripJob],
         options: BatchOptions,
-        workers: Workers,
+        workers: Workers | Cluster,
         on_event: Callable[[dict[str, Any]], None] | None,
     ) -> None:
         self.outcomes: dict[Path, Outcome] = {}
@@ -108,16 +111,19 @@ class _Batch:
         self._active: list[StripTask] = []
         self._options = options
         self._workers = workers
-        self._limit = 1 if options.jobs == 1 else 2 * options.jobs
         self._tell = on_event or (lambda event: None)
 
     def run(self) -> None:
         """Until every strip has an outcome."""
         while self._submit() or self._active:
             heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
-            done, _ = wait(heads, return_when=FIRST_COMPLETED)
-            for future in done:
-                self._take(heads[future])
+            try:
+                done = self._workers.wait(heads)
+            except BrokenExecutor as error:
+                self._give_up(error)
+            else:
+                for future in done:
+                    self._take(heads[future])
 
     def close(self) -> None:
         """Removes whatever unfinished strips have left."""
@@ -127,7 +133,7 @@ class _Batch:
 
     def _submit(self) -> bool:
         """Gives the workers as much as may wait for being written; whether anything is under way."""
-        while sum(len(strip.pending) for strip in self._active) < self._limit:
+        while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
             strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
             if strip is None:
                 break
@@ -169,6 +175,8 @@ class _Batch:
             yield
         except BrokenProcessPool:
             self._restart()
+        except BrokenExecutor as error:
+            self._give_up(error)
         except Exception as error:
             strip.drop()
             self._end(strip, Outcome(strip.job, "failed", error=error))
@@ -188,13 +196,23 @@ class _Batch:
         )
         self._end(strips[0], Outcome(strips[0].job, "failed", error=error))
 
-    def _end(self, strip: StripTask, outcome: Outcome) -> None:
+    def _give_up(self, reason: BrokenExecutor) -> None:
+        """Nobody is left to work: all strips that are not written fail for the same reason, which is told once."""
+        unfinished = [*self._active, *(StripTask(job, self._options, False) for job in (*self._again, *self._waiting))]
+        self._again.clear()
+        self._waiting.clear()
+        error = InputError(f"{reason} ({len(unfinished)} of {len(unfinished) + len(self.outcomes)} strips are missing)")
+        for strip in unfinished:
+            strip.drop()
+            self._end(strip, Outcome(strip.job, "failed", error=error), again=strip is not unfinished[0])
+
+    def _end(self, strip: StripTask, outcome: Outcome, *, again: bool = False) -> None:
         if strip in self._active:
             self._active.remove(strip)
         self.outcomes[outcome.job.path] = outcome
         event = {"event": outcome.status, "strip": str(outcome.job.path)}
         if outcome.error is not None:
-            self._tell({**event, "error": outcome.error})
+            self._tell({**event, "error": outcome.error, "again": again})
         else:
             told = outcome.report.to_json()
             self._tell({**event, "counts": told["counts"], "remarks": told["remarks"]})

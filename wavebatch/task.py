@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wavebatch.cluster import Cluster
 from wavebatch.errors import InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.publish import refuse_existing
@@ -39,6 +40,8 @@ class BatchOptions:
 
     folder: Path
     jobs: int = 1
+    scheduler: str | None = None
+    """Address of a dask cluster whose workers take the place of `jobs` processes."""
     block_size: int | None = None
     """Waveforms that go through a chain at a time; None chooses by their length."""
     overwrite: bool = False
@@ -95,10 +98,10 @@ class StripTask:
             return False
         return self._second is None or self._second.is_complete
 
-    def submit(self, workers: Workers) -> None:
+    def submit(self, workers: Workers | Cluster) -> None:
         """The next piece of work: the preparation, then unit by unit, then the tiles of a second pass."""
         if self.prepared is None:
-            self.pending.append(workers.submit(prepare_strip, self.job))
+            self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
             return
         if self._submitted == self.prepared.units:
             self.pending.append(workers.submit(process_tile, *self._second.next_tile()))

@@ -71,6 +71,13 @@ class StripJob:
         given = self.sensor != SensorRequest()
         return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
 
+    def absolute(self) -> StripJob:
+        """The same for processes that work in another folder."""
+        sensor = self.sensor
+        if sensor.trajectory is not None:
+            sensor = replace(sensor, trajectory=sensor.trajectory.absolute())
+        return replace(self, path=self.path.absolute(), sensor=sensor)
+
     def open(self) -> StripReader:
         """A reader of the strip; raises InputError where it is not one."""
         return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)

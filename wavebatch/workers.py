@@ -7,11 +7,13 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
 from typing import Any
 
 from wavebatch.allocator import keep_freed_memory
+from wavebatch.io.scratch import owning_scratch, use_scratch
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 
@@ -22,20 +24,30 @@ class Workers:
     The processes are spawned, so that nothing is inherited, use one thread each, and end when this process ends.
     """
 
+    is_remote = False
+
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
+        self.limit = 1 if jobs == 1 else 2 * jobs
+        """Calls that may wait for their results to be used."""
         keep_freed_memory()
         self._before = set(multiprocessing.active_children())
         self._pool: ProcessPoolExecutor | None = None
+        self._own = owning_scratch()
+        self._scratch: Path | None = None
 
     def __enter__(self) -> Workers:
+        self._scratch = self._own.__enter__()
         return self
 
     def __exit__(self, kind: type | None, *error: object) -> None:
-        if kind is None:
-            self._shut(cancel=False)
-        else:
-            self.kill()
+        try:
+            if kind is None:
+                self._shut(cancel=False)
+            else:
+                self.kill()
+        finally:
+            self._own.__exit__(None, None, None)
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """The future result of `function(*arguments)`."""
@@ -43,9 +55,15 @@ class Workers:
             return _run_now(function, arguments)
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.jobs, mp_context=context, initializer=_start_worker)
+            self._pool = ProcessPoolExecutor(
+                self.jobs, mp_context=context, initializer=_start_worker, initargs=(self._scratch,)
+            )
         with _single_threaded():
             return self._pool.submit(function, *arguments)
+
+    def wait(self, futures: Iterable[Future]) -> set[Future]:
+        """Those that are done, at least one."""
+        return wait(futures, return_when=FIRST_COMPLETED).done
 
     def restart(self) -> None:
         """Gives up the processes, of which one has died; the next `submit` starts new ones."""
@@ -88,9 +106,10 @@ def _single_threaded() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start_worker() -> None:
+def _start_worker(scratch: Path | None) -> None:
     """In a new process: Ctrl-C is the parent's business, and without the parent there is nothing to do."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_scratch(scratch)
     keep_freed_memory()
     parent = multiprocessing.parent_process()
     if parent is not None:

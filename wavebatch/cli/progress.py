@@ -56,7 +56,7 @@ class Progress:
         if self._bar is not None:
             share = event["done"] / event["of"] if kind == "unit" else float(kind != "start")
             self._advance(strip, share)
-        if error is not None:
+        if error is not None and not event["again"]:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
             self._say(f"error: {_place(strip, one_line(error))}")

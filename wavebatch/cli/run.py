@@ -72,8 +72,11 @@ class Size(click.ParamType):
               show_default=True, help="Names and units of the extra bytes.")
 @click.option("--columns", metavar="LIST", help="a,b writes these columns only; +a,+b adds them to the usual ones.")
 @click.option("--keep-packets", is_flag=True, help="Keep the waveforms: their point format and the packets themselves.")
-@click.option("--jobs", type=click.IntRange(0), default=1, show_default=True, metavar="N",
-              help="Processes; 0 means one per processor. The result is the same for any number.")
+@click.option("--jobs", type=click.IntRange(0), metavar="N",
+              help="Processes; 0 means one per processor. The result is the same for any number.  [default: 1]")
+@click.option("--scheduler", metavar="ADDRESS",
+              help="Of a dask cluster, e.g. tcp://10.0.0.1:8786: its workers take the place of --jobs. They must see "
+              "strips and DIR under the same names, and have the same wavebatch.")
 @click.option("--memory", type=Size(), metavar="SIZE", help="Most memory for all processes together, e.g. 2G.")
 @click.option("--block-size", type=click.IntRange(1), metavar="N",
               help="Waveforms processed at a time; the result is the same for any number.  [default: by their length]")
@@ -121,9 +124,10 @@ def _interrupt(number: int, frame: object) -> None:
 
 def _check_options(options: dict[str, Any]) -> None:
     pairs = [("chain_file", "profile"), ("chain_file", "tolerance"), ("profile", "tolerance")]
-    pairs += [("overwrite", "resume"), ("quiet", "verbose")]
+    pairs += [("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"), ("scheduler", "memory")]
+    given = {name for name, value in options.items() if value is not None and value is not False}
     for first, second in pairs:
-        if options[first] and options[second]:
+        if {first, second} <= given:
             names = [f"--{name.removesuffix('_file')}" for name in (first, second)]
             raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     report = options["report"]
@@ -161,11 +165,12 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         keep_packets=options["keep_packets"],
     )
     strips = find_strips(options["strips"])
-    wanted = options["jobs"] or os.cpu_count() or 1
+    wanted = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
     processes, block_size = plan_memory(wanted, options["memory"])
     batch_options = BatchOptions(
         folder=options["output"],
         jobs=processes,
+        scheduler=options["scheduler"],
         block_size=options["block_size"] or block_size,
         overwrite=options["overwrite"],
         resume=options["resume"],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from wavebatch.errors import InputError
 from wavebatch.io.rawbytes import read_exactly
+from wavebatch.io.scratch import make_folder, scratch_place
 
 MEMORY = 1 << 24
 """Bytes of entries that are held before they go to disk."""
@@ -104,7 +104,7 @@ class Spool:
         starts, entries = self._take_pending()
         with _reported():
             if self.folder is None:
-                self.folder = Path(tempfile.mkdtemp(prefix="wavebatch-"))
+                self.folder = make_folder()
             with open(self.path, "ab") as file:
                 self._segments.append(file.tell())
                 file.write(starts.data)
@@ -116,7 +116,7 @@ def _reported() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        folder = tempfile.gettempdir()
+        folder = scratch_place()
         raise InputError(
             f"{folder}: the temporary file for what does not fit memory cannot be used ({error.strerror or error}); "
             "free space there or set TMPDIR to another folder"
