@@ -53,8 +53,8 @@ def test_curves_are_the_fit_of_every_decomposer(name):
     if name == "decompose.skewed":
         shape, system = PulseShape(kappa=KAPPA), replace(PULSE, kappa=KAPPA)
     elif name == "decompose.reference":
-        system, parameters = replace(PULSE, components=((1.0, 0.0, 2.0), (0.1, 8.0, 2.0))), {"model": "stretched"}
-        shape = PulseShape(components=((0.1, 8.0, 0.0),))
+        system, parameters = replace(PULSE, components=((1.0, 0.0, 2.0), (0.03, 8.0, 2.0))), {"model": "stretched"}
+        shape = PulseShape(components=((0.03, 8.0, 0.0),))
     elif name == "decompose.asdf_only":
         parameters = {"refine": True} if "refine" in STAGES[name].parameters else {}
     block = simulate(shape, [(100.0, 30.3, 2.0)])

@@ -29,6 +29,15 @@ OUTSIDE = np.float32(-1e4)
 RIDGE = 1e-9
 """Added to the diagonal of the scaled normal equations: an echo outside its window must not make them singular."""
 
+DAMPING = 0.01
+"""Marquardt damping of the first step, in units of the diagonal."""
+
+KEPT = 0.75
+"""Share of the promised fall of the cost from which a step was as good as its model says."""
+
+EASE, RAISE = 0.1, 10.0
+"""What damping is multiplied with after such a step, and after one that is refused; otherwise it stays. Echoes that
+overlap lie in a curved valley: damping that falls after every step that is taken makes each second one too long."""
 
 STEEP = 1e3
 """Variance inflation by overlap from which normal equations are taken in float64."""
@@ -300,7 +309,9 @@ def _refresh(fit: Fit, windows: Windows, shape: PulseShape) -> None:
 class _State:
     """The problems still running: last accepted point with its equations, the trial point, the damping."""
 
-    __slots__ = ("accepted", "cost", "damping", "gram", "high", "kept", "low", "prior", "rows", "trial", "windows")
+    __slots__ = (
+        "accepted", "cost", "damping", "gram", "high", "kept", "low", "prior", "promised", "rows", "trial", "windows"
+    )  # fmt: skip
 
     def __init__(
         self, windows: Windows, start: np.ndarray, low: np.ndarray, high: np.ndarray, prior: WidthPrior | None
@@ -309,7 +320,8 @@ class _State:
         self.windows, self.low, self.high, self.prior = windows, low, high, prior
         self.trial = self.kept = start
         self.cost = np.full(m, np.inf)
-        self.damping = np.full(m, 1e-3)
+        self.damping = np.full(m, DAMPING)
+        self.promised = np.full(m, np.inf)
         self.accepted = np.zeros(m, bool)
         self.gram = self.rows = np.empty((m, 0, 0))
 
@@ -318,7 +330,7 @@ class _State:
         part = object.__new__(_State)
         part.prior, part.rows = self.prior, self.rows
         part.windows = self.windows.take(places)
-        for name in ("accepted", "cost", "damping", "gram", "high", "kept", "low", "trial"):
+        for name in ("accepted", "cost", "damping", "gram", "high", "kept", "low", "promised", "trial"):
             setattr(part, name, getattr(self, name)[places])
         return part
 
@@ -331,14 +343,14 @@ class _State:
         if self.prior is not None:
             cost = cost + self.prior.add(self.trial, std, gram)
         self.accepted = cost <= self.cost * (1 + 1e-6)
+        factor = np.where(self.accepted, np.where(self.cost - cost > KEPT * self.promised, EASE, 1.0), RAISE)
+        self.damping = np.maximum(self.damping * factor, 1e-7)
         if self.accepted.all():
             self.kept, self.cost, self.gram = self.trial, cost, gram
-            self.damping = np.maximum(self.damping * 0.1, 1e-7)
         else:
             self.kept = np.where(self.accepted[:, None, None], self.trial, self.kept)
             self.cost = np.where(self.accepted, cost, self.cost)
             self.gram = np.where(self.accepted[:, None, None], gram, self.gram)
-            self.damping = np.where(self.accepted, np.maximum(self.damping * 0.1, 1e-7), self.damping * 10)
         gradient = self.gram[:, :-1, -1]
         slope = gradient.reshape(self.kept.shape)
         frozen = ((self.kept <= self.low) & (slope < 0)) | ((self.kept >= self.high) & (slope > 0))
@@ -347,4 +359,5 @@ class _State:
         step *= parameter_units(self.kept, std)
         step += self.kept
         self.trial = np.minimum(np.maximum(step, self.low), self.high)
+        self.promised = decrement
         return decrement
