@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from wavebatch.errors import InputError
-from wavebatch.io.publish import Draft, refuse_existing, reporting
+from wavebatch.io.npz import NpzWriter
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",
@@ -42,62 +40,18 @@ _META = "meta"
 _PIECE = 1 << 18
 
 
-class TruthWriter:
+class TruthWriter(NpzWriter):
     """Takes columns block by block and writes them as one .npz on `publish`; memory does not grow with their length.
 
-    meta: plain values about the strip, kept as JSON in the array `meta`. Raises InputError where it cannot write.
+    Each `add` gives every column of a kind the same length. Raises InputError where it cannot write.
     """
 
     def __init__(self, target: Path, *, overwrite: bool = False) -> None:
-        self.target = Path(target)
-        if not overwrite:
-            refuse_existing(self.target)
-        self._draft = Draft(self.target, overwrite=overwrite)
-        with reporting(self.target):
-            folder = self.target.parent
-            self._spools = {
-                name: tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed in `discard`
-                for name in (*ECHO_COLUMNS, *PACKET_COLUMNS)
-            }
-        self._lengths = dict.fromkeys(self._spools, 0)
-
-    def add(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Appends values to the columns named; each call gives every column of a kind the same length."""
-        for name, values in columns.items():
-            dtype = ECHO_COLUMNS.get(name) or PACKET_COLUMNS[name]
-            with reporting(self.target):
-                self._spools[name].write(np.ascontiguousarray(values, dtype=dtype).tobytes())
-            self._lengths[name] += len(values)
+        super().__init__(target, {**ECHO_COLUMNS, **PACKET_COLUMNS}, overwrite=overwrite)
 
     def publish(self, meta: Mapping[str, Any]) -> None:
-        """Writes the .npz and gives it its name."""
-        with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
-            for name, spool in self._spools.items():
-                dtype = np.dtype(ECHO_COLUMNS.get(name) or PACKET_COLUMNS[name])
-                with _open_member(archive, name) as member:
-                    header = {"descr": dtype.str, "fortran_order": False, "shape": (self._lengths[name],)}
-                    np.lib.format.write_array_header_1_0(member, header)
-                    spool.seek(0)
-                    shutil.copyfileobj(spool, member, _PIECE)
-            with _open_member(archive, _META) as member:
-                np.lib.format.write_array(member, np.array(json.dumps(meta, sort_keys=True)), allow_pickle=False)
-        self._draft.publish()
-        self.discard()
-
-    def withdraw(self) -> None:
-        """Takes the published file back."""
-        self._draft.withdraw()
-
-    def discard(self) -> None:
-        """Closes and removes everything temporary; harmless after `publish`."""
-        for spool in self._spools.values():
-            spool.close()
-        self._draft.discard()
-
-
-def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    """A member with a fixed date, so that the same truth gives the same bytes."""
-    return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
+        """Writes the .npz and gives it its name; meta: plain values, kept as JSON in the array `meta`."""
+        super().publish({_META: json.dumps(meta, sort_keys=True)})
 
 
 class TruthReader:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import shutil
-import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +14,12 @@ from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.header import WKT_BIT, LasHeader, Vlr, has_record, read_header
+from wavebatch.io.npz import NpzWriter
 from wavebatch.io.pointfile import PointFile
-from wavebatch.io.publish import Draft, reporting
+from wavebatch.io.publish import Draft
 from wavebatch.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
-_PIECE = 1 << 18
 _WKT = 2112
 
 
@@ -43,51 +39,35 @@ class NpzVoxels:
     i lies between origin + i size and origin + (i + 1) size. No-data is NaN. Raises InputError where it cannot write.
     """
 
-    def __init__(self, target: Path, columns: Sequence[VoxelColumn], *, overwrite: bool) -> None:
-        self.target = target
-        self._dtypes = {"index": np.dtype("<i4")} | {column.name: np.dtype(f"<{column.dtype}") for column in columns}
-        self._number = 0
-        with contextlib.ExitStack() as stack, reporting(target):
-            self._draft = Draft(target, overwrite=overwrite)
-            stack.callback(self._draft.discard)
-            self._spools: dict[str, IO[bytes]] = {
-                name: stack.enter_context(tempfile.TemporaryFile(dir=target.parent)) for name in self._dtypes
-            }
-            self._opened = stack.pop_all()
+    def __init__(
+        self,
+        target: Path,
+        columns: Sequence[VoxelColumn],
+        *,
+        facts: StripFacts,
+        origin: np.ndarray,
+        size: float,
+        meta: Mapping[str, Any],
+        overwrite: bool,
+    ) -> None:
+        text = json.dumps(meta, sort_keys=True)
+        self._single = {"origin": origin, "size": size, "crs": facts.crs or "", "meta": text}
+        dtypes = {"index": np.dtype(("<i4", (3,)))} | {column.name: np.dtype(f"<{column.dtype}") for column in columns}
+        self._file = NpzWriter(target, dtypes, overwrite=overwrite)
 
     def __enter__(self) -> NpzVoxels:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._opened.close()
+        self._file.discard()
 
     def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
         """Appends voxels (m, 3) and their columns."""
-        with reporting(self.target):
-            for name, values in {"index": index, **columns}.items():
-                self._spools[name].write(np.ascontiguousarray(values, self._dtypes[name]).tobytes())
-        self._number += len(index)
+        self._file.add({"index": index, **columns})
 
-    def commit(self, origin: np.ndarray, size: float, crs: str | None, meta: Mapping[str, Any]) -> None:
+    def commit(self) -> None:
         """Completes and publishes the file."""
-        single = {"origin": origin, "size": size, "crs": crs or "", "meta": json.dumps(meta, sort_keys=True)}
-        with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
-            for name, spool in self._spools.items():
-                with _open_member(archive, name) as member:
-                    shape = (self._number, 3) if name == "index" else (self._number,)
-                    header = {"descr": self._dtypes[name].str, "fortran_order": False, "shape": shape}
-                    np.lib.format.write_array_header_1_0(member, header)
-                    spool.seek(0)
-                    shutil.copyfileobj(spool, member, _PIECE)
-            for name, value in single.items():
-                with _open_member(archive, name) as member:
-                    np.lib.format.write_array(member, np.array(value), allow_pickle=False)
-        self._draft.publish()
-
-
-def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    """A member with a fixed date, so that the same voxels give the same bytes."""
-    return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
+        self._file.publish(self._single)
 
 
 class LasVoxels:

@@ -253,20 +253,22 @@ def _add_block(
 
 def _write(grid: VoxelGrid, reader: StripReader, target: Path, meta: Mapping[str, Any], overwrite: bool) -> int:
     """Writes the voxels; their number."""
-    origin, number = grid.low * grid.size, 0
-    if target.suffix.lower() == ".npz":
-        writer = NpzVoxels(target, grid.columns, overwrite=overwrite)
-        last = (origin, grid.size, reader.facts.crs, meta)
-    else:
-        writer = LasVoxels(
-            target, grid.columns, facts=reader.facts, origin=origin, size=grid.size, meta=meta, overwrite=overwrite
-        )
-        last = ()
+    number = 0
+    kind = NpzVoxels if target.suffix.lower() == ".npz" else LasVoxels
+    writer = kind(
+        target,
+        grid.columns,
+        facts=reader.facts,
+        origin=grid.low * grid.size,
+        size=grid.size,
+        meta=meta,
+        overwrite=overwrite,
+    )
     with writer:
         for index, columns in grid.pieces():
             writer.write(index, columns)
             number += len(index)
-        writer.commit(*last)
+        writer.commit()
     return number
 
 
