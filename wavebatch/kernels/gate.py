@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from wavebatch.kernels.fit import Windows
+from wavebatch.kernels.pulse import evaluate_unit
 from wavebatch.kernels.signal import SMOOTH_GAIN
 
 HERMITE_REACH = 5.0
@@ -42,25 +45,36 @@ def _hermite(
 
 
 def residual_moments(
-    residual: np.ndarray, waveform: np.ndarray, time: np.ndarray, width: np.ndarray, std: np.ndarray
+    read: Callable[[slice | np.ndarray, np.ndarray], np.ndarray],
+    s: int,
+    time: np.ndarray,
+    width: np.ndarray,
+    std: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Hermite moments h3, h4 (m,) of residual waveforms (n, s) around echoes, within five widths of each.
+    """Gauss-Hermite moments h3, h4 (m,) of what is left around echoes, within five widths of each.
 
+    read: residuals, float32 (k, L), of echoes at the samples i4 (k, L) that it is given, all in 0..s - 1.
     time, width: in samples (m,); std: noise (m,).
     """
-    s = residual.shape[1]
     h3, h4 = np.zeros(len(time)), np.zeros(len(time))
-    reach = np.minimum(np.ceil(HERMITE_REACH * width), s).astype(np.int64)
+    reach = np.minimum(np.ceil(HERMITE_REACH * width), s).astype(np.int32)
     for size in np.unique(reach):
         rows = np.flatnonzero(reach == size)
         for begin in range(0, len(rows), 4096):
             part = rows[begin : begin + 4096]
-            at = np.rint(time[part]).astype(np.int64)[:, None] + np.arange(-size, size + 1)
+            middle = np.rint(time[part])
+            at = middle.astype(np.int32)[:, None] + np.arange(-size, size + 1, dtype=np.int32)
             inside = (at >= 0) & (at < s)
-            values = np.where(inside, residual[waveform[part][:, None], np.clip(at, 0, s - 1)], 0).astype(np.float32)
-            z = ((at - time[part][:, None]) / width[part][:, None]).astype(np.float32)
-            pulse = np.exp(np.float32(-0.5) * z * z) * inside
-            p3, p4 = _hermite(z, pulse, pulse * z, pulse * z * z)
+            cut = not inside.all()
+            values = read(part, np.clip(at, 0, s - 1) if cut else at)
+            # Centres are taken off in double precision: what is left is small.
+            z = np.arange(-size, size + 1, dtype=np.float32) - (time[part] - middle).astype(np.float32)[:, None]
+            z *= (1 / width[part]).astype(np.float32)[:, None]
+            pulse, by_time, by_width = evaluate_unit(z)
+            if cut:
+                values = np.where(inside, values, np.float32(0))
+                pulse, by_time, by_width = (column * inside for column in (pulse, by_time, by_width))
+            p3, p4 = _hermite(z, pulse, by_time, by_width)
             h3[part] = _project(p3[:, None], values)[:, 0] / std[part]
             h4[part] = _project(p4[:, None], values)[:, 0] / std[part]
     return h3, h4

@@ -70,6 +70,11 @@ def evaluate_pulse(shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarra
     return _evaluate_gaussian(z)
 
 
+def evaluate_unit(z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The unit Gaussian e = exp(-z^2/2), e z and e z^2."""
+    return _evaluate_gaussian(z.copy())
+
+
 def _evaluate_gaussian(z: np.ndarray) -> tuple[np.ndarray, ...]:
     pulse = z * z
     pulse *= np.float32(-0.5)

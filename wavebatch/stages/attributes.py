@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.kernels.gate import residual_moments
 from wavebatch.kernels.match import match_returns
+from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
 from wavebatch.kernels.render import render_echoes
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
@@ -49,17 +52,53 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     The Gauss-Hermite moments h3 (skew) and h4 (peakedness) of a right fit are standard normal, so that noise leaves
     about 1.25 std/A sqrt(T/s) here; merged echoes and sloping targets leave more. Source: ALGORITHMS 4.2.
     """
-    n, s = block.samples.shape
-    spacing = block.spacing
+    s, spacing = block.samples.shape[1], block.spacing
     time, sigma = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    model = model_parameters(shape, limits, np.stack([echoes.amplitude, time, sigma], axis=1).astype(np.float64))
-    residual = block.samples - noise.baseline[:, None]
-    residual -= render_echoes(shape, n, s, echoes.waveform, model[:, 1], model[:, 0], model[:, 2])
+    whole = np.stack([echoes.amplitude, time, sigma], axis=1).astype(np.float64)
+    model = model_parameters(shape, limits, whole)
     std = noise.std[echoes.waveform].astype(np.float64)
-    h3, h4 = residual_moments(residual, echoes.waveform, time, sigma, std)
+    h3, h4 = np.empty(len(echoes)), np.empty(len(echoes))
+    alone = echoes.count(len(block))[echoes.waveform] == 1
+    for kind, rows in ((_read_single, np.flatnonzero(alone)), (_read_several, np.flatnonzero(~alone))):
+        read = kind(block, noise, shape, echoes.waveform[rows], model[rows])
+        h3[rows], h4[rows] = residual_moments(read, s, time[rows], sigma[rows], std[rows])
     unit = echoes.amplitude / std * np.sqrt(sigma)
     return echoes.with_attributes(pulse_deviation=(np.hypot(h3, h4) / np.maximum(unit, 1e-6)).astype(np.float32))
+
+
+_Read = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def _read_single(
+    block: WaveformBlock, noise: Noise, shape: PulseShape, waveform: np.ndarray, model: np.ndarray
+) -> _Read:
+    """Reads residuals of echoes (k,) that are alone in their waveforms: the pulse is painted where it is asked for."""
+    samples, s = block.samples.ravel(), block.samples.shape[1]
+    first = waveform.astype(np.int64)[:, None] * s
+    amplitude, time, width = model.astype(np.float32).T[..., None]
+
+    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+        values = samples[first[part] + at].astype(np.float32)
+        values -= noise.baseline[waveform[part], None]
+        values -= amplitude[part] * evaluate_pulse(shape, at.astype(np.float32), time[part], width[part])[0]
+        return values
+
+    return read
+
+
+def _read_several(
+    block: WaveformBlock, noise: Noise, shape: PulseShape, waveform: np.ndarray, model: np.ndarray
+) -> _Read:
+    """Reads residuals of echoes (k,) that share their waveforms, which are painted whole."""
+    rows, place = np.unique(waveform, return_inverse=True)
+    residual = block.samples[rows] - noise.baseline[rows, None]
+    residual -= render_echoes(shape, len(rows), block.samples.shape[1], place, model[:, 1], model[:, 0], model[:, 2])
+
+    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return residual[place[part][:, None], at].astype(np.float32)
+
+    return read
 
 
 @stage("attribute", makes=("x", "y", "z", "point", "range_err"))
