@@ -13,8 +13,8 @@ from wavebatch.evaluate import list_pairs, pair_nearest
 from wavebatch.io.anglefile import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
 from wavebatch.io.buckets import Buckets
 
-BIN = 5.0
-"""Width of a histogram's bins [deg]."""
+BIN, DIFFERENCE_BIN = 5.0, 2.0
+"""Widths of the histograms' bins [deg]: of angles, of their differences."""
 
 BUCKET_POINTS, MOST_BUCKETS = 400_000, 72
 """Points that are held at a time, as long as that many buckets are enough."""
@@ -130,7 +130,7 @@ class _Tally:
         self.sums = np.zeros(3)
         self.fine = np.zeros(90 * _FINE + 1, np.int64)
         self.angles = np.zeros((2, round(90 / BIN)), np.int64)
-        self.differences = np.zeros(round(180 / BIN), np.int64)
+        self.differences = np.zeros(round(180 / DIFFERENCE_BIN), np.int64)
 
     def add(self, widths: np.ndarray, normals: np.ndarray) -> None:
         """Takes in points (n,), ANGLE_DTYPE: the one's angle from width, the other's from normals."""
@@ -147,7 +147,7 @@ class _Tally:
         self.fine += np.bincount(np.rint(np.abs(off) * _FINE).astype(np.int64), minlength=len(self.fine))
         for side, values in enumerate((a, b)):
             self.angles[side] += _bins(values / BIN, self.angles.shape[1])
-        self.differences += _bins((off + 90.0) / BIN, len(self.differences))
+        self.differences += _bins((off + 90.0) / DIFFERENCE_BIN, len(self.differences))
         error = np.hypot(widths[f"{WIDTHS}_err"][both], normals[f"{NORMALS}_err"][both])
         self.errors += int(np.isfinite(error).sum())
         self.within += int((np.abs(off) <= error).sum())
@@ -171,7 +171,7 @@ class _Tally:
             edges=tuple(BIN * step for step in range(self.angles.shape[1] + 1)),
             histogram_widths=tuple(self.angles[0].tolist()),
             histogram_normals=tuple(self.angles[1].tolist()),
-            difference_edges=tuple(BIN * step - 90.0 for step in range(len(self.differences) + 1)),
+            difference_edges=tuple(DIFFERENCE_BIN * step - 90.0 for step in range(len(self.differences) + 1)),
             histogram_difference=tuple(self.differences.tolist()),
         )
 

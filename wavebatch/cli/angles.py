@@ -53,11 +53,13 @@ def list_lines(result: AngleAgreement) -> list[str]:
 
 
 def _bars(edges: tuple[float, ...], counts: tuple[int, ...]) -> list[str]:
-    """A line per bin, from the first to the last that holds anything."""
-    filled = [number for number, count in enumerate(counts) if count]
+    """A line per bin, from the first to the last that holds a thousandth of all; what lies beyond in one line."""
+    filled = [number for number, count in enumerate(counts) if 1000 * count >= sum(counts)]
     most = max(counts)
-    return [
+    beyond = sum(counts) - sum(counts[filled[0] : filled[-1] + 1])
+    lines = [
         f"{edges[number]:>5.0f} to {edges[number + 1]:>3.0f} {counts[number]:>11} "
         + "#" * math.ceil(_BAR * counts[number] / most)
         for number in range(filled[0], filled[-1] + 1)
     ]
+    return [*lines, f"{'beyond':>12} {beyond:>11}"] if beyond else lines
