@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401 - registers them
+from wavebatch.angles import SLOPE, predict_angles
 from wavebatch.blocks import COLUMNS as COLUMNS_TABLE
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.calibration import with_physics
@@ -302,3 +303,14 @@ def test_channels_have_constants_of_their_own():
     one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes
     two = run(block, echoes, replace(SYSTEM, channels={1: (5.2e-8, 0.0), 2: (1.0, 0.0)}), "backscatter_coefficient")
     assert two.attributes["backscatter_coefficient"] == pytest.approx(2 * one["backscatter_coefficient"], rel=1e-6)
+
+
+def test_the_outlook_is_the_error_that_echoes_then_have():
+    block, echoes, _ = make(np.full(500, SLOPE), snr=200.0)
+    outlook = predict_angles(SYSTEM, 1.0, 640.0, 1.1, float(np.median(echoes.amplitude)))
+    done = run(block, echoes, SYSTEM, "incidence_angle").attributes
+    assert outlook.error == pytest.approx(np.median(done["incidence_angle_err"]), rel=0.05)
+    assert outlook.possible and "640 m" in outlook.reason
+    assert not predict_angles(SYSTEM, 1.0, 640.0, 0.05, 50.0).possible
+    short = predict_angles(SYSTEM, 2.0, 640.0, 1.1, 50.0)
+    assert not short.possible and "0.60 samples wide" in short.reason

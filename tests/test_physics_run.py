@@ -148,6 +148,44 @@ def test_wrong_options(tmp_path, tiny_strip, arguments, message):
     assert message in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), {"range": "no stage attribute.range", "reflectance": "not calibrated", "incidence_angle": "divergence"}),
+        (("--flight-height", "800"), {"cross_section": "not calibrated", "backscatter_coefficient": "not calibrated"}),
+    ],
+)
+def test_columns_that_are_not_written_have_a_reason_in_the_report(tmp_path, tiny_strip, arguments, expected):
+    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", *arguments)
+    assert done.exit_code == 0, done.output
+    told = report(tmp_path / "out")["output"]
+    for column, words in expected.items():
+        assert column not in told["columns"] and words in told["not_computed"][column]
+    assert not set(told["not_computed"]) & set(told["columns"])
+
+
+def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path, tiny_strip):
+    chain = tmp_path / "c.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position", "attribute.range",
+              "attribute.relative_backscatter", "attribute.relative_cross_section", "attribute.relative_reflectance",
+              "attribute.cross_section")  # fmt: skip
+    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
+    done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--points", "returns")
+    assert done.exit_code == 0, done.output
+    cloud = laspy.read(next((tmp_path / "out").glob("*.laz")))
+    ranges, gamma, section = columns(tmp_path / "out", "range", "relative_backscatter", "relative_cross_section")
+    known = gamma != -9999
+    assert known.mean() > 0.9 and (gamma[known] > 0).all()
+    assert (section / gamma)[known] == pytest.approx(ranges[known] ** 2, rel=1e-5)
+    said = {entry.name: entry.description for entry in cloud.point_format.extra_dimensions}
+    for name in ("relative_backscatter", "relative_cross_section", "relative_reflectance"):
+        assert "relative" in said[name] and "DN ns m" in said[name]
+    told = report(tmp_path / "out")
+    assert (columns(tmp_path / "out", "cross_section")[0] == -9999).all()
+    assert set(told["counts"]["no_data"]["cross_section"]) == {"NOT_CALIBRATED"}
+    assert any("cross_section: none of" in line and "relative_backscatter" in line for line in told["remarks"])
+
+
 def test_options_that_the_chain_ignores(tmp_path, tiny_strip):
     chain = tmp_path / "c.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position")

@@ -14,6 +14,7 @@ from wavebatch import __version__
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.remarks import explain_absence
 from wavebatch.report import RunReport
 from wavebatch.systemfile import format_survey, write_text
 from wavebatch.work import Prepared, StripJob
@@ -104,6 +105,7 @@ def build_document(
             "size": cloud.stat().st_size,
             "point_format": layout.point_format,
             "columns": {written.column: written.record.name for written in layout.written},
+            "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
         "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.nodata import REASONS, NoData
 from wavebatch.report import AMPLITUDE_BINS, RunReport
@@ -9,17 +11,48 @@ from wavebatch.work import Prepared
 
 _ANGLE = "incidence_angle"
 
+_NEEDS: dict[str, tuple[NoData, ...]] = {
+    "range": (),
+    "backscatter_coefficient": (NoData.NOT_CALIBRATED,),
+    "cross_section": (NoData.NOT_CALIBRATED, NoData.NO_DIVERGENCE),
+    "reflectance": (NoData.NOT_CALIBRATED,),
+    _ANGLE: (NoData.NO_DIVERGENCE,),
+}
+"""Columns that mean something outside the file, and what they need beside the sensor's position."""
+
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
-    """One line per column that was asked for and that no echo has, with the commonest reason and its remedy."""
-    return tuple(
-        _explain(prepared, report, column, counts)
-        for column, counts in sorted(report.no_data.items())
-        if counts and not counts.get(NoData.KNOWN.name)
-    )
+    """One line per column that was asked for and that no echo has, with the commonest reason and its remedy; and one on
+    angles where the beam tells next to none."""
+    lines = []
+    for column, counts in sorted(report.no_data.items()):
+        known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
+        if total and not known:
+            lines.append(_explain(prepared, report, column, counts))
+        elif total and column == _ANGLE:
+            outlook = _look_out(prepared, report)
+            if outlook is not None and not outlook.possible:
+                remedy = REASONS[NoData.UNCERTAIN][1]
+                lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
+    return tuple(lines)
 
 
-def _explain(prepared: Prepared, report: RunReport, column: str, counts: dict[str, int]) -> str:
+def explain_absence(prepared: Prepared) -> dict[str, str]:
+    """Why columns that need sensor, calibration or beam are not computed, by their names."""
+    chain, system = prepared.job.chain, prepared.system
+    lacks = {
+        NoData.NOT_CALIBRATED: system.calibration is None,
+        NoData.NO_DIVERGENCE: system.divergence is None,
+    }
+    told = {}
+    for column, needs in _NEEDS.items():
+        if column not in chain.makes:
+            reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
+            told[column] = reason or f"the chain has no stage attribute.{column}"
+    return told
+
+
+def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping[str, int]) -> str:
     total = sum(counts.values())
     first = max(NoData, key=lambda reason: (counts.get(reason.name, 0), -reason))
     meaning, remedy = REASONS[first]

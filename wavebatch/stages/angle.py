@@ -50,8 +50,8 @@ def incidence_angle(
 
     A plane spreads the pulse by R divergence tan(alpha) / (2 c). No-data where the system pulse is shorter than 0.85
     samples, where sensor or divergence are not known, and where the angle is more uncertain than max_error: with a
-    narrow beam and a long pulse that is everywhere. Echoes narrower than the system pulse have angle 0, and
-    the flag NARROW where that is more than noise: three errors.
+    narrow beam and a long pulse that is everywhere. Rough ground and plants widen echoes too, and read as slopes.
+    Echoes narrower than the system pulse have angle 0, and the flag NARROW where that is more than noise: three errors.
     Source: Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
 
     mode: system takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
