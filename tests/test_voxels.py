@@ -107,7 +107,7 @@ def forest(tmp_path_factory):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize(("scene", "least", "most"), [("flat", 0.99, 1.015), ("forest", 0.985, 1.015)])
+@pytest.mark.parametrize(("scene", "least", "most"), [("flat", 0.997, 1.01), ("forest", 0.995, 1.01)])
 def test_energy_is_that_of_the_echoes(scene, least, most, seed):
     block, truth = simulate_block(scene, 3000, np.random.default_rng(seed))
     profiles = deconvolve_block(block, SYSTEM, Deconvolution())
@@ -184,7 +184,8 @@ def test_a_plane_fills_the_voxels_of_its_layer(tmp_path, size):
     assert centre == pytest.approx(100.02, abs=0.02)
 
 
-def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path):
+@pytest.mark.parametrize(("iterations", "least", "most"), [(None, 0.37, 0.18), (200, 0.46, 0.04)])
+def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path, iterations, least, most):
     pulse = replace(SYSTEM, sigma_ref=4.2)
     separation = 1.2
     strip = write_strip(tmp_path / "two.las", [[(101.35, 60.0), (101.35 - separation, 60.0)]] * 150, sigma=4.2)
@@ -193,7 +194,8 @@ def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path):
     mean = block.samples.mean(axis=0)
     assert np.count_nonzero((mean[1:-1] > mean[:-2]) & (mean[1:-1] >= mean[2:]) & (mean[1:-1] > 20)) == 1
     saved = SavedSurvey(Survey(pulse, 150, {}, ()))
-    _, found = voxelize(strip, tmp_path / "v.npz", 0.3, system=saved, deconvolution=Deconvolution(iterations=200))
+    method = Deconvolution(iterations=iterations)
+    _, found = voxelize(strip, tmp_path / "v.npz", 0.3, system=saved, deconvolution=method)
     layers = sum_by_layer(found)
     energy = sum(layers.values())
     heights = np.array(sorted(layers))
@@ -202,8 +204,8 @@ def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path):
     def near(z):
         return values[np.abs(heights + 0.15 - z) < 0.35].sum()
 
-    assert near(101.35) > 0.35 and near(101.35 - separation) > 0.35
-    assert near(101.35 - separation / 2) < 0.12
+    assert near(101.35) > least and near(101.35 - separation) > least
+    assert near(101.35 - separation / 2) < most
 
 
 def naive_voxels(strip, size, headroom):
@@ -227,9 +229,9 @@ def naive_voxels(strip, size, headroom):
 @pytest.mark.parametrize("headroom", [0.0, 4.0])
 def test_rays_through_voxels_are_those_of_a_slow_tracer(tmp_path, headroom):
     rng = np.random.default_rng(12)
-    directions = DOWN + rng.normal(0, 0.02, (60, 3)) * [1, 1, 0]
-    echoes = [[(103.0, 40.0), (100.0, 50.0)] if i % 3 else [] for i in range(60)]
-    strip = write_strip(tmp_path / "s.las", echoes, directions=directions, xy=rng.uniform(0, 3, (60, 2)))
+    directions = DOWN + rng.normal(0, 0.02, (40, 3)) * [1, 1, 0]
+    echoes = [[(103.0, 40.0), (100.0, 50.0)] if i % 3 else [] for i in range(40)]
+    strip = write_strip(tmp_path / "s.las", echoes, directions=directions, xy=rng.uniform(0, 3, (40, 2)))
     _, found = voxelize(strip, tmp_path / "v.npz", 0.7, headroom=headroom, all_crossed=True)
     slow = naive_voxels(strip, 0.7, headroom)
     base = np.rint(found["origin"] / 0.7)
