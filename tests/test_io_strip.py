@@ -372,3 +372,12 @@ def test_a_file_that_shrinks_while_it_is_read_is_an_input_error(tmp_path):
             reader.read_unit(0, scan)
 
 
+def test_scanner_channels_come_with_their_waveforms(tmp_path):
+    raw = make_raw(12, point_format=9, most_returns=1)
+    raw.points["classification_flags"] = (np.arange(12) % 4) << 4 | 3
+    with StripReader(raw.write(tmp_path / "s.las")) as reader, reader.scan() as scan:
+        blocks = [block for block, _ in reader.read_blocks(reader.read_unit(0, scan), 5, owned_only=True)]
+    assert np.concatenate([block.scanner for block in blocks]).tolist() == [0, 1, 2, 3] * 3
+    with StripReader(make_raw(3).write(tmp_path / "old.las")) as reader, reader.scan() as scan:
+        block, _ = next(iter(reader.read_blocks(reader.read_unit(0, scan), 5, owned_only=True)))
+    assert block.scanner is None

@@ -300,9 +300,16 @@ def test_relative_columns_need_no_calibration_and_become_absolute_with_its_const
 
 def test_channels_have_constants_of_their_own():
     block, echoes, _ = make(np.full(20, 30.0), snr=300.0)
-    one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes
-    two = run(block, echoes, replace(SYSTEM, channels={1: (5.2e-8, 0.0), 2: (1.0, 0.0)}), "backscatter_coefficient")
-    assert two.attributes["backscatter_coefficient"] == pytest.approx(2 * one["backscatter_coefficient"], rel=1e-6)
+    one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    channels = {(1, 0): (5.2e-8, 0.0), (1, 2): (7.8e-8, 0.1), (2, 0): (1.0, 0.0)}
+    system = replace(SYSTEM, channels=channels)
+    two = run(block, echoes, system, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    assert two == pytest.approx(2 * one, rel=1e-6)
+    mixed = replace(block, scanner=np.arange(20, dtype=np.uint8) % 4)
+    done = run(mixed, echoes, system, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    # Scanner channels 1 and 3 have none of their own: they get that of all together.
+    assert done == pytest.approx(np.array([2, 1, 3, 1])[mixed.scanner] * one, rel=1e-6)
+    assert mixed.rows(slice(4, 9)).scanner.tolist() == [0, 1, 2, 3, 0]
 
 
 def test_the_outlook_is_the_error_that_echoes_then_have():

@@ -163,7 +163,7 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
     targets.write_text(f"reflectance,vertices\n{ground}\n")
     done = call("calibrate", two_channels, "--targets", targets, "-o", cal)
     assert done.exit_code == 0, done.output
-    assert "digitizer 1:" in done.stderr and "digitizer 2:" in done.stderr
+    assert "digitizer 1, scanner channel 0:" in done.stderr and "digitizer 2, scanner" in done.stderr
     found = load_calibration(cal)
     strong, weak = found.channels
     assert (strong["digitizer"], weak["digitizer"]) == (1, 2)
@@ -186,11 +186,12 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
     ("table", "message"),
     [
         ("digitizer = 1.5\nconstant = 1e-8\nrelative_error = 0.1", "digitizer must be a whole number"),
+        ("digitizer = 1\nscanner = 4\nconstant = 1e-8\nrelative_error = 0.1", "scanner must lie between 0 and 3"),
         ("digitizer = 0\nconstant = 1e-8\nrelative_error = 0.1", "must lie between 1 and 255"),
         ("digitizer = 1\nrelative_error = 0.1", "key 'constant' is missing"),
         ("digitizer = 1\nconstant = 1e-8\nerror = 0.1", "unknown key 'error'"),
         ("digitizer = 1\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\ndigitizer = 1\nconstant = 1e-8\n"
-         "relative_error = 0.1", "2: digitizer 1 has a channel already"),
+         "relative_error = 0.1", "2: digitizer 1 with scanner channel 0 is there already"),
     ],
 )  # fmt: skip
 def test_wrong_channels_are_one_line(table, message):

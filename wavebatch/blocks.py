@@ -167,6 +167,8 @@ class WaveformBlock:
     """The input's returns in these packets; None for waveforms that never had any."""
     sensor: np.ndarray | None = None
     """Position of the sensor at each pulse, f8 (n, 3) [m]; None where nobody knows it."""
+    scanner: np.ndarray | None = None
+    """Scanner channel of each pulse, u1 (n,); None where points have none: all are 0."""
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -225,6 +227,7 @@ class WaveformBlock:
             direction=self.direction[index],
             returns=returns,
             sensor=None if self.sensor is None else self.sensor[index],
+            scanner=None if self.scanner is None else self.scanner[index],
         )
 
 
@@ -270,15 +273,15 @@ class SystemPulse:
     level_variance: float = 0.0
     """Of level ground's echoes seen from above, less the system pulse's [ns2]; not positive: surveys see slopes too."""
     width_scatter: float = 0.0
-    """Scatter of echo widths of one and the same surface beyond what fits say [ns]: what no model of the pulse tells."""
+    """Scatter of echo widths of one and the same surface beyond what fits say [ns]: no model of a pulse is right."""
     divergence: float | None = None
     """Full angle of the beam between the 1/e^2 points [mrad]; None where nobody knows it."""
     calibration: float | None = None
     """C' of kernels/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
     calibration_err: float = 0.0
     """Standard deviation of the calibration, relative."""
-    channels: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    """The same two of digitizers that have a calibration of their own, by index."""
+    channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
+    """The same two of channels that have a calibration of their own, by index of the digitizer and scanner channel."""
     attenuation: float = 0.22
     """Of the light on its way through the air, one way [dB/km]."""
     sensor_error: float = 0.0
@@ -288,10 +291,16 @@ class SystemPulse:
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
 
-    def calibrate(self, digitizer: int) -> tuple[float, float]:
-        """Calibration of the digitizer with this index, and its relative error; NaN where it has none."""
-        whole = (np.nan if self.calibration is None else self.calibration, self.calibration_err)
-        return self.channels.get(digitizer, whole)
+    def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
+        """Calibration of each waveform's channel, NaN where it has none, and its relative error, f8 (n,)."""
+        n = len(block)
+        constant = np.full(n, np.nan if self.calibration is None else self.calibration)
+        error = np.full(n, self.calibration_err)
+        for (digitizer, scanner), (own, own_err) in self.channels.items():
+            if digitizer == block.digitizer.index:
+                same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
+                constant[same], error[same] = own, own_err
+        return constant, error
 
 
 _FIELDS: dict[str, type] = {

@@ -29,10 +29,11 @@ _NUMBERS = {
 }
 _MORE_NUMBERS = {
     "digitizer": (1, 255, None, "index of the wave packet descriptor"),
+    "scanner": (0, 3, 0, "scanner channel of the points"),
     "spread": (0.0, 1e6, 0.0, "of the echoes' constants, relative, robust standard deviation"),
     "echoes": (0, 1e12, 0, "that it comes from"),
 }
-_CHANNEL = ("digitizer", "constant", "relative_error", "spread", "echoes")
+_CHANNEL = ("digitizer", "scanner", "constant", "relative_error", "spread", "echoes")
 _TEXTS = ("schema", "version", "strip", "date", "conditions")
 _TABLES = ("fingerprint", "target", "channel")
 
@@ -54,7 +55,7 @@ class Calibration:
     targets: tuple[Mapping[str, Any], ...] = ()
     """What each reference target gave: name, reflectance, echoes, constant, spread."""
     channels: tuple[Mapping[str, Any], ...] = ()
-    """Digitizers with a constant of their own: digitizer, constant, relative_error, spread, echoes."""
+    """Channels with a constant of their own: digitizer, scanner, constant, relative_error, spread, echoes."""
 
     def apply(self, system: SystemPulse) -> SystemPulse:
         """The system with this calibration; a divergence of its own stays."""
@@ -62,7 +63,9 @@ class Calibration:
             system,
             calibration=self.constant,
             calibration_err=self.relative_error,
-            channels={row["digitizer"]: (row["constant"], row["relative_error"]) for row in self.channels},
+            channels={
+                (row["digitizer"], row["scanner"]): (row["constant"], row["relative_error"]) for row in self.channels
+            },
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -147,19 +150,25 @@ def parse_calibration(text: str, name: str) -> Calibration:
 def _read_channels(rows: Any, name: str) -> tuple[dict[str, Any], ...]:
     if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
         raise ConfigError(f"{name}: channel must be written as [[channel]] tables")
-    channels: dict[int, dict[str, Any]] = {}
+    channels: dict[tuple[int, int], dict[str, Any]] = {}
     for number, row in enumerate(rows, 1):
         where = f"{name}: [[channel]] {number}"
         for key in row:
             if key not in _CHANNEL:
                 raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, _CHANNEL)}")
-        index = int(_read_number(row, "digitizer", where))
-        if index != row["digitizer"]:
-            raise ConfigError(f"{where}: digitizer must be a whole number, it is {row['digitizer']!r}")
-        if index in channels:
-            raise ConfigError(f"{where}: digitizer {index} has a channel already")
-        channels[index] = {"digitizer": index, **{key: _read_number(row, key, where) for key in _CHANNEL[1:]}}
+        index, scanner = (_read_whole(row, key, where) for key in _CHANNEL[:2])
+        if (index, scanner) in channels:
+            raise ConfigError(f"{where}: digitizer {index} with scanner channel {scanner} is there already")
+        numbers = {key: _read_number(row, key, where) for key in _CHANNEL[2:]}
+        channels[index, scanner] = {"digitizer": index, "scanner": scanner, **numbers}
     return tuple(channels.values())
+
+
+def _read_whole(row: Mapping[str, Any], key: str, where: str) -> int:
+    value = _read_number(row, key, where)
+    if value != int(value):
+        raise ConfigError(f"{where}: {key} must be a whole number, it is {value!r}")
+    return int(value)
 
 
 def _read_number(document: Mapping[str, Any], key: str, name: str) -> float:

@@ -59,7 +59,7 @@ REASONS: dict[NoData, tuple[str, str]] = {
     NoData.TOO_STEEP: ("struck at more than 80 degrees, or widened by more than a slope", "nothing mends that"),
     NoData.UNCERTAIN: (
         "more uncertain than max_error",
-        "raise max_error, or take angles from the points of the surface instead of the width",
+        "raise max_error, or take angles from the points around (stage attribute.incidence_angle_normals)",
     ),
     NoData.OTHER: ("its fit gave no usable value", "see its flags"),
     NoData.NO_RAY: ("its packet has no direction, or it is no point of the cloud", "write --points echoes"),

@@ -31,6 +31,9 @@ LEAST_ECHOES = 10
 MOST_ECHOES = 200_000
 """Echoes that a target takes; more do not make it better."""
 
+SCANNERS = 4
+"""Scanner channels that points can tell apart; a channel is a digitizer times this and a scanner channel."""
+
 _CORNERS = 64
 _BLOCK = 8192
 _UNCLEAN = (
@@ -108,7 +111,7 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
 
 @dataclass(slots=True)
 class _Found:
-    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, digitizer, one row each."""
+    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, channel, one row each."""
 
     rows: list[np.ndarray] = field(default_factory=list)
     number: int = 0
@@ -192,7 +195,8 @@ def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Targe
     distance = np.sqrt((ray * ray).sum(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
         columns = [xyz, distance, echoes.amplitude, echoes.sigma, ray / distance[:, None]]
-    table = np.column_stack([*columns, np.full(len(echoes), block.digitizer.index)])
+    scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(float)
+    table = np.column_stack([*columns, np.full(len(echoes), SCANNERS * block.digitizer.index) + scanner])
     known = np.isfinite(table).all(axis=1)
     for target, place in zip(targets, found, strict=True):
         place.add(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
@@ -200,7 +204,7 @@ def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Targe
 
 def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[dict[str, Any], np.ndarray]:
     """What one target gave - echoes, median of the constant, its relative spread, the angle that was used - and the
-    digitizer and constant of every echo, f8 (n, 2)."""
+    channel and constant of every echo, f8 (n, 2)."""
     named = {"name": target.name, "reflectance": target.reflectance}
     if found.number < LEAST_ECHOES:
         return {**named, "echoes": found.number}, np.empty((0, 2))
@@ -244,15 +248,15 @@ def _combine(results: Sequence[Mapping[str, Any]], reflectance_error: float) -> 
 def _calibrate_channels(
     results: Sequence[tuple[dict[str, Any], np.ndarray]], reflectance_error: float
 ) -> tuple[dict[str, Any], ...]:
-    """The same per digitizer, of a strip whose targets were seen by several; those with too few echoes are left out."""
+    """The same per channel, of a strip whose targets were seen by several; those with too few echoes are left out."""
     every = np.concatenate([echoes for _, echoes in results])
-    digitizers = np.unique(every[:, 0]).astype(int).tolist()
-    if len(digitizers) < 2:
+    channels = np.unique(every[:, 0]).astype(int).tolist()
+    if len(channels) < 2:
         return ()
     rows = []
-    for digitizer in digitizers:
-        own = [_summarise(echoes[echoes[:, 0] == digitizer, 1]) for _, echoes in results]
+    for channel in channels:
+        own = [_summarise(echoes[echoes[:, 0] == channel, 1]) for _, echoes in results]
         found = _combine(own, reflectance_error)
         if found is not None:
-            rows.append({"digitizer": digitizer, **found})
+            rows.append({"digitizer": channel // SCANNERS, "scanner": channel % SCANNERS, **found})
     return tuple(rows)

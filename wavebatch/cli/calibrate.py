@@ -48,8 +48,9 @@ def calibrate(
     """The calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
 
     Only echoes that are alone in their waveform and lie on a target count; angles come from each target's own plane,
-    unless its file gives an incidence. Where several digitizers saw targets, each gets a constant of its own, and all
-    others that of all together. Exit code: 0, 1 where the strip or its targets give no constant, 2 wrong usage.
+    unless its file gives an incidence. Where several channels (digitizers, or scanner channels of the points) saw
+    targets, each gets a constant of its own, and all others that of all together. Exit code: 0, 1 where the strip or
+    its targets give no constant, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.calibration import format_calibration
     from wavebatch.io.publish import refuse_existing
@@ -77,5 +78,6 @@ def calibrate(
     for channel in found.channels:
         error, spread = 100 * channel["relative_error"], 100 * channel["spread"]
         numbers = f"constant {channel['constant']:.4g} +- {error:.1f} %, spread {spread:.1f} %"
-        talk(f"digitizer {channel['digitizer']}: {channel['echoes']} echoes, {numbers}")
+        where = f"digitizer {channel['digitizer']}, scanner channel {channel['scanner']}"
+        talk(f"{where}: {channel['echoes']} echoes, {numbers}")
     talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")

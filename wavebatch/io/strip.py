@@ -248,6 +248,7 @@ class _Geometry:
             returns=ReturnTable(
                 np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
             ),
+            scanner=_read_scanner(records[owner]),
         )
 
     def _take(self, entries: np.ndarray) -> np.ndarray:
@@ -257,6 +258,13 @@ class _Geometry:
         if self._all is None:
             self._all = np.concatenate([unit.points, unit.context])
         return take_records(self._all, entries)
+
+
+def _read_scanner(records: np.ndarray) -> np.ndarray | None:
+    """Scanner channels of records (n,), u1 (n,); None in point formats without."""
+    if "classification_flags" not in records.dtype.names:
+        return None
+    return (records["classification_flags"] >> 4) & 3
 
 
 def _collect_packets(

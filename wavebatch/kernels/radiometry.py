@@ -43,7 +43,7 @@ def calibrate_echoes(
 
 
 def backscatter(
-    constant: float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
+    constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
 ) -> np.ndarray:
     """Backscatter coefficient gamma of each echo: cross section per illuminated area, 4 rho cos(alpha) if Lambertian.
 
@@ -82,7 +82,7 @@ def backscatter_error(
     energy_err: np.ndarray,
     distance: np.ndarray,
     distance_err: np.ndarray | float,
-    constant_err: float,
+    constant_err: np.ndarray | float,
     attenuation: float,
     *,
     power: int = 2,

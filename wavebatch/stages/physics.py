@@ -144,7 +144,7 @@ class _Light(NamedTuple):
 
 def _measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, power: int) -> _Light:
     distance = sensor_distance(block, echoes)
-    constant, constant_err = system.calibrate(block.digitizer.index)
+    constant, constant_err = (values[echoes.waveform] for values in system.calibrate(block))
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     amplitude = np.where(guess, np.nan, echoes.amplitude.astype(np.float64))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -153,7 +153,7 @@ def _measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable,
     fit = echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
     away = np.hypot(system.sensor_error, fit)
     relative = radiometry.backscatter_error(energy, distance, away, constant_err, system.attenuation, power=power)
-    cases = (_no_sensor(distance), (NoData.NOT_CALIBRATED, constant != constant), (NoData.SATURATED, guess))
+    cases = (_no_sensor(distance), (NoData.NOT_CALIBRATED, np.isnan(constant)), (NoData.SATURATED, guess))
     return _Light(distance, gamma, relative, cases)
 
 
