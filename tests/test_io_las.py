@@ -35,7 +35,7 @@ def test_files_that_are_no_las(tmp_path, content):
 
 def test_a_missing_file_and_a_folder(tmp_path):
     refused(tmp_path / "none.las", "cannot be read: No such file")
-    refused(tmp_path, "cannot be read: Is a directory")
+    refused(tmp_path, "cannot be read: it is a folder, a pipe or a device")
 
 
 @pytest.mark.parametrize(("minor", "pattern"), [(2, "version 1.2 has no waveforms"), (6, "version 1.6")])

@@ -10,6 +10,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
 from wavebatch.errors import StageError
+from wavebatch.io.rawbytes import widen
 from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns
 from wavebatch.nodata import count_reasons
 from wavebatch.report import RunReport, count_flags
@@ -222,7 +223,7 @@ def _number_rows(
 
 def _locations(records: np.ndarray) -> np.ndarray:
     """Return locations [ns], for the order of points that share a packet; what is not a number comes first."""
-    return np.nan_to_num(records["return_point_wave_location"].astype(np.float64) / PS_PER_NS, nan=-np.inf)
+    return np.nan_to_num(widen(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
 
 
 def _coordinates(records: np.ndarray, layout: OutputLayout) -> np.ndarray:

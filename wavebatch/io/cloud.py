@@ -84,7 +84,7 @@ class CloudReader:
         if not self.has_packets:
             return rows
         for axis, name in enumerate(("x_t", "y_t", "z_t")):
-            rows["ray"][:, axis] = raw[name]
+            rows["ray"][:, axis] = widen(raw[name])
         return rows[raw["wavepacket_index"] != 0]
 
     def _read_column(self, raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:

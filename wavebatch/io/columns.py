@@ -15,6 +15,7 @@ from wavebatch.blocks import COLUMNS
 from wavebatch.errors import ConfigError
 from wavebatch.io.cloud import CloudReader, find_columns
 from wavebatch.io.names import normalise
+from wavebatch.io.rawbytes import widen
 from wavebatch.words import nearest
 
 VALUE_DTYPE = np.dtype([("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("flags", "<u2")])
@@ -129,7 +130,7 @@ class ColumnReader(CloudReader):
     def _read_standard(self, points: laspy.ScaleAwarePointRecord, name: str) -> np.ndarray:
         if name in "xyz":
             return self._scale(points, "xyz".index(name))
-        values = np.asarray(points[name]).astype(np.float64)
+        values = widen(np.asarray(points[name]))
         values[~np.isfinite(values)] = np.nan
         return values * _SCAN_ANGLE if name == "scan_angle" else values
 

@@ -12,6 +12,7 @@ from typing import BinaryIO
 from laspy import PointFormat
 
 from wavebatch.errors import InputError
+from wavebatch.io.rawbytes import open_regular
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}
 """Bytes of the header by LAS version."""
@@ -133,7 +134,7 @@ def read_header(path: Path) -> LasHeader:
     Raises InputError where the bytes are not those of a LAS file of version 1.0 to 1.5.
     """
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             return _read_header(file, path)
     except OSError as error:
         if isinstance(error, InputError):

@@ -22,6 +22,7 @@ from wavebatch.io.header import (
     has_record,
     read_header_of,
 )
+from wavebatch.io.rawbytes import open_regular
 
 WAVEFORM_FORMATS = (4, 5, 9, 10)
 MAX_FRONT = 1 << 26
@@ -57,7 +58,7 @@ def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     Raises InputError where it is not a LAS/LAZ strip with waveforms, or contradicts itself.
     """
     try:
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             _check_front(path, file, size, (1, 3) if waveforms else (1, 0))
             header = read_header_of(file)

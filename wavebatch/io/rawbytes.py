@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from wavebatch.errors import InputError
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """The file open for reading; InputError for a folder, a device, or a pipe, which would block for ever."""
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise InputError(f"{path}: cannot be read: it is a folder, a pipe or a device; give a file")
+    return open(path, "rb")
 
 
 def read_exactly(fd: int, target: np.ndarray, at: int) -> None:
@@ -39,7 +48,7 @@ def take_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def widen(values: np.ndarray) -> np.ndarray:
     """Floating-point values as f8; signalling NaN, which a damaged file may hold, is NaN and no warning."""
     with np.errstate(invalid="ignore"):
-        return values.astype(np.float64)
+        return values.astype(np.float64) * 1.0  # a copy alone keeps signalling NaN of 8 bytes
 
 
 @contextlib.contextmanager
