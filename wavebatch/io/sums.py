@@ -31,7 +31,7 @@ class KeyedSums:
         self._columns = columns
         self._held = held
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
-        self._parts: list[np.ndarray] = []
+        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         self._number = 0
         self._file: IO[bytes] | None = None
         self._runs: list[_Run] = []
@@ -57,9 +57,8 @@ class KeyedSums:
         """Adds rows: key u8 (m,), value i8 (m, columns)."""
         if not len(key):
             return
-        rows = self._sum(_rows(self._dtype, key, value))
-        self._parts.append(rows)
-        self._number += len(rows)
+        self._parts.append(_sum([(key, value)]))
+        self._number += len(self._parts[-1][0])
         if self._number > self._held:
             self._shrink()
             if self._number > self._held // 2:
@@ -69,16 +68,11 @@ class KeyedSums:
         """Keys, ascending and each once, and their sums, some at a time."""
         if not self._runs:
             self._shrink()
-            for part in self._parts:
-                for begin in range(0, len(part), self._held):
-                    rows = part[begin : begin + self._held]
-                    yield rows["key"], rows["value"]
+            yield from self._parts
             return
         self._spill()
         for low, high in self._cut_ranges():
-            parts = [self._read_range(run, low, high) for run in self._runs if run.touches(low, high)]
-            rows = self._sum(np.concatenate(parts))
-            yield rows["key"], rows["value"]
+            yield _sum([self._read_range(run, low, high) for run in self._runs if run.touches(low, high)])
 
     def _cut_ranges(self) -> Iterator[tuple[int, int]]:
         """Ranges of keys, ascending and none without rows, that hold about as many rows each as are held."""
@@ -89,22 +83,24 @@ class KeyedSums:
     def _shrink(self) -> None:
         """All rows that are held, summed."""
         if len(self._parts) > 1:
-            self._parts = [self._sum(np.concatenate(self._parts))]
-        self._number = sum(len(part) for part in self._parts)
+            self._parts = [_sum(self._parts)]
+        self._number = sum(len(key) for key, _ in self._parts)
 
     def _spill(self) -> None:
         self._shrink()
         with _reported():
             if self._file is None:
                 self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
-            for rows in self._parts:
+            for key, value in self._parts:
+                rows = np.empty(len(key), self._dtype)
+                rows["key"], rows["value"] = key, value
                 first = self._file.seek(0, 2) // self._dtype.itemsize
-                self._file.write(rows.tobytes())
-                self._runs.append(_Run(first, len(rows), rows["key"][::STRIDE].copy(), int(rows["key"][-1])))
+                self._file.write(rows.data)
+                self._runs.append(_Run(first, len(key), key[::STRIDE].copy(), int(key[-1])))
         self._parts, self._number = [], 0
 
-    def _read_range(self, run: _Run, low: int, high: int) -> np.ndarray:
-        """The rows of a run whose keys lie in [low, high)."""
+    def _read_range(self, run: _Run, low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+        """Keys and values of the rows of a run whose keys lie in [low, high)."""
         begin = max(int(np.searchsorted(run.marks, np.uint64(low), side="right")) - 1, 0) * STRIDE
         end = run.number
         if high <= run.last:
@@ -117,16 +113,8 @@ class KeyedSums:
             raise InputError(f"{tempfile.gettempdir()}: a temporary file of sums ends too early; run again")
         rows = np.frombuffer(data, self._dtype)
         last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
-        return rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
-
-    def _sum(self, rows: np.ndarray) -> np.ndarray:
-        """Rows sorted by key, those of one key added up."""
-        if not len(rows):
-            return rows
-        order = np.argsort(rows["key"], kind="stable")
-        key = rows["key"][order]
-        first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-        return _rows(self._dtype, key[first], np.add.reduceat(rows["value"][order], first, axis=0))
+        rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
+        return rows["key"], rows["value"]
 
 
 class _Run(NamedTuple):
@@ -144,10 +132,13 @@ class _Run(NamedTuple):
         return int(self.marks[0]) < high and self.last >= low
 
 
-def _rows(dtype: np.dtype, key: np.ndarray, value: np.ndarray) -> np.ndarray:
-    rows = np.empty(len(key), dtype)
-    rows["key"], rows["value"] = key, value
-    return rows
+def _sum(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Keys of all parts, ascending and each once, and the sums of their rows; there must be some."""
+    key, value = parts[0] if len(parts) == 1 else (np.concatenate(one) for one in zip(*parts, strict=True))
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+    return key[first], np.add.reduceat(np.take(value, order, axis=0), first, axis=0)
 
 
 @contextlib.contextmanager
