@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from strips import descriptor, make_raw, vlr
 
 from wavebatch import secondpass
 from wavebatch.batch import run_batch
@@ -283,3 +284,23 @@ def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
         second.close()
     assert peaks[1] < 1.3 * peaks[0]
     assert peaks[0] < 150e6
+
+
+def test_the_second_pass_is_not_told_as_units(strips, tmp_path, monkeypatch):
+    monkeypatch.setattr(secondpass, "TILE_POINTS", 2000)
+    chain = parse_chain(CHAIN, "test")
+    job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
+    events = []
+    run_batch([job], BatchOptions(tmp_path), events.append)
+    units = [(event["done"], event["of"]) for event in events if event["event"] == "unit"]
+    assert units == [(number + 1, units[0][1]) for number in range(len(units))] and len(units) == units[0][1]
+
+
+def test_strips_that_are_not_in_metres_are_refused(tmp_path):
+    raw = make_raw(60)
+    raw.vlrs = [descriptor(1), vlr(b"LASF_Projection", 34735, np.array([1, 1, 0, 1, 1024, 0, 1, 2], "<u2").tobytes())]
+    raw.write(tmp_path / "s.las")
+    chain = parse_chain(CHAIN, "test")
+    job = StripJob(tmp_path / "s.las", chain, RunOptions(columns=choose_columns(chain)))
+    error = run_batch([job], BatchOptions(tmp_path / "out")).outcomes[0].error
+    assert "coordinates are degrees" in str(error) and "project the strip to metres" in str(error)

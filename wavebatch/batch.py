@@ -161,9 +161,10 @@ class _Batch:
         if strip not in self._active:
             return
         with self._failing(strip):
+            before = strip.written
             strip.take()
             done, units = strip.written, strip.prepared.units
-            if done:
+            if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
             if strip.is_complete:
                 self._end(strip, Outcome(strip.job, "written", strip.finish()))

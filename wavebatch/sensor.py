@@ -96,7 +96,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     Raises InputError where a trajectory cannot be read, does not overlap, or contradicts the packets' vectors, and for
     strips in degrees, feet or geocentric coordinates.
     """
-    _refuse_units(reader, scan)
+    refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
         return _from_file(reader, vectors, request)
@@ -110,10 +110,10 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     return NOBODY
 
 
-def _refuse_units(reader: StripReader, scan: StripScan) -> None:
+def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raises InputError where coordinates are no metres, or nobody can be sure that they are."""
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vector_ratio
-    remedy = "project the strip to metres, or leave out the stages that need the sensor's position"
+    remedy = "project the strip to metres, or leave out the stages that measure in metres"
     for said in units:
         if not said.is_metric:
             what = f"coordinates are {said.describe()}, in which nothing has a range in metres"

@@ -24,7 +24,7 @@ from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
 from wavebatch.levels import measure_level
 from wavebatch.report import RunReport
-from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
+from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.words import nearest
 
 BLOCK_SAMPLES = 1 << 22
@@ -180,6 +180,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             columns = without_columns(job.options.columns, job.chain, choice.chain)
             job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
             surveyed = time.perf_counter()
+            if job.chain.second_step is not None:
+                refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else NOBODY
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
