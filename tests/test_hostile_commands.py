@@ -1,5 +1,6 @@
 """Every command on damaged or strange input: a documented exit code, one line per failure, no warning, no leftovers."""
 
+import json
 import os
 import random
 import sys
@@ -82,3 +83,22 @@ def test_damaged_strips_through_every_command(tmp_path, suffix):
         strip.write_bytes(data)
         for command in rng.sample(COMMANDS, 3):
             invoke(command, strip, tmp_path / "out")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes")
+@pytest.mark.parametrize(
+    "name", [b"not \xff utf-8.las", b"two\nlines.las", b"red \x1b[31m.las", "größe 点.las".encode()]
+)
+def test_names_of_files_may_hold_anything(tmp_path, name):
+    strip = tmp_path / os.fsdecode(name)
+    strip.write_bytes(make_raw(60).write(tmp_path / "plain.las").read_bytes())
+    out = ["-o", str(tmp_path / "out"), "--profile", "fast"]
+    for more in ([], ["--resume"]):
+        done = CliRunner().invoke(main, ["run", str(strip), *out, *more, "--report", str(tmp_path / "batch.json")])
+        assert done.exit_code == 0, done.stderr
+        assert done.stderr.count("\n") == 1 and "\x1b" not in done.stderr
+    assert "is there already" in done.stderr
+    assert json.loads((tmp_path / "batch.json").read_text("utf-8"))["strips"][0]["strip"] == str(strip)
+    strip.write_bytes(b"nothing")
+    done = CliRunner().invoke(main, ["run", str(strip), *out, "--overwrite"])
+    assert done.exit_code == 4 and done.stderr.count("\n") == 1 and done.stderr.startswith("error: /")

@@ -131,7 +131,9 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
     """The document as a file that appears whole or not at all."""
-    write_text(path, json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False) + "\n", overwrite=overwrite)
+    text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False)
+    # Names of files that are not UTF-8 become JSON's own escapes.
+    write_text(path, text.encode(errors="backslashreplace").decode() + "\n", overwrite=overwrite)
 
 
 def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:

@@ -146,7 +146,7 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
     draft = Draft(path, overwrite=overwrite)
     try:
         with reporting(path):
-            draft.file.write(text.encode())
+            draft.file.write(text.encode(errors="replace"))  # a strip's name can be any bytes
         draft.publish()
     finally:
         draft.discard()

@@ -36,17 +36,23 @@ class NearestGroup(click.Group):
 
 def talk(message: str) -> None:
     """One line on stderr."""
-    click.echo(message, err=True)
+    click.echo(printable(message), err=True)
+
+
+def printable(text: str) -> str:
+    """The text without what would change the terminal or begin another line: names of files may hold anything."""
+    return "".join(c if c.isprintable() else " " if c.isspace() else repr(c)[1:-1] for c in text)
 
 
 def print_json(value: Any) -> None:
     """`value` as JSON with sorted keys on stdout."""
-    click.echo(json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False))
+    text = json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)
+    click.echo(text.encode(errors="backslashreplace").decode())
 
 
 def one_line(error: BaseException) -> str:
     """The error's message without line breaks; a bug shows its type too."""
-    text = " ".join(str(error).split())
+    text = printable(" ".join(str(error).split()))
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import one_line
+from wavebatch.cli.common import one_line, printable
 from wavebatch.nodata import REASONS, NoData
 
 KINDS = ("auto", "bar", "json", "none")
@@ -59,13 +59,13 @@ class Progress:
         if error is not None and not event["again"]:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
-            self._say(f"error: {_place(strip, one_line(error))}")
+            self._say(f"error: {_place(printable(strip), one_line(error))}")
         elif kind == "written" and self._level >= 0:
-            self._say(_summary(event, self._level > 0))
+            self._say(printable(_summary(event, self._level > 0)))
             for line in [*_reasons(event["counts"]["no_data"])] * (self._level > 0) + event["remarks"]:
-                self._say(f"{strip}: {line}")
+                self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
-            self._say(f"{strip}: is there already")
+            self._say(printable(f"{strip}: is there already"))
 
     def _advance(self, strip: str, share: float) -> None:
         done = round(self._sizes.get(strip, 0) * share)

@@ -196,7 +196,8 @@ def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, A
         "generating_software": source.generating_software.split(b"\0")[0].decode("latin-1"),
     }
     account = {"wavebatch": __version__, "input_header": made_by, **provenance}
-    payload = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain).encode()
+    text = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
+    payload = text.encode(errors="backslashreplace")
     if len(payload) > 65535:
         raise ConfigError(f"{path}: the provenance of its output takes {len(payload)} bytes, a VLR holds 65535")
     return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
