@@ -22,13 +22,15 @@ from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.blocks import simulate_block
 from wavebatch.simulate.geometry import Flight
+from wavebatch.simulate.pulses import find_pulse
+from wavebatch.simulate.render import Recording
 from wavebatch.simulate.strip import WKT, StripOptions
-from wavebatch.survey import Survey
+from wavebatch.survey import Survey, measure_block
 from wavebatch.systemfile import SavedSurvey
 from wavebatch.units import HALF_C, SQRT_2PI
 from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
 from wavebatch.voxels.ceiling import Ceiling
-from wavebatch.voxels.profile import deconvolve_block
+from wavebatch.voxels.profile import _pulse_taps, deconvolve_block
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.05)
 SAVED = SavedSurvey(Survey(SYSTEM, 1000, {}, ()))
@@ -113,6 +115,29 @@ def test_energy_is_that_of_the_echoes(scene, least, most, seed):
     profiles = deconvolve_block(block, SYSTEM, Deconvolution())
     energy = profiles.value.sum() * profiles.area
     assert least < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < most
+
+
+@pytest.mark.parametrize("name", ["riegl", "leica"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_energy_of_learned_pulses_is_that_of_the_waveforms(name, seed):
+    recording = Recording(n_samples=160, pulse=find_pulse(name), baseline_spread=0.0)
+    block, truth = simulate_block("flat", 3000, np.random.default_rng(seed), recording=recording)
+    system = measure_block(block)
+    assert len(system.components) > 1
+    profiles = deconvolve_block(block, system, Deconvolution())
+    energy = profiles.value.sum() * profiles.area
+    assert energy == pytest.approx(float((block.samples - 12.0).sum()), rel=0.04)
+    off = np.arange(160) - truth.time[:, None]
+    near = profiles.value[truth.waveform][np.abs(off) < 3].sum()
+    assert near > 0.97 * profiles.value.sum()
+
+
+def test_a_learned_pulse_ends_where_nothing_was_measured():
+    wide = replace(SYSTEM, sigma_ref=1.86, components=((1.0, 0.0, 1.83), (0.025, -0.3, 13.6), (0.03, 10.9, 1.2)))
+    taps, area = _pulse_taps(wide, 1.0)
+    lag = np.flatnonzero(taps) - len(taps) // 2
+    assert lag.min() == -9 and lag.max() == 25 and taps.max() == pytest.approx(1.0, abs=0.01)
+    assert area == pytest.approx(taps.sum())
 
 
 @pytest.mark.parametrize("method", ["gold", "wiener"])

@@ -25,9 +25,9 @@ def convolve_pulse(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
     total = signal.dtype.type(taps[half]) * signal
     for i, tap in enumerate(taps.tolist()):
         lag = i - half
-        if lag > 0 and lag < s:
+        if tap and lag > 0 and lag < s:
             total[lag:] += signal.dtype.type(tap) * signal[:-lag]
-        elif lag < 0 and -lag < s:
+        elif tap and lag < 0 and -lag < s:
             total[:lag] += signal.dtype.type(tap) * signal[-lag:]
     return total
 

@@ -12,6 +12,7 @@ from wavebatch.errors import ConfigError
 from wavebatch.kernels.deconvolve import deconvolve_gold, deconvolve_richardson_lucy, deconvolve_wiener, wiener_taps
 from wavebatch.kernels.profiles import fit_height, keep_signal, measure_offsets, window_signal
 from wavebatch.kernels.signal import SMOOTH_GAIN, smooth_121, widen
+from wavebatch.measuring import AFTER, BEFORE
 from wavebatch.stages.candidates import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.reference import reference_pulse
@@ -39,7 +40,8 @@ TOLERANCE = 2.5
 AT_A_TIME = 1024
 """Waveforms whose arrays stay in the cache together."""
 
-_REACH, _LONGEST = 4.0, 40.0
+_REACH = 4.0
+"""Half of a pulse that was not learned, and what is looked at beside signal, in widths of the system pulse."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +149,19 @@ def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: 
 
 
 def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]:
-    """Samples of the system pulse of height 1, its tails and after-pulses too, and its integral [ns]."""
-    far = max((abs(delay) + _REACH * sigma for _, delay, sigma in system.components), default=0.0)
-    reach = float(np.clip(far / system.sigma_ref, _REACH, _LONGEST))
-    taps = reference_pulse(system, spacing, "system", reach).taps
+    """Samples of the system pulse of height 1, its tail and after-pulses too, and its integral [ns].
+
+    A learned pulse is cut where the echoes that it was learned from were: what its Gaussians say beyond is nothing
+    that anybody measured.
+    """
+    if not system.components:
+        taps = reference_pulse(system, spacing, "system", _REACH).taps
+        return taps, float(np.sum(taps)) * spacing
+    width = system.sigma_ref / spacing
+    unit = max(width / 2, 1.0)
+    given = reference_pulse(system, spacing, "system", AFTER * unit / width)
+    lag = np.arange(len(given.taps)) - given.middle
+    taps = np.where((lag >= -BEFORE * unit) & (lag <= AFTER * unit), given.taps, 0.0)
     return taps, float(np.sum(taps)) * spacing
 
 
