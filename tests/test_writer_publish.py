@@ -187,3 +187,19 @@ def test_published_files_get_the_usual_permissions(tmp_path):
     finally:
         os.umask(old)
     assert (tmp_path / "a").stat().st_mode & 0o777 == 0o644
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX systems")
+@pytest.mark.parametrize(("command", "most"), [("run", 0), ("run", 3000), ("voxelize", 3000)])
+def test_a_full_disk_is_told_as_such_by_compressors_and_on_closing_too(tmp_path, tiny_strip, command, most):
+    """A compressor says only that it could not seek; a file that is closed writes what it holds."""
+    more = ["-o", tmp_path, "--profile", "fast"] if command == "run" else ["-o", tmp_path / "a.npz", "--size", "2"]
+    code = (
+        "import resource, signal; from wavebatch.cli import main; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({most},) * 2); main()"
+    )
+    arguments = [sys.executable, "-c", code, command, tiny_strip, *more]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    assert done.returncode == (4 if command == "run" else 1) and done.stderr.count("\n") == 1, done.stderr
+    assert "File too large; free space or choose another output folder" in done.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import lazrs
 import numpy as np
@@ -51,11 +51,20 @@ class _WatchedFile:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._error: OSError | None = None
-        self.seek, self.tell, self.read, self.flush = file.seek, file.tell, file.read, file.flush
+        self.tell, self.read = file.tell, file.read
 
     def write(self, data: bytes) -> int:
+        return self._watch(self._file.write, data)
+
+    def seek(self, *place: int) -> int:
+        return self._watch(self._file.seek, *place)
+
+    def flush(self) -> None:
+        self._watch(self._file.flush)
+
+    def _watch(self, function: Callable, *arguments: Any) -> Any:
         try:
-            return self._file.write(data)
+            return function(*arguments)
         except OSError as error:
             self._error = self._error or error
             raise

@@ -69,7 +69,8 @@ class NpzWriter:
 
     def discard(self) -> None:
         """Closes and removes everything temporary; harmless after `publish`."""
-        self._opened.close()
+        with contextlib.suppress(OSError):  # a full disk has been told when it was written to
+            self._opened.close()
 
 
 def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
