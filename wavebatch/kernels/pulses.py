@@ -32,9 +32,28 @@ def find_nearest(
     Of two equally near ones the earlier. Times are compared as they are, so that the answer depends on nothing but the
     waveform's own echoes and returns.
     """
+    if not len(return_waveform) or not len(echo_waveform):
+        return np.full(len(echo_waveform), -1, np.int64)
+    number = np.bincount(return_waveform, minlength=int(echo_waveform.max()) + 1)
+    last = np.full(len(number), -1, np.int64)
+    last[return_waveform] = np.arange(len(return_waveform))
+    nearest = last[echo_waveform]
+    # Most waveforms have one return: only the others need an order.
+    echoes = np.flatnonzero(number[echo_waveform] > 1)
+    if len(echoes):
+        returns = np.flatnonzero(number[return_waveform] > 1)
+        found = _find_nearest_of_many(
+            echo_waveform[echoes], echo_time[echoes], return_waveform[returns], return_time[returns]
+        )
+        nearest[echoes] = np.where(found >= 0, returns[found], -1)
+    return nearest
+
+
+def _find_nearest_of_many(
+    echo_waveform: np.ndarray, echo_time: np.ndarray, return_waveform: np.ndarray, return_time: np.ndarray
+) -> np.ndarray:
+    """As find_nearest, with any number of returns in each waveform."""
     k, m = len(return_waveform), len(echo_waveform)
-    if not k or not m:
-        return np.full(m, -1, np.int64)
     first = np.lexsort((return_time, return_waveform))
     waveform, time = return_waveform[first], return_time[first]
     is_echo = np.repeat([False, True], [k, m])
