@@ -5,10 +5,10 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from wavebatch.batch import run_batch
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.task import BatchOptions
+from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.config import load_profile
-from wavebatch.task import BatchOptions
-from wavebatch.work import RunOptions, StripJob, choose_columns
 
 
 def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
-from wavebatch.assemble import assemble_returns, gather_echoes
+from wavebatch.batch.assemble import assemble_returns, gather_echoes
+from wavebatch.batch.work import prepare_strip
 from wavebatch.blocks import EchoFlag
 from wavebatch.errors import StageError
 from wavebatch.io.strip import StripReader
 from wavebatch.kernels.pulses import LONGEST_PULSE
-from wavebatch.work import prepare_strip
 
 
 def _spoil(points):

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
-from wavebatch.batch import run_batch
+from wavebatch.batch.plan import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.task import BatchOptions, StripTask
+from wavebatch.batch.work import RunOptions, choose_columns, prepare_strip
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.writer import read_provenance
-from wavebatch.plan import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
-from wavebatch.task import BatchOptions, StripTask
-from wavebatch.work import RunOptions, choose_columns, prepare_strip
 
 
 def _report(folder, stem):
@@ -161,7 +161,7 @@ def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, monkeypatc
     elif change == "no report":
         report.unlink()
     else:
-        monkeypatch.setattr("wavebatch.record.__version__", "9.9")
+        monkeypatch.setattr("wavebatch.batch.record.__version__", "9.9")
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "written"
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "skipped"
     assert _files(folder) == ["tiny.laz", "tiny.report.json"]
@@ -178,7 +178,7 @@ def test_a_failure_while_writing_leaves_nothing(tiny_strip, tmp_path, monkeypatc
 
 
 def test_an_account_that_does_not_add_up_is_a_failure_not_a_cloud(tiny_strip, tmp_path, monkeypatch):
-    from wavebatch import report
+    from wavebatch.batch import report
 
     real = report.RunReport.of_echoes.__func__
 
@@ -196,7 +196,7 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
     shutil.copyfile(tiny_strip, strip)
     task = StripTask(make_job(strip), BatchOptions(tmp_path), alone=False)
     assert task.start() is None
-    from wavebatch.workers import Workers
+    from wavebatch.batch.workers import Workers
 
     with Workers(1) as workers:
         while not task.is_complete:

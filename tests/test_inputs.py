@@ -2,8 +2,8 @@
 
 import pytest
 
+from wavebatch.batch.inputs import find_strips
 from wavebatch.errors import ConfigError
-from wavebatch.inputs import find_strips
 
 
 @pytest.fixture

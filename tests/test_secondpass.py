@@ -13,8 +13,11 @@ import pytest
 from click.testing import CliRunner
 from strips import descriptor, make_raw, vlr
 
-from wavebatch import secondpass
-from wavebatch.batch import run_batch
+from wavebatch.batch import secondpass
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.secondpass import SecondPass, process_tile
+from wavebatch.batch.task import BatchOptions
+from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.blocks import RAY
 from wavebatch.chain import STAGES, Step
 from wavebatch.cli import main
@@ -22,11 +25,8 @@ from wavebatch.config import parse_chain
 from wavebatch.errors import ConfigError
 from wavebatch.io import spool
 from wavebatch.io.layout import plan_output
-from wavebatch.secondpass import SecondPass, process_tile
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
-from wavebatch.task import BatchOptions
-from wavebatch.work import RunOptions, StripJob, choose_columns
 
 STAGE = "attribute.incidence_angle_normals"
 COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]
@@ -119,7 +119,7 @@ def test_returns_and_other_names(strips, clouds, tmp_path):
 
 
 def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.task.SecondPass", None)
+    monkeypatch.setattr("wavebatch.batch.task.SecondPass", None)
     report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
     assert not report.no_data
     assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names
@@ -144,7 +144,7 @@ def test_wrong_parameters_are_one_line(strips, tmp_path, value):
 
 _DIE = """
 import os, sys
-from wavebatch import secondpass
+from wavebatch.batch import secondpass
 def die(*arguments):
     os.kill(os.getpid(), 9)
 secondpass.SecondPass.{method} = die

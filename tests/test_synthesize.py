@@ -9,7 +9,7 @@ from batch_tools import read_cloud, run_one
 from click.testing import CliRunner
 
 from wavebatch.cli.synthesize import synthesize
-from wavebatch.compare import compare_clouds
+from wavebatch.compare.clouds import compare_clouds
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.inspection import check_file
 from wavebatch.io.strip import StripReader

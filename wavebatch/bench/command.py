@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.auto import choose_chain
+from wavebatch.batch.work import BLOCK_SAMPLES
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.methods import list_methods
@@ -27,7 +28,6 @@ from wavebatch.config import load_chain, load_profile
 from wavebatch.errors import ConfigError
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.survey import Survey
-from wavebatch.work import BLOCK_SAMPLES
 
 SCHEMA = "wavebatch.bench/1"
 

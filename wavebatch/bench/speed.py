@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch import run_batch
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.task import BatchOptions
+from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.worker import Worker, peak_memory
 from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
 from wavebatch.simulate import Scene, simulate_strip
-from wavebatch.task import BatchOptions
-from wavebatch.work import RunOptions, StripJob, choose_columns
 
 PREPARATION = ("scan", "survey")
 """Parts of a run that a strip pays once, whatever its length."""

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from wavebatch.cli.angles import list_lines, measure
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
-from wavebatch.compare import Comparison, compare_clouds, compare_truth
+from wavebatch.cli.compare_angles import list_lines, measure
+from wavebatch.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
-    from wavebatch.matchup import Matchup
+    from wavebatch.compare.chains import Matchup
 
 EXIT_VIOLATED = 1
 """A threshold is not met."""
@@ -95,13 +95,13 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
 
 
 def _is_chain(side: Path) -> bool:
-    from wavebatch.matchup import find_contender
+    from wavebatch.compare.chains import find_contender
 
     return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
 
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
-    from wavebatch.matchup import find_contender, match_sides
+    from wavebatch.compare.chains import find_contender, match_sides
     from wavebatch.systemfile import load_survey
 
     if truth is not None:

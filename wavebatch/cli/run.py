@@ -139,12 +139,12 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
+    from wavebatch.batch.inputs import find_strips
+    from wavebatch.batch.plan import check_outputs, plan_memory
+    from wavebatch.batch.task import BatchOptions
+    from wavebatch.batch.work import RunOptions, StripJob, choose_columns
     from wavebatch.calibration import load_calibration
-    from wavebatch.inputs import find_strips
-    from wavebatch.plan import check_outputs, plan_memory
     from wavebatch.sensor import SensorRequest
-    from wavebatch.task import BatchOptions
-    from wavebatch.work import RunOptions, StripJob, choose_columns
 
     chain, request = choose_chain(options)
     calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
@@ -240,9 +240,9 @@ def _read_tolerance(text: str | None) -> float | None:
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch import run_batch
+    from wavebatch.batch.record import write_json
+    from wavebatch.batch.run import run_batch
     from wavebatch.cli.progress import Progress
-    from wavebatch.record import write_json
 
     level = -1 if options["quiet"] else int(options["verbose"])
     with Progress([job.path for job in jobs], options["progress"], level, options["debug"]) as progress:
@@ -269,8 +269,8 @@ def exit_code(failed: int, strips: int) -> int:
 
 
 def _dry_run(jobs: list[Any], batch_options: Any) -> int:
+    from wavebatch.batch.plan import plan_strip
     from wavebatch.config import effective
-    from wavebatch.plan import plan_strip
 
     failed = 0
     for job in jobs:

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from wavebatch.breakdown import Breakdown, Table
-from wavebatch.differences import SPEED, Differences, Spread
+from wavebatch.compare.breakdown import Breakdown, Table
+from wavebatch.compare.differences import SPEED, Differences, Spread
 from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
 
 

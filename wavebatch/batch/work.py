@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from wavebatch.angles import angle_parameters
-from wavebatch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.auto import without_columns
+from wavebatch.batch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.report import RunReport
 from wavebatch.blocks import COLUMNS, RAY, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.chain import STAGES, Chain, Step
@@ -23,7 +24,6 @@ from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
 from wavebatch.levels import measure_level
-from wavebatch.report import RunReport
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.words import nearest
 

@@ -19,6 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.batch.report import RunReport
+from wavebatch.batch.work import unpack
 from wavebatch.blocks import COLUMNS, RAY
 from wavebatch.chain import Step
 from wavebatch.io.layout import OutputLayout
@@ -27,8 +29,6 @@ from wavebatch.io.spool import Spool
 from wavebatch.kernels.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
 from wavebatch.nodata import NoData
-from wavebatch.report import RunReport
-from wavebatch.work import unpack
 
 TILE_POINTS = 150_000
 """Points of a tile, about, without its buffer."""

@@ -6,7 +6,7 @@ import pytest
 
 from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Step
-from wavebatch.goodness import FitQuality, measure_fit
+from wavebatch.compare.goodness import FitQuality, measure_fit
 from wavebatch.stages.models import MODELS, rebuild_waveforms
 
 FINE = 100.0

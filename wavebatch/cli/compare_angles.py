@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from wavebatch.agreement import AngleAgreement
+    from wavebatch.compare.angles import AngleAgreement
 
 _BAR = 40
 
 
 def measure(a: Path, b: Path | None, options: dict) -> AngleAgreement:
     """The agreement of one cloud or two; UsageError for options that mean nothing here."""
-    from wavebatch.agreement import compare_angles
+    from wavebatch.compare.angles import compare_angles
 
     for name, value in options.items():
         if value is not None and name not in ("tolerance", "debug"):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch import matchup
 from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
-from wavebatch.compare import compare_clouds
+from wavebatch.compare import chains
+from wavebatch.compare.chains import ChainRun, Contender, find_contender, match_chains, match_sides
+from wavebatch.compare.clouds import compare_clouds
 from wavebatch.errors import InputError
 from wavebatch.io.strip import StripReader
-from wavebatch.matchup import ChainRun, Contender, find_contender, match_chains, match_sides
 
 
 def make_chain(detector, decomposer, **parameters):
@@ -65,7 +65,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     sides = find_contender("fast"), find_contender("accurate")
     result = match_sides(mixed / "s.las", *sides)
     with StripReader(mixed / "s.las") as reader, reader.scan() as scan:
-        system = matchup.survey_sample(matchup.read_sample(reader, scan)).system
+        system = chains.survey_sample(chains.read_sample(reader, scan)).system
         ((block, _),) = list(reader.read_blocks(reader.read_unit(0, scan), 5000, owned_only=True))
     a, b = (side.chain.run(block, system) for side in sides)
     differences, exact, counts = [], 0, ({}, {})
@@ -89,7 +89,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     assert spread.nmad == pytest.approx(nmad, rel=1e-6)
     assert between.gain == pytest.approx(len(a) / len(b) - 1)
     assert result.returns == len(block.returns)
-    monkeypatch.setattr(matchup, "_BLOCK", 97)
+    monkeypatch.setattr(chains, "_BLOCK", 97)
     parts = match_sides(mixed / "s.las", *sides)
     assert parts.between.differences["time"].rms == pytest.approx(spread.rms, rel=1e-12)
     assert parts.vendor["b"].missed_by == result.vendor["b"].missed_by

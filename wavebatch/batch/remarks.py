@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
+from wavebatch.batch.report import AMPLITUDE_BINS, RunReport
+from wavebatch.batch.work import Prepared
 from wavebatch.nodata import REASONS, NoData
-from wavebatch.report import AMPLITUDE_BINS, RunReport
-from wavebatch.work import Prepared
 
 _ANGLE = "incidence_angle"
 

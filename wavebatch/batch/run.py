@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.cluster import Cluster
+from wavebatch.batch.cluster import Cluster
+from wavebatch.batch.plan import check_outputs
+from wavebatch.batch.record import BATCH_SCHEMA, build_timing
+from wavebatch.batch.report import RunReport
+from wavebatch.batch.task import BatchOptions, StripTask
+from wavebatch.batch.work import StripJob
+from wavebatch.batch.workers import Workers
 from wavebatch.errors import InputError
 from wavebatch.io.publish import remove_stale, reporting
-from wavebatch.plan import check_outputs
-from wavebatch.record import BATCH_SCHEMA, build_timing
-from wavebatch.report import RunReport
-from wavebatch.task import BatchOptions, StripTask
-from wavebatch.work import StripJob
-from wavebatch.workers import Workers
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
+from wavebatch.batch.remarks import explain_absence
+from wavebatch.batch.report import RunReport
+from wavebatch.batch.work import Prepared, StripJob
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.io.fingerprint import take_fingerprint
-from wavebatch.remarks import explain_absence
-from wavebatch.report import RunReport
 from wavebatch.systemfile import format_survey, write_text
-from wavebatch.work import Prepared, StripJob
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 BATCH_SCHEMA = "wavebatch.batch-report/1"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.differences import SPEED
+from wavebatch.compare.differences import SPEED
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.evaluate import list_pairs, pair_nearest
 from wavebatch.io.anglefile import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.blocks import EchoFlag
-from wavebatch.comparison import Comparison, Pairing
+from wavebatch.compare.pairing import Comparison, Pairing
 from wavebatch.errors import ConfigError
 from wavebatch.io.buckets import Buckets
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader

@@ -12,12 +12,12 @@ from wavebatch.auto import choose_chain
 from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import read_sample, survey_sample
-from wavebatch.compare import PACKET_DTYPE, check_tolerance, open_task, read_echoes
-from wavebatch.comparison import Comparison, Pairing
+from wavebatch.compare.clouds import PACKET_DTYPE, check_tolerance, open_task, read_echoes
+from wavebatch.compare.differences import SPEED
+from wavebatch.compare.goodness import FitQuality, Goodness, measure_fit
+from wavebatch.compare.pairing import Comparison, Pairing
 from wavebatch.config import list_profiles, load_chain, load_profile
-from wavebatch.differences import SPEED
 from wavebatch.errors import ConfigError
-from wavebatch.goodness import FitQuality, Goodness, measure_fit
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.io.strip import StripReader, StripScan
 from wavebatch.survey import Survey

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from wavebatch.batch.report import RunReport, count_flags
 from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
 from wavebatch.errors import StageError
 from wavebatch.io.rawbytes import widen
 from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns
 from wavebatch.nodata import count_reasons
-from wavebatch.report import RunReport, count_flags
 from wavebatch.units import PS_PER_NS
 
 if TYPE_CHECKING:

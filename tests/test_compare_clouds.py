@@ -4,10 +4,10 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch import compare as module
 from wavebatch.blocks import EchoFlag
-from wavebatch.compare import compare_clouds, compare_truth
-from wavebatch.differences import SPEED, Differences, measure_lag
+from wavebatch.compare import clouds as module
+from wavebatch.compare.clouds import compare_clouds, compare_truth
+from wavebatch.compare.differences import SPEED, Differences, measure_lag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.kernels.bounds import crlb

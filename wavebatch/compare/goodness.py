@@ -8,7 +8,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import Step
-from wavebatch.differences import EvenSample
+from wavebatch.compare.differences import EvenSample
 from wavebatch.stages.models import rebuild_waveforms
 from wavebatch.stages.shapes import clip_level
 

@@ -12,12 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wavebatch.cluster import Cluster
-from wavebatch.errors import InputError
-from wavebatch.io.fingerprint import take_fingerprint
-from wavebatch.io.publish import refuse_existing
-from wavebatch.io.writer import CloudWriter
-from wavebatch.record import (
+from wavebatch.batch.cluster import Cluster
+from wavebatch.batch.record import (
     build_document,
     cloud_path,
     describe_chain,
@@ -27,11 +23,15 @@ from wavebatch.record import (
     report_path,
     write_json,
 )
-from wavebatch.remarks import find_remarks
-from wavebatch.report import RunReport
-from wavebatch.secondpass import SecondPass, process_tile
-from wavebatch.work import Prepared, StripJob, prepare_strip, process_packed_unit
-from wavebatch.workers import Workers
+from wavebatch.batch.remarks import find_remarks
+from wavebatch.batch.report import RunReport
+from wavebatch.batch.secondpass import SecondPass, process_tile
+from wavebatch.batch.work import Prepared, StripJob, prepare_strip, process_packed_unit
+from wavebatch.batch.workers import Workers
+from wavebatch.errors import InputError
+from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.io.publish import refuse_existing
+from wavebatch.io.writer import CloudWriter
 
 
 @dataclass(frozen=True, slots=True)

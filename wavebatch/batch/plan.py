@@ -7,10 +7,10 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
+from wavebatch.batch.record import cloud_path
+from wavebatch.batch.task import BatchOptions, StripTask
+from wavebatch.batch.work import StripJob, plan_layout
 from wavebatch.errors import ConfigError
-from wavebatch.record import cloud_path
-from wavebatch.task import BatchOptions, StripTask
-from wavebatch.work import StripJob, plan_layout
 
 LEAST_MEMORY = 300 << 20
 """Bytes that one process needs with the smallest blocks."""
