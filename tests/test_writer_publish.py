@@ -11,7 +11,8 @@ import pytest
 
 from wavebatch.errors import InputError
 from wavebatch.io import publish
-from wavebatch.io.publish import Draft, publish_together, refuse_existing, remove_stale
+from wavebatch.io.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
+from wavebatch.systemfile import write_text
 
 
 def write(target, text, *, overwrite=False):
@@ -54,6 +55,37 @@ def test_overwrite_replaces(tmp_path):
     target.write_bytes(b"old")
     write(target, b"new", overwrite=True).publish()
     assert names(tmp_path) == ["a"] and target.read_bytes() == b"new"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_devices_and_pipes_are_never_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for target in (pipe, "/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
+        assert is_stream(target)
+        with pytest.raises(InputError, match="is a device or a pipe, .*; name another"):
+            Draft(target, overwrite=True)
+    with pytest.raises(InputError, match="pipe: is a device or a pipe"):
+        refuse_existing(pipe)
+    assert names(tmp_path) == ["pipe"]
+    for name in (tmp_path / "a", tmp_path, tmp_path / "none" / "a", "/dev/shm/a"):
+        assert not is_stream(name)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+def test_text_goes_into_a_pipe_that_somebody_reads(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="pipe: cannot be written: "):  # and is not waited for
+        write_text(pipe, "lost", overwrite=True)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_text(pipe, "text", overwrite=True)
+        assert os.read(reader, 10) == b"text"
+    finally:
+        os.close(reader)
+    write_text("/dev/null", "text", overwrite=True)
+    assert names(tmp_path) == ["pipe"] and is_stream("/dev/null")
 
 
 def test_a_dangling_link_is_not_written_through(tmp_path):

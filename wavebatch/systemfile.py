@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from wavebatch import __version__
 from wavebatch.blocks import SystemPulse
 from wavebatch.errors import ConfigError
-from wavebatch.io.publish import Draft, reporting
+from wavebatch.io.publish import Draft, is_stream, open_stream, reporting
 from wavebatch.survey import Decision, Survey
 from wavebatch.words import nearest
 
@@ -142,11 +142,19 @@ def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """A text file that appears whole or not at all; InputError where it exists or cannot be written."""
+    """A text file that appears whole or not at all; InputError where it exists or cannot be written.
+
+    With overwrite a device or a pipe (/dev/null, /dev/stdout) gets the text as it is.
+    """
+    data = text.encode(errors="replace")  # a strip's name can be any bytes
+    if overwrite and is_stream(path):
+        with reporting(path), open_stream(path) as stream:
+            stream.write(data)
+        return
     draft = Draft(path, overwrite=overwrite)
     try:
         with reporting(path):
-            draft.file.write(text.encode(errors="replace"))  # a strip's name can be any bytes
+            draft.file.write(data)
         draft.publish()
     finally:
         draft.discard()

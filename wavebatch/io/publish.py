@@ -7,8 +7,10 @@ import errno
 import filecmp
 import os
 import secrets
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 from wavebatch.errors import InputError
 
@@ -46,12 +48,14 @@ class Draft:
     """A file being written: `file` is open under a temporary name, for reading too, and locked while its process lives.
 
     target: the name it will have. overwrite: whether publishing replaces a file of that name.
-    Raises InputError where the folder cannot be written.
+    Raises InputError where the folder cannot be written, or the name is that of a device or a pipe.
     """
 
     def __init__(self, target: Path, *, overwrite: bool) -> None:
         self.target = Path(target)
         self.overwrite = overwrite
+        if is_stream(self.target):
+            raise InputError(_no_file(self.target))
         with reporting(self.target):
             self.path, descriptor = _create(self.target.parent)
         self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
@@ -92,6 +96,26 @@ class Draft:
         if self.published and not self.overwrite:
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
+
+
+def is_stream(target: Path) -> bool:
+    """Whether the name is that of a device, a pipe or a socket, which no file may replace: root could do it."""
+    folder = Path(os.path.realpath(Path(target).parent))
+    if folder.as_posix() in ("/dev", "/dev/fd") or folder.is_relative_to("/proc"):  # links to files there, too
+        return True
+    try:
+        mode = os.lstat(target).st_mode
+    except OSError:
+        return False
+    return not (stat.S_ISREG(mode) or stat.S_ISLNK(mode) or stat.S_ISDIR(mode))
+
+
+def open_stream(target: Path) -> BinaryIO:
+    """A device or a pipe for writing; a pipe that nobody reads is an OSError, not waited for."""
+    descriptor = os.open(target, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
+    if hasattr(os, "set_blocking"):
+        os.set_blocking(descriptor, True)
+    return os.fdopen(descriptor, "wb")
 
 
 def refuse_existing(target: Path) -> None:
@@ -138,8 +162,14 @@ def remove_stale(folder: Path) -> list[Path]:
     return removed
 
 
+def _no_file(target: Path) -> str:
+    return f"{target}: is a device or a pipe, and this output must be a file of its own; name another"
+
+
 def _exists(target: Path) -> str:
-    return f"{target}: exists already; choose another output folder or replace it with --overwrite"
+    if is_stream(target):
+        return _no_file(target)
+    return f"{target}: exists already; choose another output or replace it with --overwrite"
 
 
 def _create(folder: Path) -> tuple[Path, int]:
