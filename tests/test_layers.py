@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent / "wavebatch"
 MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
-    {"errors", "units", "words", "allocator"},
+    {"errors", "units", "words", "allocator", "evensample"},
     {"kernels", "blocks", "trajectory", "nodata"},
     {"chain", "io", "pictures"},
     {"stages"},

@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.noise import estimate_noise
 from wavebatch.kernels.render import render_echoes
 from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples
 from wavebatch.stages.decompose import adaptive, closed_form
 from wavebatch.stages.detect import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.shapes import model_parameters, pulse_measures, pulse_shape, shape_limits
-from wavebatch.units import FWHM_PER_SIGMA, MAD_TO_STD, QUANTISATION_STD
+from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.units import MAD_TO_STD, QUANTISATION_STD
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
@@ -35,20 +34,8 @@ FEW = 20
 ENOUGH_TO_LEARN = 50
 """Isolated echoes from which a pulse can be learned (R2)."""
 
-MOST_STACKED = 3000
-"""Isolated echoes that a stack takes; more do not make it better."""
-
 FIRST_WIDTH = 2.0
 """First guess of the system pulse's width [samples]."""
-
-BEFORE, AFTER = 9.0, 25.0
-"""Samples before and behind an echo that its stack covers."""
-
-REACHED = 0.3
-"""Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
-
-NEAR_BEST = 1.25
-"""Misfit, over that of the best model, at which a simpler one is taken."""
 
 ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
 """Thresholds tried for one more echo, in chi2."""
@@ -106,7 +93,7 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     n = len(block)
     noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
     echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
-    strongest, second = _strongest(echoes, n)
+    strongest, second = find_strongest(echoes, n)
     echoes = echoes.take(strongest)
     good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
@@ -119,7 +106,7 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     return float(np.clip(find_mode(widths), 0.5, 50.0))
 
 
-def _strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
+def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the strongest echo of each waveform that has any, and the amplitude of the second strongest there."""
     order = np.lexsort((-echoes.amplitude, echoes.waveform))
     waveform = echoes.waveform[order]
@@ -155,71 +142,6 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
         return float(top)
     reached = at_top.any(axis=1).sum()
     return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
-
-
-def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, of the most common width (R2).
-
-    The half of them nearest to the mode of the widths: flat targets, whose echoes slopes do not widen.
-    """
-    n = len(block)
-    noise = pooled_noise(block, system)
-    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
-    strongest, second = _strongest(echoes, n)
-    echoes = echoes.take(strongest)
-    top = system.saturation or float(block.samples.max())
-    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
-    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
-    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    echoes = echoes.take(np.flatnonzero(good))
-    distance = np.abs(echoes.sigma - find_mode(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
-    order = np.argsort(distance, kind="stable")[: max(len(echoes) // 2, ENOUGH_TO_LEARN)]
-    return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
-
-
-def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
-    """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
-    noise = pooled_noise(block, system)
-    width = system.sigma_ref / block.spacing
-    signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
-    before, after = BEFORE * max(width / 2, 1), AFTER * max(width / 2, 1)
-    stack = stack_pulse(signal, main.amplitude.astype(np.float64), main.time / block.spacing, before, after)
-    strongest = float(np.quantile(main.amplitude, 0.99))
-    goal = max(REACHED * system.noise_std / strongest, 1.5 * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width)
-    skewed = fit_skewed(stack, width)
-    figures["misfit_goal"] = goal
-    figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
-    for fit in sums:
-        figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
-    best = _simplest([sums[0], skewed, *sums[1:]], goal)
-    return _with_pulse(system, best, stack, block.spacing)
-
-
-def _simplest(fits: list[PulseFit], goal: float) -> PulseFit:
-    """The first fit that reaches the goal, or comes near the best of all."""
-    enough = max(goal, NEAR_BEST * min(fit.rms for fit in fits))
-    return next(fit for fit in fits if fit.rms <= enough)
-
-
-def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float) -> SystemPulse:
-    """The system with a learned pulse in ns; its ringing is the largest value beyond 4 widths.
-
-    A Gaussian keeps the width that the echoes themselves had: aligning them for the stack widens it a little.
-    """
-    width = system.sigma_ref / spacing
-    far = np.abs(stack.lag - fit.datum) > 4 * width
-    system = replace(system, ringing=float(np.abs(stack.value[far]).max(initial=0.0)), kappa=fit.kappa)
-    if len(fit.components) > 1:
-        components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
-        system = replace(system, components=components)
-        limits = shape_limits(system, spacing)
-        table = pulse_measures(pulse_shape(system, spacing), limits)
-        half_width = float(np.interp(limits.ref, table.width, table.half_width))
-        return replace(system, sigma_ref=half_width / FWHM_PER_SIGMA * spacing)
-    if fit.kappa:
-        return replace(system, sigma_ref=float(fit.components[0, 2]) * spacing)
-    return system
 
 
 def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:

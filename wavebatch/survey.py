@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.learning import find_isolated, learn_pulse
 from wavebatch.measuring import (
     ENOUGH_TO_LEARN,
     FIRST_WIDTH,
@@ -15,8 +16,6 @@ from wavebatch.measuring import (
     RESIDUAL_LOOK,
     choose_acceptance,
     decompose_sample,
-    find_isolated,
-    learn_pulse,
     measure_gaussian,
     measure_residuals,
     thin_block,

@@ -35,8 +35,15 @@ class Stack(NamedTuple):
     """Standard error of each value (b,)."""
 
 
-def stack_pulse(signal: np.ndarray, amplitude: np.ndarray, time: np.ndarray, before: float, after: float) -> Stack:
-    """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it."""
+def stack_pulse(
+    signal: np.ndarray, amplitude: np.ndarray, time: np.ndarray, before: float, after: float, std: float = 0.0
+) -> Stack:
+    """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
+
+    std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
+    the values of a bin may all be equal without being exact.
+    """
+    least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after)
     values = (signal / amplitude[:, None])[used]
@@ -51,7 +58,7 @@ def stack_pulse(signal: np.ndarray, amplitude: np.ndarray, time: np.ndarray, bef
             middle = np.median(part)
             spread = 1.4826 * np.median(np.abs(part - middle))
             centre = (bins[begin] + 0.5) * STEP - before
-            stack.append((centre, middle, 1.2533 * max(spread, 1e-6) / np.sqrt(len(part))))
+            stack.append((centre, middle, 1.2533 * max(spread, least) / np.sqrt(len(part))))
     return Stack(*np.array(stack).reshape(-1, 3).T)
 
 

@@ -139,6 +139,13 @@ def _evaluate_components(
     return pulse, by_time, by_width
 
 
+STEADY = 0.1
+"""Step of the peak's delay from one of 200 widths to the next, in the least width, from which it is a jump."""
+
+LEAST_RISE = 1e-3
+"""Share by which half widths grow over the allowed widths, where they would not."""
+
+
 class PulseTail(NamedTuple):
     """What a learned pulse does beside its main part, per unit of amplitude, by lag on a grid of TAIL_STEP."""
 
@@ -186,9 +193,9 @@ class PulseMeasures(NamedTuple):
     peak: np.ndarray
     """Height of the peak over the amplitude of the main part."""
     delay: np.ndarray
-    """Peak after the centre of the main part [samples]."""
+    """Peak after the centre of the main part [samples]; of flat tops the middle of the main lobe."""
     half_width: np.ndarray
-    """Full width at half maximum of the main lobe [samples]."""
+    """Full width at half maximum of the main lobe [samples], rising."""
 
 
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
@@ -198,10 +205,25 @@ def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
     reach = max([6 * high, *(abs(delay) + high for _, delay, _ in shape.components)])
     x = np.arange(-reach, reach, step)
     table = np.array([_measure_one(evaluate_pulse(shape, x, np.zeros(1), np.full(1, s))[0], x) for s in widths])
-    return PulseMeasures(widths, *table.T)
+    peak, delay, half_width, middle = table.T
+    # The peak of a flat top jumps from one end of it to the other; the middle of the lobe does not.
+    steady = np.abs(np.diff(delay)).max() <= STEADY * low
+    return PulseMeasures(widths, peak, delay if steady else middle, _make_rising(half_width))
 
 
-def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]:
+def _make_rising(half_width: np.ndarray) -> np.ndarray:
+    """Half widths that grow with every width, as the way back to widths needs.
+
+    Some flat-topped sums have dips, which deepen where they are narrow: the pulse becomes lower, its half width larger.
+    """
+    if np.all(np.diff(half_width) > 0):
+        return half_width
+    level = np.minimum.accumulate(half_width[::-1])[::-1]
+    return level * (1 + LEAST_RISE * np.linspace(0, 1, len(level)))
+
+
+def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float, float]:
+    """Height and place of the peak, full width at half maximum of its lobe, and the middle of that."""
     top = int(np.argmax(pulse))
     below = pulse < 0.5 * pulse[top]
     right = top + int(np.argmax(below[top:]))
@@ -210,7 +232,8 @@ def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float]
     def cross(a: int, b: int) -> float:
         return x[a] + (x[b] - x[a]) * (0.5 * pulse[top] - pulse[a]) / (pulse[b] - pulse[a])
 
-    return float(pulse[top]), float(x[top]), cross(right - 1, right) - cross(left + 1, left)
+    begin, end = cross(left + 1, left), cross(right - 1, right)
+    return float(pulse[top]), float(x[top]), end - begin, 0.5 * (begin + end)
 
 
 TABLE_ROWS = 64
@@ -226,7 +249,7 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
     spline = CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
     fine = np.arange(x[0], x[-1], step / 64)
-    height, peak, full = _measure_one(spline(fine), fine)
+    height, peak, full, _ = _measure_one(spline(fine), fine)
     unit = full / FWHM_PER_SIGMA
     rows = np.arange(np.ceil((x[0] - peak) / unit * TABLE_ROWS), np.floor((x[-1] - peak) / unit * TABLE_ROWS) + 1)
     z = rows / TABLE_ROWS

@@ -20,25 +20,41 @@ from wavebatch.stages.candidates import make_table, signal_above
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
 
+BROAD = 4.0
+"""Width of the system pulse [samples] from which the smoothing grows with it."""
+
 
 @stage("detect")
 def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.0) -> EchoTable:
     """Echoes at the local maxima of the [1 4 6 4 1]/16-smoothed waveform.
 
-    Time, amplitude and width come from a log-parabola through five samples around the maximum. Never splits a broad
-    echo. Source: Wagner et al. (2007), max-detection; smoothing as in ALGORITHMS 1.1.
+    Of pulses wider than 4 samples, on whose tops noise has maxima of its own, a Gaussian takes the place of these taps,
+    which grows by half of what they are wider. Time, amplitude and width come from a log-parabola through five samples
+    around the maximum. Never splits a broad echo. Source: Wagner et al. (2007), max-detection; smoothing as in
+    ALGORITHMS 1.1.
 
     threshold: least height above the baseline, in standard deviations of the smoothed noise.
     """
-    smoothed = smooth_121(signal_above(block, noise))
-    twice = smooth_121(smoothed)
-    waveform, sample = find_peaks(twice, np.float32(threshold * TWICE_SMOOTHED_GAIN) * noise.std)
+    signal = signal_above(block, noise)
     ref = system.sigma_ref / block.spacing
+    broad = 0.5 * (ref - BROAD) + 1.0 if ref > BROAD else 0.0
+    if broad:
+        taps = gaussian_taps(broad)
+        taps /= taps[0] + 2 * taps[1:].sum()
+        even = smoothed = filter_symmetric(signal, taps)
+        gain = float(np.sqrt(filter_energy(taps)))
+    else:
+        smoothed = smooth_121(signal)
+        even, gain = smooth_121(smoothed), TWICE_SMOOTHED_GAIN
+    waveform, sample = find_peaks(even, np.float32(threshold * gain) * noise.std)
     amplitude, time, width = estimate_starts(smoothed, waveform, sample, ref)
     gap = _nearest_gap(waveform, sample)
     crowded = np.flatnonzero(gap < 4.0 * ref)
     time[crowded], amplitude[crowded] = refine_peaks(smoothed, waveform[crowded], sample[crowded])
     width = np.minimum(width, 0.5 * gap)
+    if broad:
+        width = np.sqrt(np.maximum(width * width - broad * broad, 0.25 * ref * ref))
+        amplitude *= np.hypot(1.0, broad / width)
     return make_table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
 
 

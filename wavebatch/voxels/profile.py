@@ -12,7 +12,7 @@ from wavebatch.errors import ConfigError
 from wavebatch.kernels.deconvolve import deconvolve_gold, deconvolve_richardson_lucy, deconvolve_wiener, wiener_taps
 from wavebatch.kernels.profiles import fit_height, keep_signal, measure_offsets, window_signal
 from wavebatch.kernels.signal import SMOOTH_GAIN, smooth_121, widen
-from wavebatch.measuring import AFTER, BEFORE
+from wavebatch.learning import AFTER, BEFORE
 from wavebatch.stages.candidates import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.reference import reference_pulse

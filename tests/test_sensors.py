@@ -1,0 +1,99 @@
+"""Surveys and chains of sensors that the simulator does not have: other pulses, noise and baselines, rendered here."""
+
+import numpy as np
+import pytest
+
+from wavebatch.auto import choose_chain
+from wavebatch.blocks import EchoFlag, WaveformBlock
+from wavebatch.kernels.pulse import PulseShape, measure_pulse
+from wavebatch.survey import survey_block
+
+
+def flat_top(x):
+    return np.exp(-0.5 * (np.abs(x) / 1.15) ** 4)
+
+
+def skewed(x):
+    """Log-normal with the steep side first; half width as that of a Gaussian of width 1, to 1 %."""
+    return np.exp(-0.5 * (np.log(np.maximum(1 + 0.15 * x, 1e-9)) / 0.15) ** 2)
+
+
+def gaussian(x):
+    return np.exp(-0.5 * x * x)
+
+
+def broaden(pulse, sigma):
+    """The pulse convolved with a Gaussian of this width, peak 1 at 0."""
+    x = np.arange(-30, 30, 0.02)
+    kernel = np.exp(-0.5 * (np.arange(-6 * sigma, 6 * sigma, 0.02) / sigma) ** 2)
+    wide = np.convolve(pulse(x), kernel, "same")
+    top = np.argmax(wide)
+    return lambda z: np.interp(z, x - x[top], wide / wide[top], left=0, right=0)
+
+
+def record(pulse, seed, *, n=2500, s=80, width=2.0, noise=1.0, amplitude=(10, 200), wide=0.0, dtype="u1"):
+    """One echo per waveform: block, times [samples], amplitudes. wide: share of echoes that targets widened."""
+    rng = np.random.default_rng(seed)
+    time = rng.uniform(0.3 * s, 0.6 * s, n)
+    height = np.exp(rng.uniform(*np.log(amplitude), n))
+    x = (np.arange(s) - time[:, None]) / width
+    signal = pulse(x)
+    rows = np.flatnonzero(rng.random(n) < wide)
+    signal[rows] = broaden(pulse, 0.8)(x[rows])
+    samples = 12.0 + height[:, None] * signal + noise * rng.standard_normal((n, s))
+    top = np.iinfo(dtype).max
+    return WaveformBlock.from_samples(np.clip(np.rint(samples), 0, top).astype(dtype)), time, height
+
+
+def judge(block, time):
+    """System, echoes, share of waveforms with exactly one echo, and those echoes' time errors less their median."""
+    survey = survey_block(block)
+    echoes = choose_chain(survey).run(block, survey.system)
+    one = echoes.count(len(block)) == 1
+    error = echoes.time[one[echoes.waveform]] - time[one]
+    return survey.system, echoes, one.mean(), error - np.median(error)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_flat_tops_are_learned_and_found(seed):
+    block, time, _ = record(flat_top, seed)
+    system, _, whole, error = judge(block, time)
+    assert system.noise_std == pytest.approx(1.04, rel=0.15)
+    assert whole > 0.94 and np.std(error) < 0.12
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
+    block, time, height = record(gaussian, 3, noise=noise, wide=0.3)
+    system, echoes, whole, _ = judge(block, time)
+    assert system.noise_std < 0.45 and system.sigma_ref == pytest.approx(2.0, rel=0.01)
+    assert whole > 0.98
+    alone = echoes.count(len(block))[echoes.waveform] == 1
+    ratio = echoes.amplitude[alone] / height[echoes.waveform[alone]]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_noise_on_a_broad_top_is_no_echo(seed):
+    block, time, _ = record(gaussian, seed, n=1500, s=300, width=10.0, wide=0.3)
+    _, echoes, whole, _ = judge(block, time)
+    assert whole > 0.985
+    assert not (echoes.flags & int(EchoFlag.MERGED)).any()
+
+
+@pytest.mark.parametrize("mirror", [1, -1])
+def test_widened_echoes_of_skewed_pulses_stay_whole(mirror):
+    """A target adds its own shape to a pulse; it does not stretch it."""
+    block, time, _ = record(lambda x: skewed(mirror * x), 6, n=4000, amplitude=(30, 200), wide=0.4)
+    _, _, whole, _ = judge(block, time)
+    assert whole > 0.98
+
+
+def test_half_widths_of_any_sum_rise_with_its_width():
+    """Two Gaussians with a dip between them: narrower ones have a lower peak and therefore a larger half width."""
+    lobes = ((0.86, 1.92, -0.33), (0.6, -1.54, -0.55), (-0.17, 3.23, -0.83), (-0.13, -2.65, -0.9))
+    shape = PulseShape(components=lobes)
+    table = measure_pulse(shape, 0.985, 4.7)
+    assert (np.diff(table.half_width) > 0).all() and np.abs(np.diff(table.delay)).max() < 0.1
+    plain = measure_pulse(PulseShape(components=((0.1, 5.0, 1.0),)), 0.7, 4.0)
+    assert plain.half_width == pytest.approx(2.354820 * plain.width, rel=0.05)
