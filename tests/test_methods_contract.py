@@ -5,7 +5,7 @@ import pytest
 from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
 from wavebatch import survey
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
@@ -69,10 +69,16 @@ def test_parts_of_a_block_do_not_show(monkeypatch):
         assert np.unique(table.waveform).size > 40
 
 
-@pytest.mark.parametrize("name", sorted(name for name, stage in STAGES.items() if stage.kind == "detect"))
-def test_a_constant_waveform_holds_no_echo(name):
-    """H10, T15: whatever its level, and whatever a filter makes of its ends."""
-    block = WaveformBlock.from_samples(np.repeat(np.array([0, 12, 40, 255], np.uint8)[:, None], 80, axis=1))
+@pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith(("detect.", "decompose."))))
+@pytest.mark.parametrize("s", [1, 2, 80])
+def test_a_constant_waveform_holds_no_echo(name, s):
+    """H10, T15: whatever its level, whatever a filter makes of its ends or a loop of its residual, and its company."""
+    level = np.repeat(np.array([0, 12, 40, 255], np.uint8)[:, None], s, axis=1)
+    pulse = 12 + np.rint(80 * np.exp(-0.5 * ((np.arange(s) - 0.6 * s) / 2) ** 2)).astype(np.uint8)
+    block = WaveformBlock.from_samples(np.insert(level, [1, 3], pulse, axis=0))
     system = SystemPulse(2.0, baseline=12, noise_std=1.0)
-    noise = STAGES["noise.pooled"].function(block, system)
-    assert len(STAGES[name].function(block, noise, system)) == 0
+    noise = Noise(np.full(6, 12, np.float32), np.ones(6, np.float32))
+    given = (STAGES["detect.maximum"].function(block, noise, system),) if name.startswith("decompose") else ()
+    table = STAGES[name].function(block, noise, system, *given)
+    assert set(table.waveform.tolist()) <= {1, 4}
+    assert s < 80 or set(table.waveform.tolist()) == {1, 4}

@@ -20,10 +20,14 @@ def make_table(
 ) -> EchoTable:
     """Candidates in samples as a table in ns; a constant waveform has none, whatever filters make of its ends (H10)."""
     rows, row = np.unique(waveform, return_inverse=True)
-    samples = block.samples[rows]
-    varies = (samples.max(axis=1, initial=0) > samples.min(axis=1, initial=block.digitizer.max_count))[row]
-    table = EchoTable.build(waveform, time * block.spacing, amplitude, width * block.spacing)
-    return table if varies.all() else table.take(np.flatnonzero(varies))
+    varies = find_varying(block.samples[rows])[row]
+    columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
+    return EchoTable.build(*(columns if varies.all() else (values[varies] for values in columns)))
+
+
+def find_varying(samples: np.ndarray) -> np.ndarray:
+    """True (n,) for the waveforms of samples (n, s) that are not constant."""
+    return (samples != samples[:, :1]).any(axis=1)
 
 
 def candidate_table(

@@ -14,7 +14,7 @@ from wavebatch.kernels.cluster import estimate_starts
 from wavebatch.kernels.pulse import GAUSSIAN
 from wavebatch.kernels.render import render_echoes
 from wavebatch.kernels.signal import smooth_121
-from wavebatch.stages.candidates import candidate_table, signal_above
+from wavebatch.stages.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.decompose import gaussian
 from wavebatch.stages.detect_correlation import asdf
 from wavebatch.stages.flags import flag_echoes
@@ -47,6 +47,7 @@ def residual_loop(
     """
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
+    varies = find_varying(block.samples)
     parts: list[tuple[EchoTable, int]] = []
     while len(rows):
         found = gaussian(
@@ -54,7 +55,7 @@ def residual_loop(
         )
         sample, height = _largest_residuals(block, noise, found)
         number = found.count(len(rows))
-        grows = (height > t_diff * noise.std) & (number < max_echoes) & (number > before)
+        grows = (height > t_diff * noise.std) & (number < max_echoes) & (number > before) & varies
         final = found.take(np.flatnonzero(~grows[found.waveform]))
         parts.append((replace(final, waveform=rows[final.waveform].astype(np.int32)), 0))
         at = np.flatnonzero(grows)
@@ -62,7 +63,7 @@ def residual_loop(
             found.take(np.flatnonzero(grows[found.waveform])), at, sample[at], height[at], block, system
         )
         echoes = replace(echoes, waveform=np.searchsorted(at, echoes.waveform).astype(np.int32))
-        rows, before, block = rows[at], number[at], block.rows(at)
+        rows, before, varies, block = rows[at], number[at], varies[at], block.rows(at)
         noise = Noise(noise.baseline[at], noise.std[at])
     table = EchoTable.concatenate(parts)
     return table.take(np.lexsort((table.time, table.waveform)))
