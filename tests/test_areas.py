@@ -14,6 +14,7 @@ from wavebatch import returns
 from wavebatch.areas import Grid, PolygonSet
 from wavebatch.cli.stats import SHOWN, stats
 from wavebatch.errors import ConfigError
+from wavebatch.io import buckets
 from wavebatch.polygons import Polygon, find_inside, load_polygons
 from wavebatch.returns import count_returns
 
@@ -84,7 +85,7 @@ def check_sum(areas, total):
 @pytest.mark.parametrize("bucket", [400_000, 150])
 def test_cells_as_a_loop_over_pulses_counts_them(tmp_path, monkeypatch, size, bucket):
     points = make_cloud(tmp_path / "c.las")
-    monkeypatch.setattr(returns, "BUCKET_POINTS", bucket)
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", bucket)
     (one,), total = count_returns([tmp_path / "c.las"], divisions=[Grid(size)])
     naive = count_naively(*points, lambda x, y: (math.floor(x / size) * size, math.floor(y / size) * size))
     check_areas(one.areas, naive, lambda area: (area.x, area.y))

@@ -11,10 +11,10 @@ from wavebatch.batch.run import run_batch
 from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
-from wavebatch.compare import angles
 from wavebatch.compare.angles import compare_angles
 from wavebatch.config import parse_chain
 from wavebatch.errors import ConfigError, InputError
+from wavebatch.io import buckets
 from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 
@@ -76,7 +76,7 @@ def test_angles_of_a_simulated_village_agree(clouds):
 @pytest.mark.parametrize("order", [("widths", "normals"), ("normals", "widths")])
 @pytest.mark.parametrize("points", [400_000, 3000])
 def test_two_clouds_are_matched(clouds, monkeypatch, order, points):
-    monkeypatch.setattr(angles, "BUCKET_POINTS", points)
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", points)
     whole, found = compare_angles(clouds["both"]), compare_angles(*(clouds[name] for name in order))
     assert found.points == whole.points and found.number == whole.number
     for name in ("bias", "mae", "rms"):

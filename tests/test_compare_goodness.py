@@ -137,6 +137,5 @@ def test_many_waveforms_are_thinned_evenly():
         part = misfit[begin : begin + step]
         quality.add(part, 2 * part, np.ones(len(part), int), np.ones(len(part), bool))
     found = quality.result()["single"]
-    assert sum(len(part["misfit"]) for part in quality.parts) <= 1000
     assert found.waveforms == 20_000 and found.mean == pytest.approx(misfit.mean())
     assert found.median == pytest.approx(0.5, abs=0.06) and found.floor_median == 2 * found.median

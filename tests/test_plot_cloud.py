@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from wavebatch.blocks import COLUMNS, EchoFlag
 from wavebatch.cli import main
 from wavebatch.errors import ConfigError, InputError
+from wavebatch.evensample import EvenSample
 from wavebatch.io import cloud as io_cloud
 from wavebatch.io.columns import ColumnReader
 from wavebatch.plots import raster, values
 from wavebatch.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.plots.raster import grid_values
-from wavebatch.plots.values import EvenSample, Selection, read_flags, robust_limits
+from wavebatch.plots.values import Selection, read_flags, robust_limits
 
 POINTS = 5000
 
@@ -118,17 +119,6 @@ def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
         total[at] += value
     count = np.bincount(cell, minlength=len(total))
     assert np.array_equal(again.values.ravel()[count > 0], total[count > 0] / count[count > 0])
-
-
-def test_an_even_sample_is_every_nth(rng):
-    data = rng.normal(size=5000)
-    sample = EvenSample()
-    sample.LIMIT = 300
-    for part in np.array_split(data, 77):
-        sample.add(part)
-    assert sample.seen == 5000 and np.array_equal(sample.read(), data[:: sample.step])
-    assert 150 < len(sample.read()) <= 300
-    assert len(EvenSample().read()) == 0
 
 
 @settings(max_examples=200, deadline=None)

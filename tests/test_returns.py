@@ -11,6 +11,7 @@ from wavebatch import returns
 from wavebatch.blocks import EchoFlag
 from wavebatch.cli.stats import stats
 from wavebatch.errors import InputError
+from wavebatch.io import buckets
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.header import LasHeader
 from wavebatch.io.pointfile import PointFile
@@ -88,7 +89,7 @@ def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
     receiver = DiscreteReceiver(most=3)
     simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)
     whole = count_returns([tmp_path / "c.laz"])[1]
-    monkeypatch.setattr(returns, "BUCKET_POINTS", 500)
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 500)
     parts = count_returns([tmp_path / "c.laz"])[1]
     assert parts.by_count == whole.by_count and parts.incomplete == whole.incomplete == 0
     assert parts.separations["1-2"].least == whole.separations["1-2"].least

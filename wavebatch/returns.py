@@ -12,13 +12,9 @@ import numpy as np
 from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
 from wavebatch.blocks import EchoFlag
 from wavebatch.errors import ConfigError, InputError
-from wavebatch.io.buckets import Buckets
+from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, time_keys
 from wavebatch.io.returnfile import ReturnReader
 from wavebatch.units import HALF_C
-
-BUCKET_POINTS = 400_000
-"""Points held at a time, as long as MOST_BUCKETS are enough."""
-MOST_BUCKETS = 72
 
 _BIN = 0.01
 _BINS = 10_000
@@ -115,17 +111,14 @@ def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
-        number = min(-(-max(reader.point_count, 1) // BUCKET_POINTS), MOST_BUCKETS)
-        buckets = Buckets(_ROW, number)
-        try:
+        number = count_buckets(reader.point_count)
+        with Buckets(_ROW, number) as buckets:
             keys = _Keys(by_time)
             for rows in reader.read_pieces():
                 tally.add_points(rows)
-                buckets.add(_shape(rows, keys.of(rows)), lambda part: _scatter(part, number))
+                buckets.add(_shape(rows, keys.of(rows)), lambda part: _sort_by_key(part, number))
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
-        finally:
-            buckets.close()
     return tally
 
 
@@ -138,7 +131,7 @@ class _Keys:
     def of(self, rows: np.ndarray) -> np.ndarray:
         """u8 (n,)."""
         if self._by_time:
-            return (rows["gps_time"] + 0.0).view(np.uint64)
+            return time_keys(rows["gps_time"])
         if not len(rows):
             return np.empty(0, np.uint64)
         starts = rows["number"] <= np.concatenate([[self._last], rows["number"][:-1]])
@@ -156,9 +149,8 @@ def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
     return shaped
 
 
-def _scatter(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    bits = rows["key"] * np.uint64(0x9E3779B97F4A7C15)
-    return np.arange(len(rows)), ((bits >> np.uint64(40)) % np.uint64(number)).astype(np.int64)
+def _sort_by_key(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(len(rows)), spread_keys(rows["key"], number)
 
 
 @dataclass(slots=True, eq=False)

@@ -8,16 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.compare.differences import SPEED
-from wavebatch.errors import ConfigError, InputError
-from wavebatch.evaluate import list_pairs, pair_nearest
+from wavebatch.compare.pairing import check_tolerance, pair_echoes
+from wavebatch.errors import InputError
 from wavebatch.io.anglefile import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
-from wavebatch.io.buckets import Buckets
+from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time
 
 BIN, DIFFERENCE_BIN = 5.0, 2.0
 """Widths of the histograms' bins [deg]: of angles, of their differences."""
-
-BUCKET_POINTS, MOST_BUCKETS = 400_000, 72
-"""Points that are held at a time, as long as that many buckets are enough."""
 
 _FINE = 1000
 """Bins per degree in which absolute differences are counted for their median."""
@@ -65,8 +62,7 @@ def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0)
     nearest first. Memory is bounded; large pairs of clouds need room in TMPDIR.
     Raises InputError where a file cannot be read or lacks what is needed, ConfigError for a wrong tolerance.
     """
-    if not 0 < tolerance_ns < 1e6:
-        raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
+    check_tolerance(tolerance_ns)
     tally = _Tally()
     if b is None:
         with AngleReader(a) as cloud:
@@ -95,31 +91,17 @@ def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally
     for cloud in (widths, normals):
         if not cloud.has_gps_time:
             raise InputError(f"{cloud.path}: has no GPS times, by which echoes of two clouds are matched")
-    number = min(-(-max(widths.point_count, normals.point_count, 1) // BUCKET_POINTS), MOST_BUCKETS)
-    sides = [Buckets(ANGLE_DTYPE, number) for _ in range(2)]
-    try:
-        for cloud, buckets in zip((widths, normals), sides, strict=True):
+    number = count_buckets(max(widths.point_count, normals.point_count))
+    with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
+        for cloud, buckets in ((widths, first), (normals, second)):
             for rows in cloud.read_angles():
                 finite = np.isfinite(rows["gps_time"]) & np.isfinite(rows["xyz"]).all(axis=1)
-                buckets.add(rows[finite], lambda part: _scatter(part, number))
+                buckets.add(rows[finite], lambda part: sort_by_time(part["gps_time"], number))
         for bucket in range(number):
-            a, b = (buckets.read(bucket) for buckets in sides)
-            group = np.unique(np.concatenate([a["gps_time"], b["gps_time"]]), return_inverse=True)[1]
-            height = a["xyz"][:, 2], b["xyz"][:, 2]
-            left, right = list_pairs(group[: len(a)], height[0], group[len(a) :], height[1], reach)
-            distance = np.linalg.norm(a["xyz"][left] - b["xyz"][right], axis=1)
-            near = np.flatnonzero(distance <= reach)
-            kept = near[pair_nearest(left[near], right[near], distance[near], len(a), len(b))]
-            tally.add(a[left[kept]], b[right[kept]])
-    finally:
-        for buckets in sides:
-            buckets.close()
-
-
-def _scatter(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bucket of every row: those of one pulse in one."""
-    bits = (rows["gps_time"] + 0.0).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-    return np.arange(len(rows)), ((bits >> np.uint64(40)) % np.uint64(number)).astype(np.int64)
+            a, b = first.read(bucket), second.read(bucket)
+            pulse = np.unique(np.concatenate([a["gps_time"], b["gps_time"]]), return_inverse=True)[1]
+            left, right = pair_echoes(pulse[: len(a)], a["xyz"], pulse[len(a) :], b["xyz"], reach)
+            tally.add(a[left], b[right])
 
 
 class _Tally:

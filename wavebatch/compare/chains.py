@@ -12,10 +12,10 @@ from wavebatch.auto import choose_chain
 from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import read_sample, survey_sample
-from wavebatch.compare.clouds import PACKET_DTYPE, check_tolerance, open_task, read_echoes
+from wavebatch.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.compare.differences import SPEED
 from wavebatch.compare.goodness import FitQuality, Goodness, measure_fit
-from wavebatch.compare.pairing import Comparison, Pairing
+from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.config import list_profiles, load_chain, load_profile
 from wavebatch.errors import ConfigError
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
@@ -166,8 +166,11 @@ def _match_cloud(
     """A chain and a cloud as two clouds."""
     ((key, run),) = runs.items()
     cloud_side = 1 if key == "a" else 0
-    with CloudReader(Path((a, b)[cloud_side].name)) as cloud, CloudReader(strip) as returns:
-        task = open_task(cloud, returns, tolerance_ns)
+    with (
+        CloudReader(Path((a, b)[cloud_side].name)) as cloud,
+        CloudReader(strip) as returns,
+        open_task(cloud, returns, tolerance_ns) as task,
+    ):
         for rows in read_echoes(cloud):
             task.add(cloud_side, rows)
         for block in blocks:
@@ -244,12 +247,12 @@ class ChainRun:
         """What the chain makes of a block."""
         echoes = self.chain.run(block, self.system)
         estimate = self.chain.steps[0]
-        return _Found(estimate.stage.function(block, self.system, **estimate.parameters), echoes)
+        return _Found(estimate.stage.function(block, self.system.of(block), **estimate.parameters), echoes)
 
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
         """Takes in what was found; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
-        misfit, floor = measure_fit(block, found.noise, self.system, self.chain.steps[2], found.echoes)
+        misfit, floor = measure_fit(block, found.noise, self.system.of(block), self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
         self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), _keys(block))
 

@@ -8,21 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.blocks import EchoFlag
-from wavebatch.compare.pairing import Comparison, Pairing
-from wavebatch.errors import ConfigError
-from wavebatch.io.buckets import Buckets
+from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
+from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader
 from wavebatch.units import FWHM_PER_SIGMA
 
 PASSED_THROUGH = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
 """Points with one of these flags are not echoes that somebody found."""
-
-BUCKET_POINTS = 400_000
-"""Points of a cloud that are held at a time, as long as MOST_BUCKETS are enough."""
-
-MOST_BUCKETS = 72
-"""Every bucket is an open file for each side: systems allow 256 at least."""
 
 _MOST_PER_PULSE = 32
 """More points per GPS time than this, on average, and it does not tell pulses apart."""
@@ -40,8 +33,7 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison
     Points passed through without an echo do not count. Memory is bounded; large clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance.
     """
-    with CloudReader(a) as first, CloudReader(b) as second:
-        task = open_task(first, second, tolerance_ns)
+    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
         for reader, side in ((first, 0), (second, 1)):
             for rows in read_echoes(reader):
                 task.add(side, rows)
@@ -68,22 +60,15 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Compari
     compare_clouds."""
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
         points = max(cloud.point_count, reference.meta.get("packets", 0))
-        task = CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta)
-        for rows in read_echoes(cloud):
-            task.add(0, rows)
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
-        for piece in reference.read_pieces(*names):
-            task.add(1, _shape_truth(piece))
-        for piece in reference.read_pieces("packet_gps_time"):
-            task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
-        return task.finish(str(a), str(truth))
-
-
-def check_tolerance(tolerance_ns: float) -> float:
-    """The tolerance; ConfigError where it is none."""
-    if not 0 < tolerance_ns < 1e6:
-        raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
-    return tolerance_ns
+        with CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta) as task:
+            for rows in read_echoes(cloud):
+                task.add(0, rows)
+            for piece in reference.read_pieces(*names):
+                task.add(1, _shape_truth(piece))
+            for piece in reference.read_pieces("packet_gps_time"):
+                task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
+            return task.finish(str(a), str(truth))
 
 
 def _can_group(reader: CloudReader) -> bool:
@@ -114,14 +99,25 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
 
 
 class CloudTask:
-    """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket."""
+    """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket.
+
+    A context manager, because temporary files hold the rows.
+    """
+
 
     def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
         self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
-        self.number = min(-(-max(points, 1) // BUCKET_POINTS), MOST_BUCKETS)
+        self.number = count_buckets(points)
         dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)
+
+    def __enter__(self) -> CloudTask:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for bucket in self.buckets:
+            bucket.close()
 
     def place_borders(self, reader: CloudReader) -> None:
         """Borders along x of slabs with about the same number of points."""
@@ -134,8 +130,7 @@ class CloudTask:
         self.buckets[side].add(rows, self._sort_by_time if self.by_time else self._sort_by_place)
 
     def _sort_by_time(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        bits = np.ascontiguousarray(rows["gps_time"]).view(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        return np.arange(len(rows)), ((bits >> np.uint64(40)) % np.uint64(self.number)).astype(np.int64)
+        return sort_by_time(rows["gps_time"], self.number)
 
     def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The slab of every point, and the neighbouring ones that it is close to."""
@@ -157,6 +152,4 @@ class CloudTask:
             else:
                 own = [np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b)]
                 self.pairing.pair_by_place(a, b, (own[0], own[1]))
-        for bucket in self.buckets:
-            bucket.close()
         return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")

@@ -8,6 +8,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag
 from wavebatch.evaluate import ErrorStats
+from wavebatch.evensample import EvenSample
 from wavebatch.kernels.bounds import crlb
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 
@@ -29,46 +30,11 @@ class Spread:
     nmad: float
 
 
-class EvenSample:
-    """Rows of columns, every `step`-th of all that were seen: enough for medians, whatever their number."""
-
-    LIMIT = 1_000_000
-    """Most rows that are kept, unless told otherwise; then every second one is dropped."""
-
-    def __init__(self, limit: int | None = None) -> None:
-        self.limit = limit or self.LIMIT
-        self.step, self.seen = 1, 0
-        self.parts: list[dict[str, np.ndarray]] = []
-
-    def keep(self, part: dict[str, np.ndarray]) -> None:
-        """Takes in rows: columns (k,) of the same names every time."""
-        start, number = -self.seen % self.step, _length(part)
-        self.seen += number
-        # Copies, because slices would keep the whole records alive.
-        self.parts.append({name: values[start :: self.step].copy() for name, values in part.items()})
-        while sum(map(_length, self.parts)) > self.limit:
-            whole = self.join()
-            self.parts = [{name: values[::2].copy() for name, values in whole.items()}]
-            self.step *= 2
-
-    def join(self) -> dict[str, np.ndarray]:
-        """All parts as one, which then is the only part; empty where nothing was taken in."""
-        if not self.parts:
-            return {}
-        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
-        self.parts = [whole]
-        return whole
-
-
-def _length(part: dict[str, np.ndarray]) -> int:
-    return len(next(iter(part.values())))
-
-
-class Differences(EvenSample):
+class Differences:
     """Collects matched pairs (records of io.cloud.CLOUD_DTYPE): sums of all, an even sample of them for medians."""
 
     def __init__(self, limit: int | None = None) -> None:
-        super().__init__(limit)
+        self._sample = EvenSample(limit)
         self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
@@ -83,7 +49,7 @@ class Differences(EvenSample):
         for name in ("amplitude", "echo_width", "flags"):
             part[f"true_{name}"] = b[name]
         part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
-        self.keep(part)
+        self._sample.add(part)
 
     def spreads(self) -> dict[str, Spread]:
         """Per quantity that both sides have: median, mean, rms and NMAD of a minus b."""
@@ -91,7 +57,7 @@ class Differences(EvenSample):
         for name, (number, total, squares) in self.sums.items():
             if not number:
                 continue
-            values = self.join()[name]
+            values = self._sample.read()[name]
             values = values[~np.isnan(values)]
             median = np.median(values)
             nmad = MAD_TO_STD * np.median(np.abs(values - median))
@@ -102,9 +68,9 @@ class Differences(EvenSample):
 
     def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
         """Errors of time [ns], amplitude [DN] and sigma [ns] in units of the bound and of what was reported."""
-        if not self.parts:
+        data = self._sample.read()
+        if not data:
             return {}
-        data = self.join()
         sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
         reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
         bounds = crlb(data["true_amplitude"], sigma, meta["noise_std"], meta["spacing"])

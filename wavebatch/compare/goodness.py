@@ -8,7 +8,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import Step
-from wavebatch.compare.differences import EvenSample
+from wavebatch.evensample import EvenSample
 from wavebatch.stages.models import rebuild_waveforms
 from wavebatch.stages.shapes import clip_level
 
@@ -45,11 +45,11 @@ def measure_fit(
     return np.square(residual).sum(axis=1) / energy, floor / energy
 
 
-class FitQuality(EvenSample):
+class FitQuality:
     """Collects E and E0 of waveforms: sums of all, an even sample of them for medians."""
 
     def __init__(self, limit: int | None = None) -> None:
-        super().__init__(limit)
+        self._sample = EvenSample(limit)
         self._sums = {name: np.zeros(3) for name in ("all", "single", "multi", "both")}
 
     def add(self, misfit: np.ndarray, floor: np.ndarray, number: np.ndarray, both: np.ndarray) -> None:
@@ -58,12 +58,12 @@ class FitQuality(EvenSample):
         part = {"misfit": misfit[rows], "floor": floor[rows], "number": number[rows], "both": both[rows]}
         for name, inside in _classes(part).items():
             self._sums[name] += [inside.sum(), part["misfit"][inside].sum(), part["floor"][inside].sum()]
-        self.keep(part)
+        self._sample.add(part)
 
     def result(self) -> dict[str, Goodness]:
         """Goodness of all waveforms, those with a single echo, with several, and where both sides have one; empty
         where E was known of none."""
-        whole = self.join()
+        whole = self._sample.read()
         if not whole or not len(whole["misfit"]):
             return {}
         classes = _classes(whole)

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from wavebatch.compare.breakdown import Breakdown, Table
 from wavebatch.compare.differences import SPEED, Differences, Spread
+from wavebatch.errors import ConfigError
 from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
 
 
@@ -101,13 +102,7 @@ class Pairing:
         self.pulses += len(number_a[counted])
         self.exact += int((number_a[counted] == number_b[counted]).sum())
         self.counts = [_add_counts(old, n[counted]) for old, n in zip(self.counts, (number_a, number_b), strict=True)]
-        # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
-        left, right = list_pairs(in_a, a["xyz"][:, 2], in_b, b["xyz"][:, 2], self.tolerance)
-        distance = np.linalg.norm(a["xyz"][left] - b["xyz"][right], axis=1)
-        near = np.flatnonzero(distance <= self.tolerance)
-        left, right, distance = left[near], right[near], distance[near]
-        kept = pair_nearest(left, right, distance, len(a), len(b))
-        left, right = left[kept], right[kept]
+        left, right = pair_echoes(in_a, a["xyz"], in_b, b["xyz"], self.tolerance)
         self.differences.add(a[left], b[right])
         self._count(0, a, left, number_b[in_a])
         self._count(1, b, right, number_a[in_b])
@@ -169,6 +164,29 @@ class Pairing:
             rows, alone = rows[own], alone[own]
         self.echoes[side] += len(rows)
         self.breakdowns[side].add(rows, alone, others)
+
+
+def pair_echoes(
+    pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of a and b that are the same echo: of one pulse and at most `reach` [m] apart, one to one, nearest first.
+
+    pulse_a, pulse_b: whole numbers (k,); xyz_a, xyz_b: positions f8 (k, 3) [m].
+    """
+    # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
+    left, right = list_pairs(pulse_a, xyz_a[:, 2], pulse_b, xyz_b[:, 2], reach)
+    distance = np.linalg.norm(xyz_a[left] - xyz_b[right], axis=1)
+    near = np.flatnonzero(distance <= reach)
+    left, right = left[near], right[near]
+    kept = pair_nearest(left, right, distance[near], len(xyz_a), len(xyz_b))
+    return left[kept], right[kept]
+
+
+def check_tolerance(tolerance_ns: float) -> float:
+    """The tolerance; ConfigError where it is none."""
+    if not 0 < tolerance_ns < 1e6:
+        raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
+    return tolerance_ns
 
 
 def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
+from wavebatch.errors import InputError
+
 try:
     import fcntl
 except ImportError:  # not on Windows: folders of killed processes then stay until somebody removes them
@@ -41,6 +43,20 @@ def make_folder() -> Path:
 def scratch_place() -> Path:
     """Where `make_folder` works, for messages."""
     return _place.get() or Path(tempfile.gettempdir())
+
+
+@contextlib.contextmanager
+def reporting_scratch() -> Iterator[None]:
+    """Turns an operating system's error with a temporary file into one InputError line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{scratch_place()}: the temporary file for what does not fit memory cannot be used "
+            f"({error.strerror or error}); free space there or set TMPDIR to another folder"
+        ) from error
 
 
 def use_scratch(folder: Path | None) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.io.buckets import spread_keys
 from wavebatch.io.judge import INDEX_BITS
 from wavebatch.io.spool import Spool
 
@@ -152,7 +153,7 @@ def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders
         for keys, index in units:
             entries = np.empty(len(keys), _KEY)
             entries["key"], entries["index"] = keys, index
-            spool.append(_scatter(keys, buckets), entries)
+            spool.append(spread_keys(keys, buckets), entries)
         spool.seal()
         for bucket in range(buckets):
             entries = _read_bucket(spool, bucket)
@@ -189,9 +190,3 @@ def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:
             keep = groups.order[expand(groups.starts, np.minimum(groups.counts, MAX_RETURNS + 1))]
             held = held[np.sort(keep)]
     return held
-
-
-def _scatter(keys: np.ndarray, buckets: int) -> np.ndarray:
-    """A bucket per key: all points of a packet in the same one, different packets spread evenly."""
-    mixed = (keys ^ (keys >> np.uint64(29))) * np.uint64(0x9E3779B97F4A7C15)
-    return ((mixed >> np.uint64(33)) % np.uint64(buckets)).astype(np.int64)

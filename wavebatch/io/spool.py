@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import InputError
 from wavebatch.io.rawbytes import read_exactly
-from wavebatch.io.scratch import make_folder, scratch_place
+from wavebatch.io.scratch import make_folder, reporting_scratch
 
 MEMORY = 1 << 24
 """Bytes of entries that are held before they go to disk."""
@@ -73,7 +71,7 @@ class Spool:
             if starts[bucket + 1] > starts[bucket]:
                 yield entries[starts[bucket] : starts[bucket + 1]]
             return
-        with _reported(), open(self.path, "rb", buffering=0) as file:
+        with reporting_scratch(), open(self.path, "rb", buffering=0) as file:
             for at in self._segments:
                 edges = np.empty(2, np.int64)
                 read_exactly(file.fileno(), edges.view(np.uint8), at + 8 * bucket)
@@ -102,24 +100,10 @@ class Spool:
 
     def _flush(self) -> None:
         starts, entries = self._take_pending()
-        with _reported():
+        with reporting_scratch():
             if self.folder is None:
                 self.folder = make_folder()
             with open(self.path, "ab") as file:
                 self._segments.append(file.tell())
                 file.write(starts.data)
                 file.write(entries.view(np.uint8).data)
-
-
-@contextlib.contextmanager
-def _reported() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        folder = scratch_place()
-        raise InputError(
-            f"{folder}: the temporary file for what does not fit memory cannot be used ({error.strerror or error}); "
-            "free space there or set TMPDIR to another folder"
-        ) from error
-
-

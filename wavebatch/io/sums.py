@@ -5,7 +5,6 @@ Integers add up to the same whatever their order: the result does not depend on 
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
 from collections.abc import Iterator
 from typing import IO, NamedTuple
@@ -13,6 +12,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from wavebatch.errors import InputError
+from wavebatch.io.scratch import reporting_scratch, scratch_place
 
 HELD = 1 << 18
 """Rows that are held in memory before they are sorted and spilled."""
@@ -88,9 +88,9 @@ class KeyedSums:
 
     def _spill(self) -> None:
         self._shrink()
-        with _reported():
+        with reporting_scratch():
             if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
+                self._file = tempfile.TemporaryFile(dir=scratch_place())  # noqa: SIM115 - closed by close()
             for key, value in self._parts:
                 rows = np.empty(len(key), self._dtype)
                 rows["key"], rows["value"] = key, value
@@ -106,11 +106,11 @@ class KeyedSums:
         if high <= run.last:
             end = min(int(np.searchsorted(run.marks, np.uint64(high))) * STRIDE, end)
         size = self._dtype.itemsize
-        with _reported():
+        with reporting_scratch():
             self._file.seek((run.first + begin) * size)
             data = self._file.read((end - begin) * size)
         if len(data) != (end - begin) * size:
-            raise InputError(f"{tempfile.gettempdir()}: a temporary file of sums ends too early; run again")
+            raise InputError(f"{scratch_place()}: a temporary file of sums ends too early; run again")
         rows = np.frombuffer(data, self._dtype)
         last = len(rows) if high > run.last else int(np.searchsorted(rows["key"], np.uint64(high)))
         rows = rows[int(np.searchsorted(rows["key"], np.uint64(low))) : last]
@@ -139,15 +139,3 @@ def _sum(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.nda
     key = key[order]
     first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
     return key[first], np.add.reduceat(np.take(value, order, axis=0), first, axis=0)
-
-
-@contextlib.contextmanager
-def _reported() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        folder = tempfile.gettempdir()
-        raise InputError(
-            f"{folder}: the temporary file of sums cannot be used ({error.strerror or error}); free space there or set "
-            "TMPDIR to another folder"
-        ) from error

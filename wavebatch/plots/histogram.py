@@ -11,8 +11,9 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag
 from wavebatch.errors import ConfigError
+from wavebatch.evensample import EvenSample
 from wavebatch.io.columns import ColumnFacts
-from wavebatch.plots.values import Clouds, EvenSample, Selection, Tally, robust_limits
+from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits
 
 MOST_BINS = 10_000
 FEWEST, MOST_CHOSEN = 20, 120
@@ -90,12 +91,12 @@ def count_values(
         series = cloud if each else 0
         tallies[series] += tally
         if len(rows):
-            samples[series].add(rows["value"])
+            samples[series].add({"value": rows["value"]})
             least, largest = min(least, float(rows["value"].min())), max(largest, float(rows["value"].max()))
     total = sum(tallies, Tally())
     if not total.values:
         raise clouds.complain(total)
-    kept = [sample.read() for sample in samples]
+    kept = [sample.read().get("value", np.empty(0)) for sample in samples]
     everything = np.concatenate(kept)
     low, high = limits or robust_limits(everything, least, largest)
     edges = place_edges(everything, low, high, clouds.facts.step, bins, exact=limits is not None)

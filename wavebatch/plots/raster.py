@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.errors import ConfigError, InputError
-from wavebatch.io.buckets import Buckets
+from wavebatch.evensample import EvenSample
+from wavebatch.io.buckets import Buckets, count_buckets
 from wavebatch.io.columns import ColumnFacts
-from wavebatch.plots.values import Clouds, EvenSample, Selection, Tally, robust_limits
+from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits
 
 STATISTICS = ("mean", "median", "min", "max", "count", "density")
 """Per cell; `density` is points per square metre."""
@@ -36,7 +37,6 @@ SHOWN = (2.0, 98.0)
 """Percentiles of the cells between which the colours lie."""
 
 _BUCKET_POINTS = 2_000_000
-_MOST_BUCKETS = 72
 _SIDE = 128
 _PLACED = np.dtype([("cell", "<u4"), ("value", "<f8")])
 
@@ -150,7 +150,7 @@ def _survey(
             keep &= (places >= bounds[:2]).all(axis=1) & (places <= bounds[2:]).all(axis=1)
         places = places[keep]
         if len(places):
-            sample.add(places)
+            sample.add({"place": places})
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
     return total, sample, bounds or (*low.tolist(), *high.tolist())
 
@@ -158,7 +158,7 @@ def _survey(
 def _choose_grid(
     where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool
 ) -> Grid:
-    places = sample.read()
+    places = sample.read()["place"]
     west, south, east, north = box
     if not fixed:
         west, east = robust_limits(places[:, 0], west, east)
@@ -207,19 +207,17 @@ class _Cells:
         self._count = np.zeros(grid.rows * grid.columns, np.int64)
         start = {"min": np.inf, "max": -np.inf}.get(statistic, 0.0)
         self._value = np.full(len(self._count), start)
-        self._number = min(-(-points // _BUCKET_POINTS), _MOST_BUCKETS) if statistic == "median" else 0
+        self._number = count_buckets(points, _BUCKET_POINTS) if statistic == "median" else 0
         self._buckets = Buckets(_PLACED, max(self._number, 1))
 
     def fill(self, clouds: Clouds) -> tuple[np.ndarray, int]:
         """Values (rows, columns), and how many points lie in them."""
-        try:
+        with self._buckets:
             for _, rows, _ in clouds.read():
                 cell = self._grid.place(rows["x"], rows["y"])
                 inside = np.flatnonzero(cell >= 0)
                 self._add(cell[inside], rows["value"][inside])
             return self._finish().reshape(self._grid.rows, self._grid.columns), int(self._count.sum())
-        finally:
-            self._buckets.close()
 
     def _add(self, cell: np.ndarray, value: np.ndarray) -> None:
         np.add.at(self._count, cell, 1)

@@ -1,4 +1,4 @@
-"""The values of a column over clouds of any size: which points count, an even sample, robust limits."""
+"""The values of a column over clouds of any size: which points count, robust limits."""
 
 from __future__ import annotations
 
@@ -102,36 +102,6 @@ class Clouds:
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")
-
-
-class EvenSample:
-    """An even sample of rows that come in pieces: all of them up to LIMIT, then every second, fourth ...; the same for
-    any size of the pieces."""
-
-    LIMIT = 1_000_000
-
-    def __init__(self) -> None:
-        self.step, self.seen = 1, 0
-        self._parts: list[np.ndarray] = []
-        self._kept = 0
-
-    def add(self, rows: np.ndarray) -> None:
-        """Takes in rows."""
-        start = -self.seen % self.step
-        self.seen += len(rows)
-        part = rows[start :: self.step].copy()
-        self._parts.append(part)
-        self._kept += len(part)
-        while self._kept > self.LIMIT:
-            self._parts = [np.concatenate(self._parts)[::2].copy()]
-            self._kept = len(self._parts[0])
-            self.step *= 2
-
-    def read(self) -> np.ndarray:
-        """The sample, in order."""
-        if len(self._parts) != 1:
-            self._parts = [np.concatenate(self._parts)] if self._parts else [np.empty(0)]
-        return self._parts[0]
 
 
 def robust_limits(sample: np.ndarray, least: float, largest: float) -> tuple[float, float]:

@@ -1,0 +1,29 @@
+import numpy as np
+
+from wavebatch.evensample import EvenSample
+
+
+def test_an_even_sample_is_every_nth_row_however_they_come(rng):
+    columns = {"value": rng.normal(size=5000), "place": rng.normal(size=(5000, 2))}
+    for pieces in (1, 77, 5000):
+        sample = EvenSample(300)
+        for rows in np.array_split(np.arange(5000), pieces):
+            sample.add({name: values[rows] for name, values in columns.items()})
+        assert sample.seen == 5000 and sample.step == 32
+        for name, values in columns.items():
+            assert np.array_equal(sample.read()[name], values[:: sample.step])
+
+
+def test_few_rows_are_all_kept_and_none_make_no_columns():
+    sample = EvenSample()
+    assert sample.read() == {}
+    sample.add({"value": np.arange(3)})
+    sample.add({"value": np.arange(2)})
+    assert sample.read()["value"].tolist() == [0, 1, 2, 0, 1]
+
+
+def test_a_sample_keeps_no_larger_array_alive():
+    data = np.zeros(1000, [("value", "f8"), ("rest", "u1", 100)])
+    sample = EvenSample()
+    sample.add({"value": data["value"]})
+    assert sample.read()["value"].base is None
