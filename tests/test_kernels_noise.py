@@ -46,7 +46,8 @@ def test_little_or_nothing_gives_finite_numbers(shape):
 
 
 def test_waveforms_without_a_quiet_sample_give_the_first_guess():
-    signal = np.tile(np.array([[0.0], [200.0]], np.float32), (20, 50))
+    signal = np.tile(np.array([[10.0], [200.0]], np.float32), (20, 50))
+    signal[0] = 9.0
     pooled = estimate_noise(signal, 6)
     assert pooled.share == 0
     assert pooled.std >= QUANTISATION_STD
@@ -102,3 +103,13 @@ def test_tail_noise_follows_a_drifting_baseline():
     noise = STAGES["noise.tail"].function(block, survey.SystemPulse(2.0, noise_std=0.5), samples=20)
     assert np.abs(noise.baseline - base[:, 0]).max() < 1.5
     assert np.median(noise.std) == pytest.approx(1.04, rel=0.1)
+
+
+@pytest.mark.parametrize(("level", "std"), [(0, 5.0), (4, 5.0), (12, 8.0), (0, 0.4), (3, 40.0)])
+def test_noise_that_is_cut_at_zero_is_not_taken_for_silence(level, std):
+    rng = np.random.default_rng(10)
+    y = level + std * rng.standard_normal((80, 2000))
+    y += 60 * std * np.exp(-0.5 * ((np.arange(80)[:, None] - rng.uniform(20, 60, 2000)) / 2.0) ** 2)
+    pooled = estimate_noise(np.maximum(np.rint(y), 0), 6)
+    true = np.std(np.maximum(np.rint(level + std * rng.standard_normal(100_000)), 0))
+    assert pooled.std == pytest.approx(max(true, QUANTISATION_STD), rel=0.1)

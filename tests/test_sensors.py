@@ -1,12 +1,18 @@
 """Surveys and chains of sensors that the simulator does not have: other pulses, noise and baselines, rendered here."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from wavebatch.auto import choose_chain
-from wavebatch.blocks import EchoFlag, WaveformBlock
+from wavebatch.blocks import EchoFlag, SystemPulse, WaveformBlock
+from wavebatch.chain import STAGES
+from wavebatch.errors import ConfigError
+from wavebatch.kernels.noise import find_levels
 from wavebatch.kernels.pulse import PulseShape, measure_pulse
-from wavebatch.survey import survey_block
+from wavebatch.survey import Survey, survey_block, survey_blocks
+from wavebatch.systemfile import SavedSurvey, load_survey, parse_survey, write_survey
 
 
 def flat_top(x):
@@ -97,3 +103,77 @@ def test_half_widths_of_any_sum_rise_with_its_width():
     assert (np.diff(table.half_width) > 0).all() and np.abs(np.diff(table.delay)).max() < 0.1
     plain = measure_pulse(PulseShape(components=((0.1, 5.0, 1.0),)), 0.7, 4.0)
     assert plain.half_width == pytest.approx(2.354820 * plain.width, rel=0.05)
+
+
+def drifting(seed, *, drift, noise, n=3000, top=200):
+    """A strip of Gaussian echoes whose baseline rises by `drift` counts from its first to its last waveform."""
+    rng = np.random.default_rng(seed)
+    time, height = rng.uniform(20, 50, n), np.exp(rng.uniform(np.log(10 * noise), np.log(top), n))
+    base = 40 + drift * np.linspace(0, 1, n)
+    signal = height[:, None] * gaussian((np.arange(80) - time[:, None]) / 2.0)
+    samples = base[:, None] + signal + noise * rng.standard_normal((n, 80))
+    return WaveformBlock.from_samples(np.clip(np.rint(samples), 0, 65535).astype(np.uint16)), time, base
+
+
+@pytest.mark.parametrize(("drift", "noise", "top"), [(20, 1.0, 200), (300, 3.0, 3000), (2, 0.4, 200)])
+def test_baselines_that_drift_along_the_strip_hide_no_echo(drift, noise, top):
+    block, time, base = drifting(7, drift=drift, noise=noise, top=top)
+    system, _, whole, error = judge(block, time)
+    assert system.noise_std == pytest.approx(np.hypot(noise, 0.289), rel=0.05)
+    assert system.baseline_spread == pytest.approx(drift / np.sqrt(12), rel=0.05)
+    assert whole > 0.985
+    found = STAGES["noise.pooled"].function(block, system).baseline - base
+    assert np.sqrt(np.mean(found**2)) < 0.3 * np.hypot(noise, 0.289)
+
+
+def test_levels_of_waveforms_do_not_depend_on_their_neighbours(rng):
+    signal = (rng.normal(0, 1, (60, 500)) + 30 * rng.normal(size=500)).astype(np.float32)
+    level, quiet, number = find_levels(signal, 1.0, 6)
+    for column in (0, 1, 499):
+        alone = find_levels(signal[:, column : column + 1], 1.0, 6)
+        assert alone[0][0] == level[column] and alone[2][0] == number[column]
+        assert np.array_equal(alone[1][:, 0], quiet[:, column])
+
+
+def digitized(block, index, **changes):
+    """The block as another digitizer's."""
+    return replace(block, digitizer=replace(block.digitizer, index=index, **changes))
+
+
+def test_digitizers_that_record_otherwise_get_a_pulse_and_noise_of_their_own():
+    wide = digitized(record(gaussian, 8, n=1500)[0], 1)
+    narrow, time, _ = record(gaussian, 9, n=600, s=48, width=1.2, amplitude=(300, 9000), noise=8.0, dtype="u2")
+    narrow = digitized(narrow, 4)
+    low = digitized(WaveformBlock.from_samples(record(gaussian, 10, n=12)[0].samples + np.uint8(30)), 5)
+    survey = survey_blocks([narrow, wide, low])
+    system = survey.system
+    assert set(system.digitizers) == {4, 5}
+    assert system.sigma_ref == pytest.approx(2.0, rel=0.02) and system.of(wide) is system
+    own = system.of(narrow)
+    assert own.sigma_ref == pytest.approx(1.2, rel=0.02) and own.noise_std == pytest.approx(8.0, rel=0.05)
+    # Twelve waveforms are too few for a pulse, but enough for a level.
+    few = system.of(low)
+    assert few.sigma_ref == system.sigma_ref and few.baseline == pytest.approx(42, abs=0.3)
+    echoes = choose_chain(survey).run(narrow, replace(system, divergence=0.5))
+    assert (echoes.count(len(narrow)) == 1).mean() > 0.98
+    assert np.std(echoes.time - time[echoes.waveform]) < 0.1
+    assert replace(system, divergence=0.5).of(narrow).divergence == 0.5
+    assert survey.waveforms == 2112 and survey.figures["single_share"] > 0.98
+
+
+def test_digitizers_that_record_alike_share_what_is_learned():
+    """As scanners do that write one descriptor per length of a waveform."""
+    blocks = [digitized(record(skewed, seed, n=900, s=s)[0], index) for index, seed, s in ((1, 1, 80), (2, 2, 64))]
+    assert survey_blocks(blocks).system.digitizers == {}
+
+
+def test_systems_of_digitizers_are_saved(tmp_path):
+    own = SystemPulse(1.2, baseline=300.0, noise_by_kind={"quiet": 8.0}, components=((1.0, 0.0, 1.2), (0.1, 5.0, 1.0)))
+    survey = Survey(SystemPulse(2.0, digitizers={4: own, 9: SystemPulse(3.0)}), 5, {}, ())
+    path = tmp_path / "system.toml"
+    write_survey(path, SavedSurvey(survey), overwrite=False)
+    assert load_survey(path).survey == survey
+    text = path.read_text()
+    for old, new in (("index = 9", "index = 4"), ("index = 9", "index = 0"), ("index = 9\n", "")):
+        with pytest.raises(ConfigError, match=r"\[system\]: digitizers 2: index must be a number from 1 to 255"):
+            parse_survey(text.replace(old, new), "x.toml")

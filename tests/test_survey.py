@@ -12,7 +12,7 @@ from wavebatch.choice import read_sample, survey_sample
 from wavebatch.io.strip import StripReader
 from wavebatch.measuring import FIRST_LOOK
 from wavebatch.simulate import PulseModel, find_pulse
-from wavebatch.survey import join_largest, survey_block, survey_blocks
+from wavebatch.survey import join_digitizers, survey_block, survey_blocks
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])
@@ -64,10 +64,10 @@ def test_the_largest_group_of_one_length_decides():
     flat, other = make_block("flat", 1000, seed=6)[0], make_block(make_scene("flat", n_samples=40), 1500, seed=6)[0]
     ends = [(other, 0, 700), (flat, 0, 600), (other, 700, 1500), (flat, 600, 1000)]
     parts = [block.rows(slice(start, stop)) for block, start, stop in ends]
-    joined = join_largest(parts)
-    assert np.array_equal(joined.samples, flat.samples)
+    joined = join_digitizers(parts)
+    assert len(joined) == 1 and np.array_equal(joined[0].samples, flat.samples)
     assert survey_blocks(parts) == survey_blocks([flat])
-    assert join_largest([]) is None and survey_blocks([]).waveforms == 0
+    assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])

@@ -246,7 +246,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class SystemPulse:
-    """What the strip's survey says of sensor and scene; the same for every block of the strip."""
+    """What the strip's survey says of sensor and scene; the same for every block of one digitizer."""
 
     sigma_ref: float
     """Gaussian standard deviation of the echo of a flat target [ns]."""
@@ -286,10 +286,20 @@ class SystemPulse:
     """Of the light on its way through the air, one way [dB/km]."""
     sensor_error: float = 0.0
     """Standard deviation of the distance to the sensor's position [m]."""
+    digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)
+    """Pulse and noise of digitizers that record otherwise than the strip's commonest one, by their index."""
 
     def __post_init__(self) -> None:
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
+
+    def of(self, block: WaveformBlock) -> SystemPulse:
+        """The system of the block's digitizer: its own pulse and noise, with what is known of the strip as a whole."""
+        own = self.digitizers.get(block.digitizer.index)
+        if own is None:
+            return self
+        whole = ("divergence", "calibration", "calibration_err", "channels", "attenuation", "sensor_error")
+        return replace(own, **{name: getattr(self, name) for name in whole})
 
     def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
         """Calibration of each waveform's channel, NaN where it has none, and its relative error, f8 (n,)."""

@@ -186,7 +186,7 @@ class Chain:
         self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None
     ) -> EchoTable:
         """Echoes of the block; seconds spent in each stage are added to `timing`."""
-        data: dict[str, Any] = {"block": block, "system": system}
+        data: dict[str, Any] = {"block": block, "system": system.of(block)}
         slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
         for step in self.steps:
             start = time.perf_counter()

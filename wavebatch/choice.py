@@ -68,23 +68,24 @@ def widest(request: Request) -> Chain:
     return load_profile(COSTS[-1]) if request.tolerance is not None else widest_chain()
 
 
-def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = None) -> WaveformBlock | None:
-    """Waveforms spread over a strip, those of its largest group of one length; None where there are none.
+def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = None) -> list[WaveformBlock]:
+    """Waveforms spread over a strip, a block per digitizer, the main one first; none where there are none.
 
     The same ones every time. waveforms: how many to read; without it as many as a survey looks at.
     """
-    return survey.join_largest(reader.sample_blocks(scan, waveforms or sample_size(reader)))
+    return survey.join_digitizers(reader.sample_blocks(scan, waveforms or sample_size(reader, scan)))
 
 
-def sample_size(reader: StripReader) -> int:
+def sample_size(reader: StripReader, scan: StripScan) -> int:
     """Waveforms of a strip that a survey looks at."""
-    longest = max((digitizer.n_samples for digitizer in reader.facts.digitizers.values()), default=0)
+    used = (digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor)
+    longest = max((digitizer.n_samples for digitizer in used), default=0)
     return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, survey.SAMPLE))
 
 
-def survey_sample(block: WaveformBlock | None) -> Survey:
+def survey_sample(sample: list[WaveformBlock]) -> Survey:
     """The survey of a strip's sample; one that knows nothing where there is no waveform."""
-    return survey.survey_blocks([] if block is None else [block])
+    return survey.survey_blocks(sample)
 
 
 def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> Choice:
@@ -92,8 +93,9 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
 
     Raises ConfigError where no shipped chain meets the tolerance.
     """
-    block = read_sample(reader, scan) if request.system is None or request.tolerance is not None else None
-    found = survey_sample(block) if request.system is None else request.system.survey
+    sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
+    found = survey_sample(sample) if request.system is None else request.system.survey
+    block = sample[0] if sample else None
     if request.tolerance is not None:
         return _choose_by_tolerance(block, found, request.tolerance, str(reader.facts.path))
     if not request.auto:

@@ -36,7 +36,11 @@ def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing:
     blocks: with the sensor's positions, sampled over the strip; those of another spacing [ns] are left out. The system
     as it is where its divergence is not known or fewer than 50 clean echoes are found.
     """
-    parts = [_measure(block, system) for block in blocks if block.sensor is not None and block.spacing == spacing]
+    parts = [
+        _measure(block, system)
+        for block in blocks
+        if block.sensor is not None and block.spacing == spacing and block.digitizer.index not in system.digitizers
+    ]
     if system.divergence is None or not parts:
         return system
     variance, error = (np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -52,11 +52,14 @@ NEAR = 3.0
 MIN_SNR = 20.0
 
 
-def measure_gaussian(block: WaveformBlock) -> SystemPulse:
-    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all."""
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
+    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
+
+    first: width to begin with [samples], and to end with where too few echoes are isolated.
+    """
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_block(block, FIRST_LOOK)
-    width, last = FIRST_WIDTH, 0.0
+    width, last = first, 0.0
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break

@@ -25,7 +25,7 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
         reason = "nobody knows where the sensor was: give --trajectory to `wavebatch run`"
         return _decide(replace(survey, system=system), needed=False, reason=reason)
     spacing = survey.figures["spacing_ns"]
-    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader)))
+    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
     system = measure_level(blocks, system, spacing)
     outlook = predict_angles(system, spacing, distance, divergence, survey.figures["amplitude_50"])
     return _decide(replace(survey, system=system), needed=outlook.possible, reason=outlook.reason)

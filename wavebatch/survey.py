@@ -11,6 +11,7 @@ from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.learning import find_isolated, learn_pulse
 from wavebatch.measuring import (
     ENOUGH_TO_LEARN,
+    FEW,
     FIRST_WIDTH,
     MIN_SNR,
     RESIDUAL_LOOK,
@@ -20,9 +21,13 @@ from wavebatch.measuring import (
     measure_residuals,
     thin_block,
 )
+from wavebatch.stages.shapes import clip_level
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
+
+COUNTED = 256
+"""Samples of a waveform that count where the main digitizer is chosen."""
 
 
 _UNCLEAN = (
@@ -57,27 +62,79 @@ def measure(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> SystemPul
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
-    """Survey of a strip from blocks sampled over it; the largest group of one spacing and length decides.
+    """Survey of a strip from blocks sampled over it; the digitizer with the most samples decides.
 
+    Others that record otherwise get pulse and noise of their own, and count in the shares of the scene.
     learn: also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
     """
-    block = join_largest(blocks)
-    if block is None:
+    main, *others = join_digitizers(blocks) or [None]
+    if main is None:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
-    return survey_block(block, learn=learn)
+    found = survey_block(main, learn=learn)
+    return _add_digitizers(found, main, others, learn=learn) if others else found
 
 
-def join_largest(blocks: Iterable[WaveformBlock]) -> WaveformBlock | None:
-    """The samples of the largest group of blocks of one spacing and length as one block, None without waveforms."""
-    groups: dict[tuple[float, int], list[WaveformBlock]] = {}
+def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
+    """The samples of each digitizer, those of its commonest length, as one block; the largest first.
+
+    Samples of long waveforms count up to 256 each: it takes many waveforms to learn a pulse.
+    """
+    groups: dict[tuple[int, int], list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
-            groups.setdefault((block.spacing, block.samples.shape[1]), []).append(block)
-    if not groups:
-        return None
-    chosen = max(groups.values(), key=lambda group: (sum(block.samples.size for block in group), group[0].spacing))
-    samples = np.concatenate([block.samples for block in chosen])
-    return WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
+            groups.setdefault((block.digitizer.index, block.samples.shape[1]), []).append(block)
+    sizes = {key: sum(map(len, group)) * min(key[1], COUNTED) for key, group in groups.items()}
+    largest: dict[int, WaveformBlock] = {}
+    for key in sorted(groups, key=lambda key: (-sizes[key], key)):
+        if key[0] not in largest:
+            digitizer = groups[key][0].digitizer
+            samples = np.concatenate([block.samples for block in groups[key]])
+            block = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
+            largest[key[0]] = replace(block, digitizer=replace(digitizer, n_samples=key[1]))
+    return list(largest.values())
+
+
+def _add_digitizers(found: Survey, main: WaveformBlock, others: list[WaveformBlock], *, learn: bool) -> Survey:
+    """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see."""
+    plain = measure_gaussian(main)
+    systems, counts, scenes = {}, [len(main)], [found.figures]
+    for block in others:
+        own = found.system
+        if not _records_alike(plain, main, block):
+            systems[block.digitizer.index] = own = _survey_other(found.system, block, learn=learn)
+        counts.append(len(block))
+        scenes.append(_describe(block, own, decompose_sample(block, own)))
+    figures = dict(found.figures)
+    for name in ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share"):
+        figures[name] = float(np.average([scene[name] for scene in scenes], weights=counts))
+    system = replace(found.system, digitizers=systems)
+    return Survey(system, sum(counts), figures, _decide(system, main.spacing, figures))
+
+
+def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:
+    """Whether a block's digitizer has level, noise, pulse width and clipping of the main one.
+
+    plain: of the main one, as `measure_gaussian` finds it.
+    """
+    if block.digitizer.bits != main.digitizer.bits:
+        return False
+    other = measure_gaussian(block, plain.sigma_ref / block.spacing)
+    slack = 0.25 * plain.noise_std + 3 * plain.baseline_spread / np.sqrt(len(block))
+    alike = abs(other.baseline - plain.baseline) < slack
+    for quantity, most in (("noise_std", 1.2), ("sigma_ref", 1.04)):
+        ratio = getattr(other, quantity) / getattr(plain, quantity)
+        alike &= 1 / most < ratio < most
+    return bool(alike and (other.saturation or main.digitizer.max_count) == clip_level(main, plain))
+
+
+def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> SystemPulse:
+    """The system of another digitizer; where its echoes are too few for a pulse, the main one's with its noise."""
+    own = survey_block(block, learn=learn)
+    if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
+        return own.system
+    noise = measure_gaussian(block, system.sigma_ref / block.spacing)
+    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "saturation")
+    return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
 
 
 def measure_block(block: WaveformBlock, *, learn: bool = True) -> SystemPulse:

@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,7 +52,7 @@ QUANTITIES: dict[str, Quantity] = {
 COMPONENT_LIMITS = ((-10.0, 10.0), (-1e4, 1e4), (1e-3, 1e4))
 """Allowed weight, delay [ns] and sigma [ns] of a component."""
 
-_NOISE, _COMPONENTS = "noise_by_kind_dn", "components"
+_NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
 _TABLES = {"schema": str, "version": str, "strip": str, "waveforms": int}
 
 
@@ -71,6 +71,11 @@ class SavedSurvey:
 
 def describe_system(system: SystemPulse) -> dict[str, Any]:
     """The system pulse as plain numbers, lists and dictionaries under the keys of the file; exact."""
+    own = [{_INDEX: index, **_describe_pulse(other)} for index, other in sorted(system.digitizers.items())]
+    return {**_describe_pulse(system), **({_DIGITIZERS: own} if own else {})}
+
+
+def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
     told = {key: getattr(system, quantity.field) for key, quantity in QUANTITIES.items()}
     return {
         **{key: None if value is None else float(value) for key, value in told.items()},
@@ -90,13 +95,10 @@ def format_survey(saved: SavedSurvey) -> str:
     }
     lines = ["# What a survey found: `wavebatch run --system` takes it for a strip of the same sensor and settings."]
     lines += _format_table(head)
-    lines += ["", "[system]"]
-    for key, quantity in QUANTITIES.items():
-        if told[key] is not None:
-            lines.append(f"{key} = {_format(told[key])}  # {quantity.meaning}")
-    lines.append("# (weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first")
-    lines += _format_table({_COMPONENTS: told[_COMPONENTS]})
-    lines += ["", f"[system.{_NOISE}]", *_format_table(told[_NOISE])]
+    lines += ["", "[system]", *_format_pulse(told, "system")]
+    for own in told.get(_DIGITIZERS, []):
+        lines += ["", "# a digitizer that records otherwise", f"[[system.{_DIGITIZERS}]]", f"{_INDEX} = {own[_INDEX]}"]
+        lines += _format_pulse(own, f"system.{_DIGITIZERS}")
     finite = {key: float(value) for key, value in survey.figures.items() if math.isfinite(value)}
     lines += ["", "[figures]", *_format_table(finite)]
     for decision in survey.decisions:
@@ -105,6 +107,16 @@ def format_survey(saved: SavedSurvey) -> str:
     if saved.fingerprint:
         lines += ["", "[fingerprint]", *_format_fingerprint(saved.fingerprint)]
     return "\n".join(lines) + "\n"
+
+
+def _format_pulse(told: Mapping[str, Any], name: str) -> list[str]:
+    lines = []
+    for key, quantity in QUANTITIES.items():
+        if told[key] is not None:
+            lines.append(f"{key} = {_format(told[key])}  # {quantity.meaning}")
+    lines.append("# (weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first")
+    lines += _format_table({_COMPONENTS: told[_COMPONENTS]})
+    return [*lines, "", f"[{name}.{_NOISE}]", *_format_table(told[_NOISE])]
 
 
 def _format_table(table: Mapping[str, Any]) -> list[str]:
@@ -224,6 +236,22 @@ def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], needed: tupl
 
 
 def _read_system(table: Mapping[str, Any], where: str) -> SystemPulse:
+    """The table [system] with those of digitizers that record otherwise."""
+    rows = table.get(_DIGITIZERS, [])
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ConfigError(f"{where}: {_DIGITIZERS} must be written as [[system.{_DIGITIZERS}]] tables")
+    main = _read_pulse({key: value for key, value in table.items() if key != _DIGITIZERS}, where)
+    own: dict[int, SystemPulse] = {}
+    for number, row in enumerate(rows, 1):
+        place = f"{where}: {_DIGITIZERS} {number}"
+        index = row.get(_INDEX)
+        if type(index) is not int or not 1 <= index <= 255 or index in own:
+            raise ConfigError(f"{place}: {_INDEX} must be a number from 1 to 255 of its own, it is {_shorten(index)}")
+        own[index] = _read_pulse({key: value for key, value in row.items() if key != _INDEX}, place)
+    return replace(main, digitizers=own)
+
+
+def _read_pulse(table: Mapping[str, Any], where: str) -> SystemPulse:
     known = (*QUANTITIES, _COMPONENTS, _NOISE)
     needed = tuple(key for key in known if not (key in QUANTITIES and QUANTITIES[key].optional))
     _check_keys(table, dict.fromkeys(known), needed, where)

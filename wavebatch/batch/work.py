@@ -201,7 +201,7 @@ def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choi
     system = choice.survey.system
     used = system if job.calibration is None else job.calibration.apply(system)
     used = replace(used, divergence=parameters["divergence"] or used.divergence)
-    blocks = (sensor.fill(block) for block in reader.sample_blocks(scan, sample_size(reader)))
+    blocks = (sensor.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
     seen = measure_level(blocks, used, choice.survey.figures.get("spacing_ns", 0.0))
     system = replace(system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
     return replace(choice, survey=replace(choice.survey, system=system))

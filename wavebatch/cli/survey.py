@@ -11,6 +11,7 @@ import click
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 
 if TYPE_CHECKING:
+    from wavebatch.blocks import SystemPulse
     from wavebatch.io.strip import StripReader, StripScan
     from wavebatch.systemfile import SavedSurvey
 
@@ -72,11 +73,11 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
 
     with StripReader(strip, direction=options["direction"], headerless=options["headerless"]) as reader:
         with reader.scan() as scan:
-            block = read_sample(reader, scan, options["waveforms"])
+            sample = read_sample(reader, scan, options["waveforms"])
             facts = _describe_strip(reader, scan)
-            if block is None:
+            if not sample:
                 raise InputError(f"{strip}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-            found = survey_sample(block)
+            found = survey_sample(sample)
             if options["divergence"] is not None:
                 found = survey_angles(reader, scan, found, options["divergence"])
         packet_file = reader.facts.packet_file
@@ -131,6 +132,7 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield _line("vectors", f"{direction['sign']} the sensor: {direction['evidence']}")
     yield from _noise_lines(saved)
     yield from _pulse_lines(saved)
+    yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"
     for decision in _decisions(saved):
@@ -156,16 +158,18 @@ def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("signal noise", text)
 
 
+def _name_model(system: SystemPulse) -> str:
+    if system.components:
+        return f"learned, {len(system.components)} Gaussians"
+    return f"skewed, kappa {system.kappa:.4f}" if system.kappa else "Gaussian"
+
+
 def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     from wavebatch.units import FWHM_PER_SIGMA
 
     system, figures = saved.survey.system, saved.survey.figures
-    model = "Gaussian"
-    if system.components:
-        model = f"learned, {len(system.components)} Gaussians"
-    elif system.kappa:
-        model = f"skewed, kappa {system.kappa:.4f}"
     width = system.sigma_ref * FWHM_PER_SIGMA
+    model = _name_model(system)
     yield _line("system pulse", f"{model}; s_ref {system.sigma_ref:.4f} ns, full width at half maximum {width:.3f} ns")
     for weight, delay, sigma in system.components:
         yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
@@ -177,6 +181,12 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
+
+
+def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:
+    for index, own in saved.survey.system.digitizers.items():
+        noise = f"baseline {own.baseline:.3f} DN, noise {own.noise_std:.3f} DN"
+        yield _line(f"digitizer {index}", f"{noise}; {_name_model(own)}; s_ref {own.sigma_ref:.4f} ns")
 
 
 def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:

@@ -13,6 +13,13 @@ ROUNDS = 4
 """Times that level and quiet samples are found from each other."""
 
 
+DRIFT = 1.0
+"""Spread of the baselines, over the noise, from which each waveform's level is found from itself."""
+
+BELOW_QUARTILE = 0.773
+"""Root mean square distance from the lower quartile of what lies below it, for normal noise of unit variance."""
+
+
 class PooledNoise(NamedTuple):
     """Noise of one recorded sample over many waveforms [count]."""
 
@@ -29,12 +36,18 @@ class PooledNoise(NamedTuple):
 
 
 def first_level(signal: np.ndarray) -> tuple[float, float]:
-    """Most frequent value among the lower half of signal (s, n), and the spread below it: a start, echoes ignored."""
+    """Most frequent value among the lower half of signal (s, n), and the spread below it: a start, echoes ignored.
+
+    Where nothing lies below it, because counts end there, the spread up to the third quartile of all values: too large
+    a start becomes smaller later.
+    """
     median = np.median(signal, axis=0)
     low = signal[signal <= np.median(median) + 1]
     values, counts = np.unique(low, return_counts=True)
     level = float(values[np.argmax(counts)])
     below = low[low <= level] - level
+    if not below.any():
+        return level, max(float(np.quantile(signal, 0.75) - level) / 0.674, QUANTISATION_STD)
     return level, max(float(np.sqrt(np.mean(below * below))), QUANTISATION_STD)
 
 
@@ -59,7 +72,43 @@ def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> Pooled
         level += float(np.sum(mean * number, dtype=np.float64) / np.sum(number))
         deviation = np.where(quiet, signal - np.float32(level), np.float32(0))
         std, spread = _split_variance(deviation, number)
+    if spread > DRIFT * std:
+        return _estimate_drifting(signal, reach, limit) or PooledNoise(level, std, std, spread, float(quiet.mean()))
     return PooledNoise(level, std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()))
+
+
+def find_levels(
+    signal: np.ndarray, std: float, reach: int, limit: float = 4.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Level of each waveform of signal (s, n) from itself alone, (n,), its quiet samples (s, n) and their number (n,).
+
+    For baselines that scatter by more than the noise: a common level with so much room would take echoes for quiet.
+    Begins with the lower quartile, which echoes on up to half of the samples hardly move. std: noise of a sample.
+    """
+    level = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
+    width = np.float32(limit * SMOOTH_GAIN * std + 0.25)
+    for extra in (std, 0.0, 0.0):
+        quiet = find_quiet(signal - level, width + np.float32(extra), reach)
+        mean, number = quiet_mean(signal - level, quiet)
+        level = level + mean
+    return level, quiet, number
+
+
+def _estimate_drifting(signal: np.ndarray, reach: int, limit: float) -> PooledNoise | None:
+    """As `estimate_noise` for baselines that scatter by more than the noise; None without quiet samples."""
+    quartile = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
+    below = signal[signal < quartile] - np.broadcast_to(quartile, signal.shape)[signal < quartile]
+    std = max(float(np.sqrt(np.mean(below * below))) / BELOW_QUARTILE, QUANTISATION_STD) if len(below) else 1.0
+    for _ in range(ROUNDS):
+        levels, quiet, number = find_levels(signal, std, reach, limit)
+        several = number >= 8
+        if not several.any():
+            return None
+        std, _ = _split_variance(np.where(quiet, signal - levels, np.float32(0)), number)
+    known = levels[several].astype(np.float64)
+    scatter = np.mean((known - known.mean()) ** 2) - std**2 * np.mean(1 / number[several])
+    spread = float(np.sqrt(max(scatter, 0.0)))
+    return PooledNoise(float(known.mean()), std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()))
 
 
 def _split_variance(deviation: np.ndarray, number: np.ndarray) -> tuple[float, float]:

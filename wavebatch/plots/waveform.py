@@ -84,6 +84,7 @@ def build_views(
     block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int]
 ) -> list[WaveformView]:
     """A view per waveform of the block; packets: their numbers in the strip."""
+    system = system.of(block)
     first, decomposer = chain.steps[0], chain.steps[2]
     noise = first.stage.function(block, system, **first.parameters)
     echoes = chain.run(block, system)

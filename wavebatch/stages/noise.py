@@ -7,6 +7,7 @@ import numpy as np
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.errors import ConfigError
+from wavebatch.kernels.noise import DRIFT, find_levels
 from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.units import QUANTISATION_STD
 
@@ -18,6 +19,7 @@ def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, lim
     The standard deviation is that of the pooled quiet samples of the whole strip (survey): of a single waveform
     rounded to whole counts it could not be estimated (H10). The baseline is the best linear estimate from the mean
     of the waveform's own quiet samples and the strip's baseline, given how much baselines scatter between waveforms.
+    Where they scatter by more than the noise, what is quiet is found from each waveform alone.
 
     guard: samples next to a signal are not quiet; how far, in widths of the system pulse.
     limit: a smoothed sample further from the strip's baseline than this is signal, in noise standard deviations.
@@ -28,8 +30,11 @@ def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, lim
     signal -= np.float32(system.baseline)
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
     spread = system.baseline_spread
-    quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach)
-    mean, number = quiet_mean(signal, quiet)
+    if spread > DRIFT * std:
+        mean, _, number = find_levels(signal, std, reach, limit)
+    else:
+        quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach)
+        mean, number = quiet_mean(signal, quiet)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.baseline + trust * mean
     return Noise(baseline.astype(np.float32), np.full(n, std, np.float32))

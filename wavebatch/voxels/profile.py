@@ -94,6 +94,7 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
     Where nothing rises above the noise there is nothing: runs of samples whose sum is less than `threshold` standard
     deviations of a lone echo's amplitude are dropped. Each waveform is treated on its own.
     """
+    system = system.of(block)
     taps, area = _pulse_taps(system, block.spacing)
     noise = pooled(block, system)
     signal = signal_above(block, noise)
