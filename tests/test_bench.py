@@ -138,7 +138,7 @@ def test_plot_is_written_where_matplotlib_is(tmp_path, document):
     ("words", "message"),
     [
         (["a.las", "b.las"], "one strip at a time"),
-        (["--waveforms", "0"], "at least 1"),
+        (["--waveforms", "0"], "--waveforms': 0 is not in the range"),
         (["--tolerance", "2"], "no length"),
         (["missing.toml"], "cannot be read"),
         (["--hazard", "H99"], "H99"),

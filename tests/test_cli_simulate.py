@@ -72,6 +72,7 @@ def test_every_option_reaches_the_recording(tmp_path):
         (["flat", "--pulses", "0"], "at least one pulse"),
         (["flat", "--samples", "2"], "n_samples"),
         (["flat", "--las-version", "1.3", "--point-format", "9"], "1.3"),
+        (["flat", "--baseline", "255"], "baseline must lie"),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, arguments, words):

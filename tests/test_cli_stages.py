@@ -51,3 +51,5 @@ def test_json_for_programs():
 def test_an_unknown_stage_names_the_nearest():
     result = _invoke("detect.maximun")
     assert result.exit_code == 2 and "did you mean 'detect.maximum'" in result.stderr
+    nothing_like_it = _invoke("xyzzy")
+    assert nothing_like_it.exit_code == 2 and nothing_like_it.stderr.endswith("; `wavebatch stages` lists them\n")

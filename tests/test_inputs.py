@@ -2,7 +2,7 @@
 
 import pytest
 
-from wavebatch.batch.inputs import find_strips
+from wavebatch.batch.inputs import find_files, find_strips
 from wavebatch.errors import ConfigError
 
 
@@ -36,6 +36,14 @@ def test_a_strip_counts_once(folder):
     assert _names([str(folder / "b.las"), str(folder), str(folder / "sub" / ".." / "b.las")]) == ["b.las", "a.LAZ"]
 
 
+def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(folder):
+    (folder / "sub" / "b.laz").write_bytes(b"")
+    arguments = [str(folder), str(folder / "sub")]
+    assert [path.name for path in find_files(arguments)] == ["a.LAZ", "b.las", "b.laz", "c.laz"]
+    with pytest.raises(ConfigError, match="both would be written as b"):
+        find_strips(arguments)
+
+
 def test_a_name_with_brackets_is_a_name(folder):
     (folder / "x[1].las").write_bytes(b"")
     assert _names([str(folder / "x[1].las")]) == ["x[1].las"]
@@ -50,7 +58,7 @@ def test_a_named_file_that_is_missing_fails_later_and_alone(folder):
     [
         (["empty"], "holds no .las or .laz"),
         (["*.laz2"], "matches no"),
-        (["@none.txt"], "list of strips cannot be read"),
+        (["@none.txt"], "list cannot be read: No such file"),
         (["@loop.txt"], "line 1: a list cannot name another list"),
         (["@blank.txt"], "no strip given"),
         (["b.las", "sub/b.laz"], "both would be written as b"),

@@ -147,4 +147,6 @@ def test_text_has_every_figure(tmp_path):
     assert result.exit_code == 0
     for text in ("pulses         4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning        incomplete: 1 of 4"):
         assert text in result.stdout
-    assert "total" in CliRunner().invoke(stats, [str(path), str(path)]).stdout
+    other = write_cloud(tmp_path / "d.las", **SMALL)
+    assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
+    assert "total" not in CliRunner().invoke(stats, [str(path), str(path)]).stdout  # one file counts once

@@ -49,7 +49,7 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     try:
         text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: polygons cannot be read: {error}") from error
+        raise ConfigError(f"{path}: polygons cannot be read: {getattr(error, 'strerror', '') or error}") from error
     polygons = []
     for number, (properties, rings) in enumerate(read_features(text, path), 1):
         for ring in rings:

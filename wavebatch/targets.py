@@ -67,7 +67,7 @@ def load_targets(path: Path | str) -> list[Target]:
     try:
         text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: targets cannot be read: {error}") from error
+        raise ConfigError(f"{path}: targets cannot be read: {getattr(error, 'strerror', '') or error}") from error
     rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(io.StringIO(text)))
     targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
     if not targets:

@@ -1,4 +1,4 @@
-"""Which strips an argument list means: files, globs, directories and lists."""
+"""Which strips or clouds an argument list means: files, globs, folders and lists."""
 
 from __future__ import annotations
 
@@ -12,26 +12,35 @@ from wavebatch.errors import ConfigError
 SUFFIXES = (".las", ".laz")
 
 
-def find_strips(arguments: Iterable[str]) -> list[Path]:
-    """The strips that arguments mean, each once, in the order of the arguments; folders and globs by name.
+def find_files(arguments: Iterable[str]) -> list[Path]:
+    """The files that arguments mean, each once, in the order of the arguments; folders and globs by name.
 
     A folder means its LAS and LAZ files, not those of folders in it. `@list.txt` means one such argument per line;
     relative ones are taken from the list's folder, empty lines and lines that start with # are left out. A named file
     that does not exist is kept: it fails when its turn comes, and the others do not suffer.
-    Raises ConfigError where an argument means nothing, or two strips would have outputs of the same name.
+    Raises ConfigError where an argument means nothing.
     """
-    strips: dict[Path, Path] = {}
+    files: dict[Path, Path] = {}
     for argument in arguments:
         for path in _expand(argument, Path()):
-            strips.setdefault(path.resolve(), path)
+            files.setdefault(path.resolve(), path)
+    return list(files.values())
+
+
+def find_strips(arguments: Iterable[str]) -> list[Path]:
+    """The strips that arguments mean, as `find_files` finds them.
+
+    Raises ConfigError where there is none, or two would have outputs of the same name.
+    """
+    strips = find_files(arguments)
     if not strips:
         raise ConfigError("no strip given")
     stems: dict[str, Path] = {}
-    for path in strips.values():
+    for path in strips:
         other = stems.setdefault(os.path.normcase(path.stem), path)
         if other is not path:
             raise ConfigError(f"{other} and {path}: both would be written as {path.stem}; run them into two folders")
-    return list(strips.values())
+    return strips
 
 
 def _expand(argument: str, folder: Path) -> Iterator[Path]:
@@ -62,7 +71,7 @@ def _read_list(path: Path) -> Iterator[Path]:
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: list of strips cannot be read: {error}") from error
+        raise ConfigError(f"{path}: list cannot be read: {getattr(error, 'strerror', '') or error}") from error
     for number, line in enumerate(lines, 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import sys
 import traceback
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import IO, Any
 
 import click
 
@@ -19,8 +20,46 @@ EXIT_INTERRUPTED = 130
 """Ctrl-C or SIGTERM."""
 
 
+class WrongUsage(click.ClickException):
+    """Wrong usage in one line, as all other errors are told, where click takes four."""
+
+    exit_code = EXIT_USAGE
+
+    def __init__(self, error: click.UsageError) -> None:
+        text = " ".join(error.format_message().split()).removesuffix(".").replace(". (Did", " (did")
+        if not text[1:2].isupper():  # CRS stays
+            text = text[:1].lower() + text[1:]
+        if error.ctx:
+            text += f"{'' if text.endswith('?') else ';'} see `{error.ctx.command_path} --help`"
+        super().__init__(text)
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(f"error: {self.message}", file=file, err=file is None)
+
+
+@contextlib.contextmanager
+def _usage_in_one_line() -> Iterator[None]:
+    try:
+        yield
+    except click.UsageError as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
+            raise
+        raise WrongUsage(error) from error
+
+
 class NearestGroup(click.Group):
-    """A group of commands that names the nearest one where there is none of the name."""
+    """A group of commands that names the nearest one where there is none of the name; wrong usage is one line."""
+
+    def make_context(self, *args: Any, **options: Any) -> click.Context:
+        """As click does it, for the options of the group itself."""
+        with _usage_in_one_line():
+            return super().make_context(*args, **options)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """As click does it, for the commands."""
+        with _usage_in_one_line():
+            return super().invoke(ctx)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

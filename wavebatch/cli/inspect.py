@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors
 from wavebatch.inspection import check_file, describe_strip
 
@@ -57,10 +58,11 @@ def check(
 ) -> None:
     """Problems of strips and of chain files (.toml): one line each, with where and what to do.
 
-    Notes are oddities that do no harm here. Exit code: 0 clean, 1 problems found.
+    STRIP is a LAS or LAZ file, a glob, a folder, or @list.txt. Notes are oddities that do no harm here. Exit code: 0
+    clean, 1 problems found.
     """
     clean, results = True, []
-    for path in files:
+    for path in find_files(map(str, files)):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (strict and found.notes)
         results.append(found.to_dict())

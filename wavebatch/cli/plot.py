@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,16 +150,19 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 @_quiet
 @debug_option
 @report_errors()
-def histogram(clouds: tuple[Path, ...], column: str, output: Path, **options: Any) -> None:
+def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
     """How often which values of a column occur in CLOUDs of any size.
 
-    Points without data are left out and counted. Bins of a column of whole steps hold the same number of steps each.
-    Exit code: 0, 1 where a cloud cannot be read or the picture not be written, 2 wrong usage.
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt. Points without data are left out and counted. Bins of a
+    column of whole steps hold the same number of steps each. Exit code: 0, 1 where a cloud cannot be read or the
+    picture not be written, 2 wrong usage.
     """  # fmt: skip
+    from wavebatch.batch.inputs import find_files
     from wavebatch.pictures import check_picture
     from wavebatch.plots.histogram import count_flags, count_values, is_flags
 
     check_picture(output, overwrite=options["overwrite"])
+    clouds = find_files(map(str, clouds))
     selection = _select(column, options)
     how = {"log": options["log"], "overwrite": options["overwrite"]}
     if is_flags(clouds[0], column):
@@ -209,12 +213,13 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @_quiet
 @debug_option
 @report_errors()
-def map_(clouds: tuple[Path, ...], column: str | None, output: Path, **options: Any) -> None:
+def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """A map of a column of CLOUDs of any size, over x and y.
 
-    Colours lie between the 2nd and the 98th percentile of the cells. Exit code: 0, 1 where a cloud cannot be read or
-    the picture not be written, 2 wrong usage.
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt. Colours lie between the 2nd and the 98th percentile of
+    the cells. Exit code: 0, 1 where a cloud cannot be read or the picture not be written, 2 wrong usage.
     """  # fmt: skip
+    from wavebatch.batch.inputs import find_files
     from wavebatch.errors import ConfigError
     from wavebatch.pictures import check_picture
     from wavebatch.plots.raster import grid_values
@@ -223,6 +228,7 @@ def map_(clouds: tuple[Path, ...], column: str | None, output: Path, **options: 
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {statistic} needs a --column; count and density do without")
+    clouds = find_files(map(str, clouds))
     found = grid_values(
         clouds, _select(column, options), statistic, size=options["size"], bounds=options["bounds"]
     )

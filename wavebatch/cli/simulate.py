@@ -44,16 +44,21 @@ _SCENE_LINES = "\n\n".join(
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
 @click.argument("scene")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The strip: .las or .laz.")
-@click.option("--seed", default=0, show_default=True, help="Pulse k of a scene and seed is always the same.")
-@click.option("--pulses", default=100_000, show_default=True, help="Pulses to fire.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    metavar="N",
+    help="Pulse k of a scene and seed is always the same.",
+)
+@click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Pulses to fire.")
 @click.option("--truth", type=click.Path(path_type=Path), help="Write the true echoes to this .npz.")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), help="Bits per sample.  [default: 8]")
 @click.option("--samples", type=int, help="Samples per waveform.  [default: the scene's, 80 or 96]")
 @click.option("--spacing", type=float, help="Time between samples [ns].  [default: 1]")
 @click.option("--noise", type=float, help="Noise before rounding [DN].  [default: the scene's, 1 or 1.2]")
-@click.option(
-    "--rho", type=float, help="Correlation of the noise of neighbours: 0, .5, .667, .75, .8.  [default: 0]"
-)
+@click.option("--rho", type=float, help="Correlation of the noise of neighbours: 0, .5, .667, .75, .8.  [default: 0]")
 @click.option("--noise-gain", type=float, help="Variance that the signal adds, per DN.  [default: 0]")
 @click.option("--baseline", type=float, help="Level without signal [DN].  [default: 12]")
 @click.option("--saturation", type=int, help="Count at which the receiver clips.  [default: the digitizer's largest]")
@@ -88,7 +93,8 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
 
     The points are what a vendor would deliver: a return per distinguishable echo, sharing packets, placed rightly but
     with a return location that is up to half a sample off. --truth keeps every true echo for `wavebatch compare`.
-    --sensor discrete writes the returns of a receiver with a dead zone instead, in point format 1, 3, 6 or 8.
+    --sensor discrete writes the returns of a receiver with a dead zone instead, in the point format without waveforms:
+    1, 3, 6 or 8 in place of 4, 5, 9 or 10. Exit code: 0, 1 where the strip cannot be written, 2 wrong usage.
     """
     receiver = _build_receiver(truth, options)
     shaped = _shape_scene(find_scene(scene), options)
@@ -108,7 +114,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
             summary = simulate_strip(shaped, output, truth=truth, **common)
     if options["as_json"]:
         print_json(asdict(summary))
-    elif not options["quiet"]:
+    if not options["quiet"]:
         rest = f"{summary.empty} without any" if receiver else f"{summary.packets} packets with {summary.echoes} echoes"
         talk(f"{output}: {summary.points} points of {summary.pulses} pulses, {rest}")
 
@@ -119,6 +125,8 @@ def _build_receiver(truth: Path | None, options: dict) -> DiscreteReceiver | Non
     if options["sensor"] == "discrete":
         if truth:
             raise click.UsageError("--truth holds the echoes of waveforms; simulate them with --sensor waveform")
+        if not options["internal"]:
+            raise click.UsageError("--external is about packets, of which --sensor discrete has none")
         return DiscreteReceiver(**given)
     if given:
         raise click.UsageError("--dead-zone, --threshold and --most-returns need --sensor discrete")

@@ -27,7 +27,10 @@ def _read_lines(context: click.Context, parameter: click.Parameter, text: str | 
         raise click.BadParameter(f"{text!r} is neither a number nor FIRST:BEHIND")
     if found[1]:
         return int(found[1]), int(found[1]) + 1
-    return int(found[2] or 0), int(found[3]) if found[3] else None
+    first, behind = int(found[2] or 0), int(found[3]) if found[3] else None
+    if behind is not None and behind <= first:
+        raise click.BadParameter(f"{text!r} holds no line; BEHIND is the line after the last one")
+    return first, behind
 
 
 @click.command(name="slice")
@@ -74,7 +77,7 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
         talk(f"{strip}: no scan line has a number that --lines asks for")
     if options["as_json"]:
         print_json(counts)
-    elif not options["quiet"]:
+    if not options["quiet"]:
         talk(f"{strip}: {counts['segments']} segments in {counts['lines']} scan lines of {counts['pulses']} pulses")
 
 

@@ -26,7 +26,8 @@ def stages(name: str | None, as_json: bool, debug: bool) -> None:
     from wavebatch.chain import KINDS, STAGES
 
     if name is not None and name not in STAGES:
-        raise ConfigError(f"no stage {name!r}; {nearest(name, STAGES)}")
+        told = nearest(name, STAGES)
+        raise ConfigError(f"no stage {name!r}; {told if '?' in told else '`wavebatch stages` lists them'}")
     order = list(KINDS)
     chosen = [STAGES[name]] if name else sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
     if as_json:

@@ -14,6 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.areas import AreaStats, Grid, PolygonSet
+from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.errors import InputError
 from wavebatch.io.publish import refuse_existing
@@ -51,9 +52,9 @@ def stats(
 ) -> None:
     """How many returns the pulses of CLOUDs have, how far apart they are, and which flags they carry.
 
-    Any LAS or LAZ file, in any order of points. Warns what the sensor's dead zone and its largest number of returns
-    hide. A pulse belongs to the area of its first return, with all of its returns. Exit code: 0, or 1 where a cloud
-    cannot be read (the others are counted).
+    CLOUD is a LAS or LAZ file with its points in any order, a glob, a folder, or @list.txt. Warns what the sensor's
+    dead zone and its largest number of returns hide. A pulse belongs to the area of its first return, with all of its
+    returns. Exit code: 0, or 1 where a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
     if output is not None and not overwrite:
         refuse_existing(output)
@@ -67,13 +68,14 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = count_returns(clouds, skip, divisions=divisions)
+    files = find_files(map(str, clouds))
+    each, total = count_returns(files, skip, divisions=divisions)
     if output is not None:
         write_text(output, _format_table(each, total), overwrite=overwrite)
     if as_json:
         print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
     else:
-        shown = [*each, total] if len(clouds) > 1 else each
+        shown = [*each, total] if len(files) > 1 else each
         click.echo("\n\n".join("\n".join(_list_lines(one)) for one in shown), nl=bool(shown))
     sys.exit(EXIT_UNREADABLE if failed else 0)
 

@@ -32,7 +32,9 @@ _RADAR = ("power", "aperture", "divergence", "efficiency", "attenuation")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="8", show_default=True, help="Bits per sample.")
 @click.option("--baseline", default=12.0, show_default=True, help="Level without signal [DN].")
 @click.option("--noise", default=0.0, show_default=True, help="Noise before rounding [DN].")
-@click.option("--seed", default=0, show_default=True, help="Of noise and of the samples' phase.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of noise and of the samples' phase."
+)
 @click.option("--sensor-height", type=float, help="Reflectance: height of the sensor, as the cloud's heights [m].")
 @click.option("--power", type=float, help="Reflectance: peak power of the pulse [W].  [default: 1]")
 @click.option("--aperture", type=float, help="Reflectance: diameter of the receiver [m].  [default: 0.1]")

@@ -48,6 +48,7 @@ class Recording:
             "noise_std must not be negative": self.noise_std >= 0,
             "noise_gain must not be negative": self.noise_gain >= 0,
             "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": abs(self.rho - self.color / (self.color + 1)) < 0.006,
+            "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,
             "saturation must be a count that the bits can hold": 0 < self.clip < 1 << self.bits,
         }
         for message, good in check.items():
