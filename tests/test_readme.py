@@ -28,6 +28,15 @@ def test_every_flag_is_described_as_it_is_declared(flag):
     assert f"| {int(flag)} | {flag.name} | {FLAG_MEANINGS[flag]} |" in TEXT
 
 
+def test_every_part_of_the_program_has_its_place():
+    table = TEXT[TEXT.index("## Where things are") : TEXT.index("## Dependencies")]
+    told = re.findall(r"`(\w+/?)`", "".join(re.findall(r"(?m)^\| (`.*?) \|", table)))
+    root = Path(__file__).resolve().parent.parent / "wavebatch"
+    parts = {f"{path.name}/" for path in root.iterdir() if path.is_dir() and path.name != "__pycache__"}
+    parts |= {path.stem for path in root.glob("[a-z]*.py")}
+    assert sorted(told) == sorted(parts)
+
+
 def test_profiles_are_named():
     for name in list_profiles():
         assert name in TEXT
