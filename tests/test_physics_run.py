@@ -1,6 +1,7 @@
 """`wavebatch run` with calibration, trajectory and neither: columns, report, the same bytes for any jobs and blocks."""
 
 import json
+import tomllib
 from dataclasses import replace
 
 import laspy
@@ -206,6 +207,8 @@ def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
 def test_calibration_files():
     again = parse_calibration(format_calibration(FOUND), "cal")
     assert replace(again, strip=FOUND.strip) == replace(FOUND)
+    written = tomllib.loads(format_calibration(FOUND))["section_constant"]
+    assert written == pytest.approx(np.pi / 4 * 1.1e-3**2 * 2.6e-8, rel=1e-12)
     bare = parse_calibration('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n', "cal")
     assert bare.divergence is None and bare.attenuation == 0.22
     system = FOUND.apply(SystemPulse(2.0))
@@ -222,6 +225,12 @@ def test_calibration_files():
         ('schema = "wavebatch.calibration/1"', "key 'constant' is missing"),
         ('schema = "wavebatch.calibration/1"\nconstant = "a"\nrelative_error = 1', "constant must be a number"),
         ('schema = "wavebatch.calibration/1"\nconstant = 0\nrelative_error = 1', "must lie between 1e-30 and"),
+        ('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\nsection_constant = 1e-15', "no div"),
+        (
+            'schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\ndivergence_mrad = 1\n'
+            "section_constant = 8e-15",
+            "but there is 7.853981633974",
+        ),
     ],
 )
 def test_wrong_calibration_files_are_one_line(tmp_path, text, message):

@@ -14,7 +14,7 @@ from wavebatch.errors import ConfigError
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import find_scene, simulate_strip, strip
-from wavebatch.simulate.geometry import EAST, GROUND, NORTH
+from wavebatch.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS
 from wavebatch.targets import Target, fit_normal, load_targets
 from wavebatch.units import MAD_TO_STD
@@ -115,6 +115,33 @@ def test_targets_off_the_strip(tmp_path, ground):
     assert done.exit_code == 1
     assert "no target has 10 clean single echoes (target 1 0)" in done.stderr
     assert not (tmp_path / "cal.toml").exists()
+
+
+def test_a_lever_arm_leads_from_the_trajectory_to_the_scanner(tmp_path, ground):
+    flight = Flight()
+    seconds = np.arange(-1.0, 2.0, 0.05)
+    rays = trace_rays(flight, "flat", seconds * flight.pulse_rate)
+    sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
+    # Heading east, the trajectory's antenna is 30 m above the scanner and 2 m behind it.
+    antenna = sensor + [-2.0, 0.0, 30.0]
+    rows = np.column_stack([START_TIME + seconds, antenna, np.tile([0.0, 0.0, 90.0], (len(seconds), 1))])
+    text = "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows)
+    (tmp_path / "t.csv").write_text("time,x,y,z,roll,pitch,heading\n" + text)
+    cloud = laspy.read(ground)
+    target = f"reflectance,x,y,radius\n0.2,{np.median(cloud.x)},{np.median(cloud.y)},40\n"
+    (tmp_path / "g.csv").write_text(target)
+    constants = []
+    for number, options in enumerate([(), ("--trajectory", tmp_path / "t.csv"), ("--lever-arm", "2,0,30")]):
+        cal = tmp_path / f"{number}.toml"
+        options = ("--trajectory", tmp_path / "t.csv", *options) if number == 2 else options
+        done = call("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", cal, *options)
+        assert done.exit_code == 0, done.output
+        constants.append(load_calibration(cal).constant)
+    vectors, antenna, scanner = constants
+    assert scanner == pytest.approx(vectors, rel=1e-4)
+    assert antenna < 0.95 * vectors
+    done = call("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", tmp_path / "x.toml", "--lever-arm", "1,2,3")
+    assert done.exit_code == 2 and "--lever-arm is of no use without --trajectory" in done.stderr
 
 
 @pytest.fixture(scope="module")

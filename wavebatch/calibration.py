@@ -27,7 +27,9 @@ _NUMBERS = {
     "attenuation_db_km": (0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
     "divergence_mrad": (1e-3, 100.0, math.nan, "full angle of the beam between the 1/e^2 points; needed for m2"),
 }
+_SECTION = (0.0, 1e30, math.nan, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission")
 _MORE_NUMBERS = {
+    "section_constant": _SECTION,
     "digitizer": (1, 255, None, "index of the wave packet descriptor"),
     "scanner": (0, 3, 0, "scanner channel of the points"),
     "spread": (0.0, 1e6, 0.0, "of the echoes' constants, relative, robust standard deviation"),
@@ -57,6 +59,11 @@ class Calibration:
     channels: tuple[Mapping[str, Any], ...] = ()
     """Channels with a constant of their own: digitizer, scanner, constant, relative_error, spread, echoes."""
 
+    @property
+    def section_constant(self) -> float | None:
+        """C_cal [1/(m2 count ns)]; None where nobody gave the divergence."""
+        return None if self.divergence is None else 0.25 * math.pi * (1e-3 * self.divergence) ** 2 * self.constant
+
     def apply(self, system: SystemPulse) -> SystemPulse:
         """The system with this calibration; a divergence of its own stays."""
         return replace(
@@ -77,6 +84,7 @@ class Calibration:
             "relative_error": self.relative_error,
             "attenuation_db_km": self.attenuation,
             "divergence_mrad": self.divergence,
+            "section_constant": self.section_constant,
             "strip": self.strip,
             "date": self.date,
             "channels": [dict(row) for row in self.channels],
@@ -105,8 +113,9 @@ def format_calibration(found: Calibration) -> str:
     lines = ["# A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."]
     texts = (CALIBRATION_SCHEMA, __version__, found.strip, found.date, found.conditions)
     lines += [f"{key} = {json.dumps(value)}" for key, value in zip(_TEXTS, texts, strict=True)]
-    values = (found.constant, found.relative_error, found.attenuation, found.divergence)
-    for (key, (*_, meaning)), value in zip(_NUMBERS.items(), values, strict=True):
+    values = (found.constant, found.relative_error, found.attenuation, found.divergence, found.section_constant)
+    numbers = {**_NUMBERS, "section_constant": _SECTION}
+    for (key, (*_, meaning)), value in zip(numbers.items(), values, strict=True):
         if value is not None:
             lines.append(f"{key} = {float(value)!r}  # {meaning}")
     for word, tables in (("channel", found.channels), ("target", found.targets)):
@@ -135,16 +144,28 @@ def parse_calibration(text: str, name: str) -> Calibration:
         document = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{name}: not valid TOML: {error}") from error
+    keys = (*_TEXTS, *_NUMBERS, "section_constant", *_TABLES)
     for key in document:
-        if key not in (*_TEXTS, *_NUMBERS, *_TABLES):
-            raise ConfigError(f"{name}: unknown key {key!r}; {nearest(key, (*_TEXTS, *_NUMBERS, *_TABLES))}")
+        if key not in keys:
+            raise ConfigError(f"{name}: unknown key {key!r}; {nearest(key, keys)}")
     if document.get("schema") != CALIBRATION_SCHEMA:
         raise ConfigError(f"{name}: schema is {document.get('schema')!r}, this version reads {CALIBRATION_SCHEMA!r}")
     constant, error, attenuation, divergence = (_read_number(document, key, name) for key in _NUMBERS)
     texts = {key: str(document.get(key, "")) for key in ("strip", "date", "conditions")}
     divergence = None if math.isnan(divergence) else divergence
     channels = _read_channels(document.get("channel", []), name)
-    return Calibration(constant, error, attenuation, divergence, **texts, channels=channels)
+    found = Calibration(constant, error, attenuation, divergence, **texts, channels=channels)
+    if "section_constant" in document:
+        _check_section(_read_number(document, "section_constant", name), found, name)
+    return found
+
+
+def _check_section(said: float, found: Calibration, name: str) -> None:
+    """Raises ConfigError where C_cal is not that of the constant and the divergence: one was changed, not the other."""
+    expected = found.section_constant
+    if expected is None or abs(said - expected) > 1e-3 * expected:
+        wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
+        raise ConfigError(f"{name}: section_constant is {said!r}, but there is {wanted}: mend these, or leave it out")
 
 
 def _read_channels(rows: Any, name: str) -> tuple[dict[str, Any], ...]:

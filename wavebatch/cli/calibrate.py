@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from wavebatch.cli.common import debug_option, report_errors, talk
+from wavebatch.cli.sensor import read_sensor
 
 
 @click.command()
@@ -16,6 +18,7 @@ from wavebatch.cli.common import debug_option, report_errors, talk
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAL.toml", help="The result.")
 @click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
               help="Where the sensor was; without it the packets' own vectors say.")
+@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
 @click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
 @click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M", help="Where nothing else says.")
 @click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE", help="A saved survey.")
@@ -34,9 +37,6 @@ def calibrate(
     strip: Path,
     targets: Path,
     output: Path,
-    trajectory: Path | None,
-    crs: str | None,
-    flight_height: float | None,
     system_file: Path | None,
     attenuation: float,
     divergence: float | None,
@@ -44,6 +44,7 @@ def calibrate(
     direction: str,
     overwrite: bool,
     debug: bool,
+    **options: Any,
 ) -> None:
     """The calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
 
@@ -54,16 +55,16 @@ def calibrate(
     """  # fmt: skip
     from wavebatch.calibration import format_calibration
     from wavebatch.io.publish import refuse_existing
-    from wavebatch.sensor import SensorRequest
     from wavebatch.systemfile import load_survey, write_text
     from wavebatch.targets import calibrate_strip, load_targets
 
+    sensor = read_sensor(options)
     if not overwrite:
         refuse_existing(output)
     found = calibrate_strip(
         strip,
         load_targets(targets),
-        sensor=SensorRequest(trajectory, crs, None, flight_height),
+        sensor=sensor,
         system=load_survey(system_file).survey.system if system_file else None,
         attenuation=attenuation,
         divergence=divergence,

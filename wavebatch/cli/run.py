@@ -12,6 +12,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.common import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
+from wavebatch.cli.sensor import read_sensor
 from wavebatch.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
@@ -144,13 +145,10 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     from wavebatch.batch.task import BatchOptions
     from wavebatch.batch.work import RunOptions, StripJob, choose_columns
     from wavebatch.calibration import load_calibration
-    from wavebatch.sensor import SensorRequest
 
     chain, request = choose_chain(options)
     calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
-    sensor = SensorRequest(
-        options["trajectory"], options["crs"], _read_lever_arm(options["lever_arm"]), options["flight_height"]
-    )
+    sensor = read_sensor(options)
     template = StripJob(Path(), chain, RunOptions(), request, sensor, calibration)
     chain = chain if options["chain_file"] else template.extend(chain)
     _check_use(chain, options)
@@ -213,20 +211,6 @@ def _check_use(chain: Any, options: dict[str, Any]) -> None:
     if given and not needs_sensor(chain):
         option = f"--{given[0].removesuffix('_file').replace('_', '-')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage attribute.range")
-    for name in ("lever_arm", "crs"):
-        if options[name] is not None and options["trajectory"] is None:
-            raise ConfigError(f"--{name.replace('_', '-')} is of no use without --trajectory; give that too")
-
-
-def _read_lever_arm(text: str | None) -> tuple[float, float, float] | None:
-    """Forward, right, down [m]."""
-    if text is None:
-        return None
-    try:
-        forward, right, down = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise ConfigError(f"--lever-arm: {text!r} must be three numbers in metres, e.g. 0.1,-0.2,0.5") from error
-    return forward, right, down
 
 
 def _read_tolerance(text: str | None) -> float | None:

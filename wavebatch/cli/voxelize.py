@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.sensor import read_sensor
 
 if TYPE_CHECKING:
     from wavebatch.voxels import VoxelSummary
 
-_SENSOR = ("trajectory", "crs", "flight_height")
+_SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 
 
 @click.command()
@@ -40,6 +41,7 @@ _SENSOR = ("trajectory", "crs", "flight_height")
               help="Of `wavebatch calibrate`, with divergence: adds the cross section in m2.")
 @click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
               help="For cross sections: where the sensor was; without it the packets' own vectors say.")
+@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
 @click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
 @click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
               help="For cross sections, where nothing else says where the sensor was.")
@@ -73,11 +75,11 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     from tqdm import tqdm
 
     from wavebatch.calibration import load_calibration
-    from wavebatch.sensor import SensorRequest
     from wavebatch.systemfile import load_survey
     from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
 
     _check_options(options)
+    sensor = read_sensor(options)
     deconvolution = Deconvolution(
         options["method"], options["iterations"], options["snr"], options["threshold"]
     )
@@ -95,7 +97,7 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
             settings,
             system=load_survey(system_file) if system_file else None,
             calibration=load_calibration(calibration_file) if calibration_file else None,
-            sensor=SensorRequest(options["trajectory"], options["crs"], None, options["flight_height"]),
+            sensor=sensor,
             direction=options["direction"],
             headerless=options["headerless"],
             overwrite=options["overwrite"],
@@ -117,8 +119,6 @@ def _check_options(options: dict[str, Any]) -> None:
     for name in _SENSOR:
         if options[name] is not None and options["calibration_file"] is None:
             raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")
-    if options["crs"] is not None and options["trajectory"] is None:
-        raise click.UsageError("--crs is of no use without --trajectory")
 
 
 def _list_lines(summary: VoxelSummary) -> list[str]:
