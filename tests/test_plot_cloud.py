@@ -416,6 +416,14 @@ def test_without_matplotlib_a_line_says_what_to_install(cloud, tmp_path, monkeyp
     assert result.exit_code == 2 and "pip install 'wavebatch[plot]'" in result.stderr
 
 
+def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
+    assert result.exit_code == 2 and "matplotlib cannot be imported" in result.stderr
+    assert len(result.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())
+
+
 def test_matplotlib_is_not_imported_before_something_is_drawn(cloud, tmp_path):
     code = (
         "import sys\nfrom click.testing import CliRunner\nfrom wavebatch.cli import main\n"

@@ -72,9 +72,12 @@ def open_picture(
     check_picture(target, overwrite=overwrite)
     # In cron, with no home to write to, matplotlib would talk about its cache on stderr.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    try:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ConfigError(f"{target}: matplotlib cannot be imported, install it anew: {error}") from error
 
     kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}
     with matplotlib.rc_context({**kept, **_STYLE}), warnings.catch_warnings():
