@@ -350,5 +350,5 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
     back = compare_clouds(tmp_path / "b.las", tmp_path / "a.las")
     assert (back.extra_by, back.missed_by) == (result.missed_by, result.extra_by)
     both = 2 * result.matched / (result.echoes_a + result.echoes_b)
-    assert result.identical == pytest.approx(both) and result.to_dict()["identical"] == result.identical
+    assert result.identical == pytest.approx(both) and result.to_json()["identical"] == result.identical
     assert result.gain == pytest.approx(keep.sum() / len(times) - 1)

@@ -191,5 +191,5 @@ def test_statistics_of_known_errors():
 
 def test_score_is_plain_data():
     _, truth = make_block("mixed", 100)
-    text = json.dumps(score(truth, truth, 100, noise_std=1.2).to_dict())
+    text = json.dumps(score(truth, truth, 100, noise_std=1.2).to_json())
     assert json.loads(text)["errors"]["isolated"]["time"]["rmse"] == 0

@@ -151,12 +151,9 @@ def describe_choice(choice: Choice, request: Request) -> dict[str, Any]:
 def describe_survey(choice: Choice, request: Request, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
     """The pulse that is used and where it comes from, for reports. fingerprint: of the strip that is run."""
     found, saved = choice.survey, request.system
-    source: dict[str, Any] = {"from": "strip", "waveforms": found.waveforms, "figures": _finite(found.figures)}
+    figures = {name: float(value) for name, value in found.figures.items() if np.isfinite(value)}
+    source: dict[str, Any] = {"from": "strip", "waveforms": found.waveforms, "figures": figures}
     if saved is not None:
         same = bool(saved.fingerprint) and dict(saved.fingerprint) == dict(fingerprint)
         source |= {"from": "file", "strip": saved.strip, "version": saved.version, "of_this_strip": same}
     return {"system": describe_system(found.system), "survey": source}
-
-
-def _finite(figures: Mapping[str, float]) -> dict[str, float]:
-    return {name: float(value) for name, value in figures.items() if np.isfinite(value)}

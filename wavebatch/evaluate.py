@@ -148,7 +148,7 @@ class Score:
     errors: dict[str, dict[str, ErrorStats]]
     """Per class (all, isolated, overlapped) and quantity (time [ns], amplitude [count], sigma [ns])."""
 
-    def to_dict(self) -> dict:
+    def to_json(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
         return asdict(self)
 

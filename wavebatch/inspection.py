@@ -34,7 +34,7 @@ class Findings:
         """Whether there are no problems."""
         return not self.problems
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """For JSON."""
         lists = {"problems": list(self.problems), "notes": list(self.notes)}
         return {"file": self.file, "clean": self.is_clean, "summary": self.summary, **lists}

@@ -1,12 +1,15 @@
 """Why an echo has no value in a column: one code per echo, beside the column, so that reports can say how many and why.
 
-The codes of column `c` are the attribute `c_reason`, u1; they never leave the program.
+The codes of column `c` are the attribute `c_reason`, u1; they never leave the program. What is unknown is NaN in arrays
+and null in JSON.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -83,6 +86,17 @@ def explain(values: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]) -> np.
         left[np.broadcast_to(holds, len(rows))] = reason
     codes[rows] = left
     return codes
+
+
+def without_nan(value: Any) -> Any:
+    """The same numbers, lists and dictionaries for JSON: None for what is no finite number, names as text."""
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(value) else None
+    return value
 
 
 def count_reasons(attributes: Mapping[str, np.ndarray]) -> dict[str, dict[str, int]]:

@@ -17,6 +17,7 @@ from wavebatch.batch.work import Prepared, StripJob
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.nodata import without_nan
 from wavebatch.systemfile import format_survey, write_text
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
@@ -63,7 +64,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
         "direction": {
             "sign": scan.direction,
             "evidence": scan.direction_evidence,
-            "vector_ratio": _finite(scan.vector_ratio),
+            "vector_ratio": without_nan(scan.vector_ratio),
         },
         "sensor": prepared.sensor.describe(),
         **describe_survey(prepared.choice, prepared.job.request, fingerprint),
@@ -147,7 +148,3 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
         if same and document["output"]["file"] == cloud.name and document["output"]["size"] == cloud.stat().st_size:
             return RunReport.from_json(document)
     return None
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or value != value or abs(value) == float("inf") else float(value)

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.nodata import without_nan
+
 NOTHING = float("nan")
 
 SURVEY_SCATTER = 0.05
@@ -30,7 +32,7 @@ class Figure:
 
     def to_json(self) -> dict[str, Any]:
         """Value and error; None for what there was nothing to tell from."""
-        return {"value": _finite(self.value), "error": _finite(self.error)}
+        return without_nan({"value": self.value, "error": self.error})
 
     def scale(self, factor: float) -> Figure:
         """The figure in another unit."""
@@ -92,7 +94,3 @@ def median_range(values: list[float]) -> dict[str, Any]:
         "max": float(max(values)),
         "repeats": len(values),
     }
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -84,8 +84,10 @@ def printable(text: str) -> str:
 
 
 def print_json(value: Any) -> None:
-    """`value` as JSON with sorted keys on stdout."""
-    text = json.dumps(value, indent=2, sort_keys=True, ensure_ascii=False)
+    """`value` as JSON with sorted keys on stdout; null for what is no number, so that every reader takes it."""
+    from wavebatch.nodata import without_nan
+
+    text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     click.echo(text.encode(errors="backslashreplace").decode())
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 EXIT_VIOLATED = 1
 """A threshold is not met."""
 
+_SHARE, _LENGTH = click.FloatRange(0.0, 1.0), click.FloatRange(0.0)
+
 
 @click.command()
 @click.argument("a", type=click.Path(path_type=Path))
@@ -34,12 +36,12 @@ EXIT_VIOLATED = 1
 @click.option("--truth", type=click.Path(path_type=Path), help="Truth of a simulated strip, in place of B.")
 @click.option("--angles", is_flag=True, help="Angles from widths against those from normals: of A, or A against B.")
 @click.option("--tolerance", type=float, help="Largest difference of the same echo [ns].  [default: 1; truth: 1.5]")
-@click.option("--min-completeness", type=float, help="Least share of B's echoes that A has.")
-@click.option("--min-correctness", type=float, help="Least share of A's echoes that B has.")
-@click.option("--min-exact", type=float, help="Least share of pulses with as many echoes in A as in B.")
-@click.option("--max-median", type=float, help="Largest absolute median of the difference [ns].")
-@click.option("--max-rmse", type=float, help="Largest root mean square of the difference [ns].")
-@click.option("--max-nmad", type=float, help="Largest robust spread of the difference [ns].")
+@click.option("--min-completeness", type=_SHARE, help="Least share of B's echoes that A has.")
+@click.option("--min-correctness", type=_SHARE, help="Least share of A's echoes that B has.")
+@click.option("--min-exact", type=_SHARE, help="Least share of pulses with as many echoes in A as in B.")
+@click.option("--max-median", type=_LENGTH, help="Largest absolute median of the difference [ns].")
+@click.option("--max-rmse", type=_LENGTH, help="Largest root mean square of the difference [ns].")
+@click.option("--max-nmad", type=_LENGTH, help="Largest robust spread of the difference [ns].")
 @click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
 @debug_option
 @report_errors(failure=2)
@@ -60,12 +62,12 @@ def compare(
     """  # fmt: skip
     if angles:
         agreement = measure(a, b, {**options, "strip": strip, "truth": truth})
-        print_json(_finite(agreement.to_dict())) if as_json else click.echo("\n".join(list_lines(agreement)))
+        print_json(agreement.to_json()) if as_json else click.echo("\n".join(list_lines(agreement)))
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     if as_json:
-        print_json(_finite(result.to_dict()))
+        print_json(result.to_json())
     else:
         click.echo("\n".join([*_list_lines(between), *(_list_match(result) if strip else [])]))
     broken = _check_thresholds(between, options)
@@ -101,13 +103,19 @@ def _is_chain(side: Path) -> bool:
 
 
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
-    from wavebatch.compare.chains import find_contender, match_sides
+    from wavebatch.choice import COSTS
+    from wavebatch.compare.chains import AUTO, find_contender, match_sides
     from wavebatch.systemfile import load_survey
+    from wavebatch.words import nearest
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` holds chains against a truth")
     saved = load_survey(options["system_file"]).survey if options["system_file"] else None
     sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
+    for side in sides:
+        if side is not None and side.is_cloud and not Path(side.name).exists():
+            chain = nearest(side.name, [AUTO, *COSTS])
+            raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
     return match_sides(strip, *sides, survey=saved, limit=options["limit"], **_tolerance(options))
 
 
@@ -207,12 +215,3 @@ def _list_errors(result: Comparison) -> list[str]:
             figures = " ".join(f"{'-':>10}" if math.isnan(value) else f"{value:>10.4f}" for value in values)
             lines.append(f"{kind + ' ' + name:<22} {stats.number:>10} {figures}")
     return lines
-
-
-def _finite(value):
-    """The same structure with None for what is not a number, so that every JSON reader takes it."""
-    if isinstance(value, dict):
-        return {str(key): _finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

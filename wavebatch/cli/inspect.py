@@ -65,7 +65,7 @@ def check(
     for path in find_files(map(str, files)):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (strict and found.notes)
-        results.append(found.to_dict())
+        results.append(found.to_json())
         if as_json:
             continue
         for line in found.problems:

@@ -18,6 +18,13 @@ from wavebatch.nodata import REASONS, NoData
 KINDS = ("auto", "bar", "json", "none")
 
 
+def counting(unit: str, quiet: bool, total: int | None = None) -> Any:
+    """A bar that counts up to `total`, on a terminal and unless `quiet`; a context manager with `update(number)`."""
+    from tqdm import tqdm
+
+    return tqdm(total=total, unit=f" {unit}", disable=quiet or not sys.stderr.isatty(), leave=False)
+
+
 class Progress:
     """Takes the events of a batch. kind: one of KINDS; auto is a bar where stderr is a terminal.
 

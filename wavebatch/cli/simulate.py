@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.progress import counting
 from wavebatch.simulate import (
     CANOPIES,
     PULSES,
@@ -99,7 +98,7 @@ def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | Non
     receiver = _build_receiver(truth, options)
     shaped = _shape_scene(find_scene(scene), options)
     storage = {name: options[name] for name in _STORAGE} | {"point_format": int(options["point_format"])}
-    bar = tqdm(total=pulses, unit=" pulses", disable=options["quiet"] or not sys.stderr.isatty(), leave=False)
+    bar = counting("pulses", options["quiet"], pulses)
     common = {
         "pulses": pulses,
         "seed": seed,

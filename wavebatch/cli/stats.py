@@ -148,13 +148,4 @@ def _cell(value: Any) -> Any:
 
 
 def _plain(found: ReturnStats) -> dict[str, Any]:
-    """JSON has no NaN: what is unknown is null."""
-    return _finite({**asdict(found), "returns_per_pulse": found.returns_per_pulse})
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return {**asdict(found), "returns_per_pulse": found.returns_per_pulse}

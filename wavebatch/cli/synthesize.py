@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import click
-from tqdm import tqdm
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.progress import counting
 from wavebatch.synthesize import INTENSITIES, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
 _PLAIN = ("intensity", "gain", "width", "spacing", "baseline", "noise", "seed", "internal")
@@ -56,7 +55,7 @@ def synthesize(cloud: Path, output: Path, **options) -> None:
     settings = SynthesisOptions(
         bits=int(options["bits"]), radar=_build_radar(options), **{name: options[name] for name in _PLAIN}
     )
-    with tqdm(unit=" points", disable=options["quiet"] or not sys.stderr.isatty(), leave=False) as bar:
+    with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
     if options["as_json"]:
         print_json(asdict(summary))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.progress import counting
 from wavebatch.cli.sensor import read_sensor
 
 if TYPE_CHECKING:
@@ -72,8 +72,6 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0, 1 where the strip cannot be read or the output not be written, 2 wrong usage.
     """  # fmt: skip
-    from tqdm import tqdm
-
     from wavebatch.calibration import load_calibration
     from wavebatch.systemfile import load_survey
     from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
@@ -85,7 +83,7 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     )
     settings = VoxelOptions(options["size"], deconvolution, options["headroom"], options["all_crossed"])
     calibration_file, system_file = options["calibration_file"], options["system_file"]
-    with tqdm(unit=" waveforms", disable=options["quiet"] or not sys.stderr.isatty(), leave=False) as bar:
+    with counting("waveforms", options["quiet"]) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total

@@ -50,7 +50,7 @@ class AngleAgreement:
     difference_edges: tuple[float, ...]
     histogram_difference: tuple[int, ...]
 
-    def to_dict(self) -> dict:
+    def to_json(self) -> dict:
         """Plain numbers and lists for JSON."""
         return asdict(self)
 

@@ -74,14 +74,14 @@ class Matchup:
     several (`multi`), and those in which `both` chains have one; empty where what was fitted is not known, as it is
     not of a cloud."""
 
-    def to_dict(self) -> dict:
+    def to_json(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
         return {
-            **self.between.to_dict(),
+            **self.between.to_json(),
             "strip": self.strip,
             "waveforms": self.waveforms,
             "returns": self.returns,
-            "vendor": {side: one.to_dict() for side, one in self.vendor.items()},
+            "vendor": {side: one.to_json() for side, one in self.vendor.items()},
             "fit": {side: {name: asdict(one) for name, one in fit.items()} or None for side, fit in self.fit.items()},
         }
 

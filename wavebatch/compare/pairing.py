@@ -65,7 +65,7 @@ class Comparison:
         """How many more echoes a has than b, as a share of b's."""
         return _share(self.echoes_a - self.echoes_b, self.echoes_b)
 
-    def to_dict(self) -> dict:
+    def to_json(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
         return {**asdict(self), "identical": self.identical, "gain": self.gain}
 
