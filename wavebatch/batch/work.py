@@ -134,6 +134,8 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
     added = [entry[1:] for entry in entries if entry.startswith("+")]
     chosen = [entry for entry in entries if not entry.startswith("+")]
+    if wanted is not None and not entries:
+        raise ConfigError("--columns: names no column; leave it out for the usual ones, or write a,b or +a,+b")
     for name in [*chosen, *added]:
         _check_column(name, (*computed, *_ALWAYS))
     return tuple(dict.fromkeys([*(chosen or default), *added]))

@@ -210,7 +210,8 @@ def _check_use(chain: Any, options: dict[str, Any]) -> None:
     given = [name for name in ("trajectory", "flight_height", "calibration_file") if options[name] is not None]
     if given and not needs_sensor(chain):
         option = f"--{given[0].removesuffix('_file').replace('_', '-')}"
-        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage attribute.range")
+        stage = "attribute.backscatter_coefficient" if given[0] == "calibration_file" else "attribute.range"
+        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
 
 
 def _read_tolerance(text: str | None) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,7 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
         if target is not None and not overwrite:
             refuse_existing(target)
     saved, facts = _survey(strip, options)
+    saved = replace(saved, survey=replace(saved.survey, decisions=tuple(_decisions(saved))))
     if output is not None:
         write_survey(output, saved, overwrite=overwrite)
     if chain_file is not None:
@@ -116,7 +118,7 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
         "figures": {name: float(value) for name, value in saved.survey.figures.items()},
         "decisions": [
             {"part": decision.part, "needed": bool(decision.needed), "reason": decision.reason}
-            for decision in _decisions(saved)
+            for decision in saved.survey.decisions
         ],
         "chain": chain_text(saved.survey),
     }
@@ -135,7 +137,7 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"
-    for decision in _decisions(saved):
+    for decision in saved.survey.decisions:
         yield f"  {'needed' if decision.needed else 'left out':10}{decision.part:26}{decision.reason}"
 
 
