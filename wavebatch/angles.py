@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.blocks import SystemPulse
 from wavebatch.chain import Chain
 from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.incidence import angles_of_variance, spread_of_angle
+from wavebatch.kernels.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.angle import LEAST_WIDTH
 
 SLOPE = 30.0
@@ -62,9 +62,12 @@ def predict_angles(
     variance_err = 2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR)
     values = (np.array([value]) for value in (added * added, variance_err, distance))
     error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))
+    least = np.sqrt(2.0 * np.hypot(own * width_err, own * own * REFERENCE_ERROR))
+    facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))
     reason = (
         f"from {distance:.0f} m a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse of "
         f"{own:.3g} ns to {sigma:.4g} ns, which echoes of {amplitude:.0f} DN over a noise of {system.noise_std:.3g} DN "
-        f"tell to {width_err:.2g} ns: that is an angle to {error:.1f} degrees, and max_error is {max_error:g}"
+        f"tell to {width_err:.2g} ns: that is an angle to {error:.1f} degrees ({facing:.1f} where it "
+        f"faces the sensor), and max_error is {max_error:g}"
     )
     return AngleOutlook(error, max_error, reason)
