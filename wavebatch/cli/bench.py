@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import json_option
 
 
 @click.command()
@@ -39,7 +40,7 @@ from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 @click.option("--hazard", "hazards", multiple=True, metavar="H1..H16", help="Only the cases of this hazard.")
 @click.option("--promises", is_flag=True, help="Also measure what each release promises, and say what is met.")
 @click.option("--large", is_flag=True, envvar="BENCH_LARGE", help="With --promises: memory for 10^7 pulses too.")
-@click.option("--json", "as_json", is_flag=True, help="Print the JSON document in place of the tables.")
+@json_option("Print the JSON document in place of the tables.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
 @debug_option
 @report_errors()

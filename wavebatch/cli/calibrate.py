@@ -8,7 +8,8 @@ from typing import Any
 import click
 
 from wavebatch.cli.common import debug_option, report_errors, talk
-from wavebatch.cli.sensor import read_sensor
+from wavebatch.cli.options import direction_option, overwrite_option, system_option
+from wavebatch.cli.sensor import read_sensor, sensor_options
 
 
 @click.command()
@@ -16,21 +17,16 @@ from wavebatch.cli.sensor import read_sensor
 @click.option("--targets", required=True, type=click.Path(path_type=Path), metavar="FILE",
               help="GeoJSON polygons with reflectance, or CSV with reflectance and x, y, radius or vertices.")
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), metavar="CAL.toml", help="The result.")
-@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
-              help="Where the sensor was; without it the packets' own vectors say.")
-@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
-@click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
-@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M", help="Where nothing else says.")
-@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE", help="A saved survey.")
+@sensor_options
+@system_option
 @click.option("--attenuation", type=click.FloatRange(0.0, 100.0), default=0.22, show_default=True, metavar="DB/KM",
               help="Of the air, one way.")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points; cross sections need it.")
 @click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
               help="Standard deviation of the targets' reflectances, relative.")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
-              help="Where the packets' vectors point.")
-@click.option("--overwrite", is_flag=True, help="Replace an output that exists.")
+@direction_option
+@overwrite_option
 @debug_option
 @report_errors()
 def calibrate(

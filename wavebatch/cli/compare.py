@@ -13,6 +13,7 @@ import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.cli.compare_angles import list_lines, measure
+from wavebatch.cli.options import json_option, system_option
 from wavebatch.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
@@ -29,8 +30,7 @@ _SHARE, _LENGTH = click.FloatRange(0.0, 1.0), click.FloatRange(0.0)
 @click.argument("b", type=click.Path(path_type=Path), required=False)
 @click.option("--strip", type=click.Path(path_type=Path), metavar="STRIP",
               help="Run A and B on the waveforms of this strip: chain files, fast, balanced, accurate or auto.")
-@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="A saved survey for chains, in place of one of the strip.")
+@system_option
 @click.option("--limit", type=click.IntRange(1), metavar="N",
               help="About N waveforms spread over the strip, in place of all.")
 @click.option("--truth", type=click.Path(path_type=Path), help="Truth of a simulated strip, in place of B.")
@@ -42,7 +42,7 @@ _SHARE, _LENGTH = click.FloatRange(0.0, 1.0), click.FloatRange(0.0)
 @click.option("--max-median", type=_LENGTH, help="Largest absolute median of the difference [ns].")
 @click.option("--max-rmse", type=_LENGTH, help="Largest root mean square of the difference [ns].")
 @click.option("--max-nmad", type=_LENGTH, help="Largest robust spread of the difference [ns].")
-@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
+@json_option("Print the figures as JSON.")
 @debug_option
 @report_errors(failure=2)
 def compare(

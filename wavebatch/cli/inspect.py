@@ -10,27 +10,18 @@ import click
 
 from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors
+from wavebatch.cli.options import direction_option, headerless_option, json_option
 from wavebatch.inspection import check_file, describe_strip
 
 EXIT_PROBLEMS = 1
 """`check` found something."""
 
-_direction = click.option(
-    "--direction",
-    type=click.Choice(["auto", "toward", "away"]),
-    default="auto",
-    show_default=True,
-    help="Where packet vectors point: decided from the file, or toward or away from the sensor.",
-)
-_headerless = click.option("--headerless", is_flag=True, help="Take a .wdp that lacks its 60-byte header.")
-_json = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-
 
 @click.command()
 @click.argument("strip", type=click.Path(path_type=Path))
-@_direction
-@_headerless
-@_json
+@direction_option
+@headerless_option
+@json_option()
 @debug_option
 @report_errors()
 def info(strip: Path, direction: str, headerless: bool, as_json: bool, debug: bool) -> None:
@@ -47,10 +38,10 @@ def info(strip: Path, direction: str, headerless: bool, as_json: bool, debug: bo
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...")
-@_direction
-@_headerless
+@direction_option
+@headerless_option
 @click.option("--strict", is_flag=True, help="Let notes count as problems.")
-@_json
+@json_option()
 @debug_option
 @report_errors()
 def check(

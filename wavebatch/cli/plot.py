@@ -10,11 +10,10 @@ from typing import Any
 import click
 
 from wavebatch.cli.common import NearestGroup, debug_option, report_errors, talk
+from wavebatch.cli.options import direction_option, headerless_option, overwrite_option, quiet_option, system_option
 
 _output = click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
                        help="The picture: .png, .svg or .pdf.")  # fmt: skip
-_overwrite = click.option("--overwrite", is_flag=True, help="Replace what exists.")
-_quiet = click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
 _clouds = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
 _with = click.option("--flags-with", multiple=True, metavar="NAMES",
                      help="Only points with one of these flags of echo_flags, e.g. SATURATED,WEAK.")  # fmt: skip
@@ -81,13 +80,11 @@ def plot() -> None:
 @click.option("-c", "--chain", "chain_file", type=click.Path(path_type=Path), metavar="FILE", help="Chain file (TOML).")
 @click.option("--profile", metavar="auto|fast|balanced|accurate",
               help="A shipped chain; auto: what the strip's own survey says that it needs.  [default: auto]")
-@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="A saved survey in place of one of the strip.")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
-              help="Where the packets' vectors point, seen from the target.")
-@click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
-@_overwrite
-@_quiet
+@system_option
+@direction_option
+@headerless_option
+@overwrite_option
+@quiet_option
 @debug_option
 @report_errors()
 def waveform(strip: Path, output: Path, **options: Any) -> None:
@@ -146,8 +143,8 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 @click.option("--each", is_flag=True, help="A line per cloud in place of one histogram of all.")
 @_with
 @_without
-@_overwrite
-@_quiet
+@overwrite_option
+@quiet_option
 @debug_option
 @report_errors()
 def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
@@ -209,8 +206,8 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N", help="The part to show [m].  [default: all]")
 @_with
 @_without
-@_overwrite
-@_quiet
+@overwrite_option
+@quiet_option
 @debug_option
 @report_errors()
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:

@@ -12,7 +12,8 @@ from typing import Any
 import click
 
 from wavebatch.cli.common import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
-from wavebatch.cli.sensor import read_sensor
+from wavebatch.cli.options import direction_option, headerless_option, overwrite_option, system_option
+from wavebatch.cli.sensor import read_sensor, sensor_options
 from wavebatch.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
@@ -50,19 +51,12 @@ class Size(click.ParamType):
               help="A shipped chain; auto: what the strip's own survey says that it needs.  [default: auto]")
 @click.option("--tolerance", metavar="LENGTH",
               help="The cheapest shipped chain whose predicted range error meets this, e.g. 0.02m, decides per strip.")
-@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="A saved survey (of `wavebatch survey -o`) in place of one of each strip.")
-@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
-              help="Where the sensor was: text with time, x, y, z, or SBET. Without it the packets' own vectors say.")
-@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
-@click.option("--crs", metavar="CRS", help="Of the strip, e.g. EPSG:32632, for a trajectory in degrees.")
-@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-              help="Above the ground, where neither a trajectory nor vectors say where the sensor was.")
+@system_option
+@sensor_options
 @click.option("--calibration", "calibration_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Of `wavebatch calibrate`: adds backscatter and reflectance, with a divergence the cross section.")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
-              help="Where the packets' vectors point, seen from the target: to the sensor or away from it.")
-@click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
+@direction_option
+@headerless_option
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="A point per echo found, or the input's own points, enriched.")
 @click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
@@ -81,7 +75,7 @@ class Size(click.ParamType):
 @click.option("--memory", type=Size(), metavar="SIZE", help="Most memory for all processes together, e.g. 2G.")
 @click.option("--block-size", type=click.IntRange(1), metavar="N",
               help="Waveforms processed at a time; the result is the same for any number.  [default: by their length]")
-@click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+@overwrite_option
 @click.option("--resume", is_flag=True, help="Leave outputs that are complete and up to date, make all others anew.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done with each strip, and touch nothing.")
 @click.option("--report", type=click.Path(dir_okay=False, allow_dash=True), metavar="FILE",

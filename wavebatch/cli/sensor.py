@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import click
 
 from wavebatch.errors import ConfigError
 
 if TYPE_CHECKING:
     from wavebatch.sensor import SensorRequest
+
+
+_OPTIONS = (
+    click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
+                 help="Where the sensor was: text with time, x, y, z, or SBET. Without it the packets' vectors say."),
+    click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m]."),
+    click.option("--crs", metavar="CRS", help="Of the strip, e.g. EPSG:32632, for a trajectory in degrees."),
+    click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
+                 help="Above the ground, where neither a trajectory nor vectors say where the sensor was."),
+)  # fmt: skip
+
+
+def sensor_options(command: Callable) -> Callable:
+    """Options of a command that say where the sensor was, for `read_sensor`."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command
 
 
 def read_sensor(options: Mapping[str, Any]) -> SensorRequest:

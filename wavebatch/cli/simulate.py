@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import json_option, overwrite_option, quiet_option
 from wavebatch.cli.progress import counting
 from wavebatch.simulate import (
     CANOPIES,
@@ -82,9 +83,9 @@ _SCENE_LINES = "\n\n".join(
 @click.option("--dead-zone", type=float, help="Discrete: least distance of two returns [m].  [default: 0.65]")
 @click.option("--threshold", type=float, help="Discrete: amplitude that fires a return [DN].  [default: 12]")
 @click.option("--most-returns", type=int, help="Discrete: returns per pulse.  [default: 4]")
-@click.option("--overwrite", is_flag=True, help="Replace what exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@overwrite_option
+@json_option("Print the counts as JSON on stdout.")
+@quiet_option
 @debug_option
 @report_errors()
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import direction_option, json_option, overwrite_option, quiet_option
 from wavebatch.errors import InputError
 from wavebatch.io.publish import refuse_existing
 from wavebatch.io.strip import StripReader
@@ -49,10 +50,10 @@ def _read_lines(context: click.Context, parameter: click.Parameter, text: str | 
 @click.option("--shortest", default=20.0, show_default=True, help="Least length of a segment [pixels: samples].")
 @click.option("--most", default=20, show_default=True, help="Segments per slice.")
 @click.option("--png", type=click.Path(path_type=Path), help="Picture of the first slice of --lines.")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True)
-@click.option("--overwrite", is_flag=True, help="Replace what exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@direction_option
+@overwrite_option
+@json_option("Print the counts as JSON on stdout.")
+@quiet_option
 @debug_option
 @report_errors()
 def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png: Path | None, **options) -> None:

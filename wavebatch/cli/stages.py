@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors
+from wavebatch.cli.options import json_option
 from wavebatch.errors import ConfigError
 from wavebatch.words import nearest
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("name", required=False)
-@click.option("--json", "as_json", is_flag=True, help="For programs.")
+@json_option("For programs.")
 @debug_option
 @report_errors()
 def stages(name: str | None, as_json: bool, debug: bool) -> None:

@@ -16,6 +16,7 @@ import click
 from wavebatch.areas import AreaStats, Grid, PolygonSet
 from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import json_option, overwrite_option
 from wavebatch.errors import InputError
 from wavebatch.io.publish import refuse_existing
 from wavebatch.polygons import load_polygons
@@ -37,8 +38,8 @@ SHOWN = 20
               help="Count by the polygons of a GeoJSON file too; the first one counts where they overlap.")
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE.csv",
               help="A table with a row per cloud and area.")
-@click.option("--overwrite", is_flag=True, help="Replace an output that exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON: `files`, and `total` over all of them.")
+@overwrite_option
+@json_option("Print JSON: `files`, and `total` over all of them.")
 @debug_option
 @report_errors()
 def stats(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import direction_option, headerless_option, json_option, overwrite_option
 
 if TYPE_CHECKING:
     from wavebatch.blocks import SystemPulse
@@ -25,13 +26,12 @@ if TYPE_CHECKING:
               help="Write the cheapest chain that serves, with a comment on each part; for `wavebatch run --chain`.")
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
               help="Waveforms to look at, spread over the strip.  [default: 8192, fewer where they are long]")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
-              help="Where packet vectors point: decided from the file, or toward or away from the sensor.")
+@direction_option
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points: says what angles its widths tell; kept in -o.")
-@click.option("--headerless", is_flag=True, help="Take a .wdp that lacks its 60-byte header.")
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@headerless_option
+@overwrite_option
+@json_option()
 @debug_option
 @report_errors()
 def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: bool, **options: Any) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import json_option, overwrite_option, quiet_option
 from wavebatch.cli.progress import counting
 from wavebatch.synthesize import INTENSITIES, Radar, SynthesisOptions, SynthesisSummary, synthesize_strip
 
@@ -41,9 +42,9 @@ _RADAR = ("power", "aperture", "divergence", "efficiency", "attenuation")
 @click.option("--efficiency", type=float, help="Reflectance: of the optics.  [default: 0.5]")
 @click.option("--attenuation", type=float, help="Reflectance: of the air [dB/km].  [default: 0.22]")
 @click.option("--internal/--external", default=True, help="Packets in the file or in a .wdp.  [default: internal]")
-@click.option("--overwrite", is_flag=True, help="Replace what exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@overwrite_option
+@json_option("Print the counts as JSON on stdout.")
+@quiet_option
 @debug_option
 @report_errors()
 def synthesize(cloud: Path, output: Path, **options) -> None:

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.options import (
+    direction_option,
+    headerless_option,
+    json_option,
+    overwrite_option,
+    quiet_option,
+    system_option,
+)
 from wavebatch.cli.progress import counting
-from wavebatch.cli.sensor import read_sensor
+from wavebatch.cli.sensor import read_sensor, sensor_options
 
 if TYPE_CHECKING:
     from wavebatch.voxels import VoxelSummary
@@ -35,22 +43,15 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
               help="Count rays over this length before their first sample, too: they crossed it, whether recorded or "
                    "not.  [default: up to the highest return near them]")
 @click.option("--all-crossed", is_flag=True, help="Write voxels that rays crossed without any signal, too.")
-@click.option("--system", "system_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="A saved survey (of `wavebatch survey -o`) in place of one of the strip.")
+@system_option
 @click.option("--calibration", "calibration_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Of `wavebatch calibrate`, with divergence: adds the cross section in m2.")
-@click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
-              help="For cross sections: where the sensor was; without it the packets' own vectors say.")
-@click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m].")
-@click.option("--crs", metavar="CRS", help="Of the strip, for a trajectory in degrees.")
-@click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-              help="For cross sections, where nothing else says where the sensor was.")
-@click.option("--direction", type=click.Choice(["auto", "toward", "away"]), default="auto", show_default=True,
-              help="Where the packets' vectors point.")
-@click.option("--headerless", is_flag=True, help="Accept a .wdp that lacks its 60-byte header.")
-@click.option("--overwrite", is_flag=True, help="Replace an output that exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON on stdout.")
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
+@sensor_options
+@direction_option
+@headerless_option
+@overwrite_option
+@json_option("Print the counts as JSON on stdout.")
+@quiet_option
 @debug_option
 @report_errors()
 def voxelize(strip: Path, output: Path, **options: Any) -> None:
@@ -69,6 +70,7 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     its last signal: what lies behind is not seen. What is not in the file was not seen, or (without --all-crossed)
     seen to be empty. An .npz holds index (n, 3), a column per value, origin, size, crs and meta; voxel i lies between
     origin + i size and origin + (i + 1) size. Memory does not grow with the strip; TMPDIR needs room for large ones.
+    Where the sensor was matters to cross sections only.
 
     Exit code: 0, 1 where the strip cannot be read or the output not be written, 2 wrong usage.
     """  # fmt: skip
