@@ -177,3 +177,20 @@ def test_systems_of_digitizers_are_saved(tmp_path):
     for old, new in (("index = 9", "index = 4"), ("index = 9", "index = 0"), ("index = 9\n", "")):
         with pytest.raises(ConfigError, match=r"\[system\]: digitizers 2: index must be a number from 1 to 255"):
             parse_survey(text.replace(old, new), "x.toml")
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.12, 11), (0.2, 12)])
+def test_after_pulses_of_every_echo_belong_to_the_pulse_however_high(share, seed):
+    block, time, _ = record(lambda x: gaussian(x) + share * gaussian(x - 5.0), seed, amplitude=(15, 200))
+    system, _, whole, _ = judge(block, time)
+    assert system.ringing == pytest.approx(share, abs=0.01) and system.sigma_ref == pytest.approx(2.0, rel=0.01)
+    assert whole > 0.985
+
+
+def test_what_is_left_of_few_echoes_is_learned_too():
+    """A tail of 1.5 % of the amplitude, from about a hundred clear echoes."""
+
+    def tailed(x):
+        return gaussian(x) + 0.06 * gaussian((x - 5.5) / 1.2) + 0.015 * gaussian((x - 12) / 3)
+
+    assert np.mean([judge(*record(tailed, seed, n=300)[:2])[2] for seed in range(20, 26)]) > 0.993

@@ -8,7 +8,7 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
 from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest
+from wavebatch.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
 from wavebatch.stages.decompose import adaptive, closed_form
 from wavebatch.stages.detect import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
@@ -23,6 +23,9 @@ BEFORE, AFTER = 9.0, 25.0
 
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
+
+GOAL = 1.25
+"""Misfit of a pulse model, in errors of the stack, that nobody can tell from none."""
 
 NEAR_BEST = 1.25
 """Misfit, over that of the best model, at which a simpler one is taken."""
@@ -56,10 +59,10 @@ def _find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     strongest, second = find_strongest(echoes, n)
     echoes = echoes.take(strongest)
     top = system.saturation or float(block.samples.max())
-    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good = echoes.amplitude > MIN_SNR * system.noise_std
     good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    return echoes.take(np.flatnonzero(good))
+    return echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second)))
 
 
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
@@ -71,7 +74,7 @@ def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figu
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     stack = stack_pulse(signal, amplitude, time, before, after, QUANTISATION_STD)
     strongest = float(np.quantile(main.amplitude, 0.99))
-    goal = max(REACHED * system.noise_std / strongest, 1.5 * float(np.sqrt(np.mean(stack.error**2))))
+    goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
     sums = fit_gaussians(stack, width)
     skewed = fit_skewed(stack, width)
     figures["misfit_goal"] = goal

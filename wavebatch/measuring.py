@@ -31,6 +31,12 @@ RESIDUAL_LOOK = 4096
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
 
+ALONE = 0.1
+"""Share of an echo up to which others of its waveform are no disturbance ..."""
+
+LEAST_ALONE, ALONE_BEFORE_RINGING = 0.15, 0.3
+"""... unless less than this share of the echoes are alone; then others may be as high as this."""
+
 ENOUGH_TO_LEARN = 50
 """Isolated echoes from which a pulse can be learned (R2)."""
 
@@ -95,11 +101,14 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     """
     n = len(block)
     noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
+    if system.baseline_spread > system.noise_std:
+        noise = pooled_noise(block, system)
     echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
     strongest, second = find_strongest(echoes, n)
     echoes = echoes.take(strongest)
-    good = (second < 0.1 * echoes.amplitude) & (echoes.amplitude > MIN_SNR * system.noise_std)
+    good = echoes.amplitude > MIN_SNR * system.noise_std
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    good = keep_lone(good, echoes.amplitude, second)
     free = (echoes.flags[good] & int(EchoFlag.AT_BOUND)) == 0
     widths = echoes.sigma[good] / block.spacing
     if 2 * free.sum() > len(free):
@@ -107,6 +116,18 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
     return float(np.clip(find_mode(widths), 0.5, 50.0))
+
+
+def keep_lone(good: np.ndarray, amplitude: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """True (m,) for the good ones of the strongest echoes that the second strongest of their waveform leaves alone.
+
+    That is less than a tenth as high; but where hardly any echo is alone, after-pulses of every echo are what is seen,
+    and they may be higher: targets at chance distances would not be everywhere.
+    """
+    alone = good & (second < ALONE * amplitude)
+    if alone.sum() < LEAST_ALONE * good.sum():
+        alone = good & (second < ALONE_BEFORE_RINGING * amplitude)
+    return alone
 
 
 def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,7 +100,8 @@ def simulate_again(
     signal += system.baseline + system.baseline_spread * rng.standard_normal((n, 1))
     top = block.digitizer.max_count if system.saturation is None else min(system.saturation, block.digitizer.max_count)
     counts = np.clip(np.rint(signal), 0, top).astype(block.samples.dtype)
-    return WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
+    trial = WaveformBlock.from_samples(counts, spacing=block.spacing, bits=block.digitizer.bits)
+    return replace(trial, digitizer=block.digitizer)
 
 
 def _rms(values: np.ndarray) -> float:

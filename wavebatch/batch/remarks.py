@@ -1,8 +1,8 @@
-"""What to tell about a strip that is written: columns in which no echo has a value, why, and what to do."""
+"""What to tell about a strip that is written: columns without any value, why, and what to do; doubtful waveforms."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.batch.report import AMPLITUDE_BINS, RunReport
@@ -10,6 +10,15 @@ from wavebatch.batch.work import Prepared
 from wavebatch.nodata import REASONS, NoData
 
 _ANGLE = "incidence_angle"
+
+LEAST_JUDGED = 20
+"""Waveforms, or returns in waveforms with echoes, below which nothing is said about the strip."""
+
+LEAST_MATCHED = 0.5
+"""Share of those returns that an echo should match."""
+
+INVERTED = 5.0
+"""How much further counts reach below the baseline than above it, or than the noise, where signals go down."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -22,9 +31,9 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
-    """One line per column that was asked for and that no echo has, with the commonest reason and its remedy; and one on
-    angles where the beam tells next to none."""
-    lines = []
+    """One line per column that was asked for and that no echo has, with the commonest reason and its remedy; one on
+    angles where the beam tells next to none; one where waveforms and returns have next to nothing in common."""
+    lines = [*_doubt_waveforms(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -35,6 +44,25 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
                 remedy = REASONS[NoData.UNCERTAIN][1]
                 lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
     return tuple(lines)
+
+
+def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """What speaks against the strip's waveforms, or against where its returns are said to lie in them."""
+    waveforms, echoes, matched = (report.count(name) for name in ("waveforms", "echoes", "matched_returns"))
+    near = matched + report.count("unmatched_returns")
+    if waveforms >= LEAST_JUDGED and not echoes:
+        figures, system = prepared.choice.survey.figures, prepared.system
+        down = system.baseline - figures.get("least_count", system.baseline)
+        up = figures.get("largest_count", system.baseline) - system.baseline
+        reason = "nothing rises far enough above the noise"
+        if down > INVERTED * max(up, system.noise_std):
+            reason = f"the signal falls from {system.baseline:.0f} to {system.baseline - down:.0f} DN: it is inverted"
+        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` says what the strip records"
+    elif near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
+        yield (
+            f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
+            "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"
+        )
 
 
 def explain_absence(prepared: Prepared) -> dict[str, str]:
