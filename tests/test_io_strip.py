@@ -24,6 +24,19 @@ def assert_same(found, plain):
         assert found[key][1] == members
 
 
+@pytest.mark.parametrize(("declared", "bits"), [(5, 8), (10, 16), (12, 16), (24, 32)])
+def test_samples_of_odd_bits_in_whole_bytes_are_read(tmp_path, declared, bits):
+    """The packet's size tells them from packed ones; counts may use more bits than the descriptor says."""
+    raw = make_raw(bits=bits)
+    plain = read_plainly(raw.points, bytes(60) + raw.packets, {1: (bits, 32)})
+    raw.vlrs = [descriptor(1, bits=declared, samples=32)]
+    path = raw.write(tmp_path / "a.las")
+    assert_same(read_all(path), plain)
+    with StripReader(path) as reader, reader.scan() as scan:
+        blocks = list(reader.sample_blocks(scan, 10))
+    assert {block.digitizer.bits for block in blocks} == {bits}
+
+
 @pytest.mark.parametrize("point_format", [4, 5, 9, 10])
 @pytest.mark.parametrize("internal", [True, False])
 @pytest.mark.parametrize("bits", [8, 16, 32])

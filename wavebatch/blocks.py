@@ -124,6 +124,11 @@ class Digitizer:
     """Volts at count zero."""
 
     @property
+    def width(self) -> int:
+        """Bytes of a sample that is stored in whole ones."""
+        return 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
+
+    @property
     def max_count(self) -> int:
         """Largest raw value that the bits can hold."""
         return (1 << self.bits) - 1

@@ -14,7 +14,8 @@ from wavebatch.io.packets import MAX_SAMPLES, refuse_compressed
 from wavebatch.io.rawbytes import widen
 
 INDEX_BITS = np.uint64(8)
-READABLE_BITS = (8, 16, 32)
+WHOLE_BITS = (8, 16, 32)
+MOST_BITS = 32
 MAX_SPACING = 1000.0
 """Samples farther apart than this are damage [ns]."""
 MAX_LOCATION = 1e9
@@ -32,15 +33,17 @@ class Reason(IntEnum):
     OUTSIDE = 5
     NO_GEOMETRY = 6
     OVERFULL = 7
+    PACKED = 8
 
 
 REASON_TEXTS = {
     Reason.NO_DESCRIPTOR: "refer to a descriptor that the header does not have",
-    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or not of 8, 16 or 32 bits",
+    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or of more than 32 bits",
     Reason.EMPTY: "have a packet without a whole sample",
     Reason.OUTSIDE: "have a packet outside the waveform data",
     Reason.NO_GEOMETRY: "have a return location or a packet vector that cannot be (no number, 0, or absurdly long)",
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
+    Reason.PACKED: "have samples of other than 8, 16 or 32 bits with no gaps between, in an order that LAS leaves open",
 }
 
 
@@ -76,14 +79,16 @@ class Judge:
     def __init__(self, facts: StripFacts) -> None:
         self._facts = facts
         self._known, self._good, self._compressed = (np.zeros(256, bool) for _ in range(3))
-        self._bits, self._samples = np.full(256, 8, np.int64), np.zeros(256, np.int64)
+        self._width, self._samples = np.ones(256, np.int64), np.zeros(256, np.int64)
+        self._odd = np.zeros(256, bool)
         for index, digitizer in facts.digitizers.items():
             self._known[index] = True
-            self._good[index] = digitizer.bits in READABLE_BITS and 0 < digitizer.spacing <= MAX_SPACING
+            self._good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
             self._good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
             self._compressed[index] = facts.compression.get(index, 0) != 0 and digitizer.n_samples > 0
             if self._good[index]:
-                self._bits[index], self._samples[index] = digitizer.bits, digitizer.n_samples
+                self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
+                self._odd[index] = digitizer.bits not in WHOLE_BITS
         self._least = facts.packet_start - facts.packet_base
         self._end = facts.packet_end - facts.packet_base
 
@@ -99,8 +104,8 @@ class Judge:
         offset = points["wavepacket_offset"].astype(np.uint64)
         has = (index > 0) & (size > 0)
         self._refuse_compressed(index[has])
-        n_samples = np.minimum(self._samples[index], size * 8 // self._bits[index])
-        room = self._end - n_samples * (self._bits[index] // 8)
+        n_samples = np.minimum(self._samples[index], size // self._width[index])
+        room = self._end - n_samples * self._width[index]
         inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64)) & (offset >= np.uint64(self._least))
         keys = (offset << INDEX_BITS) | index
         reason = np.zeros(len(points), np.uint8)
@@ -110,6 +115,8 @@ class Judge:
         reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
         reason[~inside] = Reason.OUTSIDE
         reason[n_samples == 0] = Reason.EMPTY
+        # Whether samples of 12 bits have two bytes each, only the packet's size says.
+        reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
         reason[~self._known[index]] = Reason.NO_DESCRIPTOR
         reason[~has] = Reason.NO_WAVEFORM

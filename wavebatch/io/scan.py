@@ -77,9 +77,12 @@ def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]])
         return f"points refer to packets, which are neither in the file nor beside it: put {beside} beside the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
+    remedy = f"{facts.packet_file.name} is cut, damaged or of another strip: get it again"
+    if reason is Reason.PACKED:
+        remedy = "have them written with 8, 16 or 32 bits"
     return (
         f"no packet can be used: {count} of {facts.point_count} points (first: point {first}) {REASON_TEXTS[reason]}; "
-        f"{facts.packet_file.name} is cut, damaged or of another strip: get it again"
+        f"{remedy}"
     )
 
 

@@ -205,6 +205,7 @@ class StripReader:
             start = groups.starts[group]
             same = rows[groups.order[start : start + groups.counts[group]]]
             digitizer = self.facts.digitizers[int(table.digitizer[same[0]])]
+            digitizer = replace(digitizer, bits=8 * digitizer.width)
             n_samples = int(table.n_samples[same[0]])
             step = block_rows(size, n_samples, digitizer.bits)
             for begin in range(0, len(same), step):
