@@ -209,6 +209,35 @@ def estimate_starts(
     return amplitude, time, np.where(good, narrow, width)
 
 
+def start_errors(amplitude: np.ndarray, width: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations (m,) of amplitude and width that `estimate_starts` finds of isolated Gaussian echoes.
+
+    amplitude and width [samples] of the echoes (m,); std: of the unfiltered noise (m,). To first order in the noise, of
+    peaks that lie on a sample. Broad ones, of which five samples see only the top, have errors many times the bound.
+    """
+    spread = width * width + 0.5
+    places = np.arange(-2.0, 3.0).tolist()
+    shape = [np.exp(-0.5 * x * x / spread) for x in places]
+    s0, s2, s4 = (sum(y * y * x**p for x, y in zip(places, shape, strict=True)) for p in (0, 2, 4))
+    determinant = s0 * s4 - s2 * s2
+    # Of the parabola c0 + c2 x^2: width sqrt(-1 / (2 c2) - 1/2), amplitude exp(c0) sqrt(1 + 1 / (2 width^2)).
+    gain = spread * spread / (width * determinant)
+    by_width = [gain * y * (s0 * x * x - s2) for x, y in zip(places, shape, strict=True)]
+    loss = 0.5 / (width * spread)
+    by_height = [
+        y * (s4 - s2 * x * x) / determinant - loss * part for x, y, part in zip(places, shape, by_width, strict=True)
+    ]
+    noise = std / amplitude * np.sqrt(spread) / width
+    return amplitude * noise * _filtered_norm(by_height), noise * _filtered_norm(by_width)
+
+
+def _filtered_norm(taps: list[np.ndarray]) -> np.ndarray:
+    """Root of the sum of squares of taps behind the [1 2 1]/4 filter: the gain of white noise before it."""
+    wide = [0.0, 0.0, *taps, 0.0, 0.0]
+    joined = ((a + 2.0 * b + c) * 0.25 for a, b, c in zip(wide, wide[1:], wide[2:], strict=False))
+    return np.sqrt(sum(tap * tap for tap in joined))
+
+
 def solve_parabola(s: list[np.ndarray], b: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Coefficients of the weighted parabola from its moments s (five) and right-hand sides b (three), by Cramer."""
     m0 = s[2] * s[4] - s[3] * s[3]

@@ -9,8 +9,8 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.kernels.bounds import crlb
-from wavebatch.kernels.cluster import estimate_starts
+from wavebatch.kernels.bounds import bound_time
+from wavebatch.kernels.cluster import estimate_starts, start_errors
 from wavebatch.kernels.pulse import GAUSSIAN
 from wavebatch.kernels.render import render_echoes
 from wavebatch.kernels.signal import smooth_121
@@ -18,9 +18,6 @@ from wavebatch.stages.candidates import candidate_table, find_varying, signal_ab
 from wavebatch.stages.decompose import gaussian
 from wavebatch.stages.detect_correlation import asdf
 from wavebatch.stages.flags import flag_echoes
-
-ASDF_ERROR = 1.42
-"""Error of the time of an ASDF echo over the Cramer-Rao bound (ALGORITHMS 1.1)."""
 
 
 @stage("decompose")
@@ -152,12 +149,15 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, system.sigma_ref / spacing)
     table = candidate_table(block, system, waveform, echoes.time / spacing, amplitude, width)
     std = noise.std[waveform]
-    errors = crlb(np.maximum(table.amplitude, std), table.sigma.astype(np.float64), std, spacing)
+    height, width = np.maximum(table.amplitude, std).astype(np.float64), table.sigma.astype(np.float64)
+    # A reference of another width than the echo's loses this much of the bound (Schwarz's inequality, of the slopes).
+    loss = ((width * width + system.sigma_ref**2) / (2.0 * width * system.sigma_ref)) ** 1.5
+    amplitude_err, width_err = start_errors(height, width / spacing, std)
     table = replace(
         table,
-        time_err=(ASDF_ERROR * errors[0]).astype(np.float32),
-        amplitude_err=errors[1].astype(np.float32),
-        sigma_err=errors[2].astype(np.float32),
+        time_err=(loss * bound_time(height, width, std, spacing)).astype(np.float32),
+        amplitude_err=amplitude_err.astype(np.float32),
+        sigma_err=(spacing * width_err).astype(np.float32),
         residual=_misfit(_residual(block, noise, table), waveform, sample, 3 * system.sigma_ref / spacing) / std,
     )
     close = (np.diff(waveform) == 0) & (np.diff(table.time) < 4 * system.sigma_ref)
