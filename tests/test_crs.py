@@ -148,6 +148,7 @@ def projection(record_id, payload):
         ([projection(34735, keys(short(1024, 1), short(3076, 9003)))], "coordinates are US survey feet"),
         ([projection(34735, keys(short(3076, 9001), short(4099, 9002)))], "metres with heights in international feet"),
         ([projection(2112, UTM.encode()), projection(34735, keys(short(3076, 9002)))], "are international feet"),
+        ([vlr(b"lasf_projection", 34735, keys(short(1024, 2)))], "coordinates are degrees"),
         ([projection(34735, b"\xff" * 40)], None),
         ([projection(34735, keys(short(1024, 1), short(3076, 9001)))], None),
     ],

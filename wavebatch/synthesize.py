@@ -11,7 +11,7 @@ import numpy as np
 from wavebatch.blocks import Digitizer
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.fullwave import FullwaveWriter
-from wavebatch.io.header import read_header
+from wavebatch.io.header import is_projection, read_header
 from wavebatch.io.returnfile import ReturnReader
 from wavebatch.kernels.radar import receive_power, spread_cross_section
 from wavebatch.kernels.rays import fit_rays, group_pulses
@@ -179,7 +179,7 @@ def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, 
         ],
         scales=reader.scales,
         offsets=reader.offsets,
-        records=[vlr for vlr in read_header(reader.path).vlrs if vlr.user == "LASF_Projection"],
+        records=[vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)],
         overwrite=overwrite,
     )
 

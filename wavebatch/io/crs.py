@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from wavebatch.io.header import EVLR_HEADER_SIZE, LasHeader, find_evlrs
+from wavebatch.io.header import EVLR_HEADER_SIZE, GEOTIFF_ID, WKT_ID, LasHeader, find_evlrs, is_projection
 from wavebatch.io.packets import MAX_EVLRS
 
-WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID = 2112, 34735, 34736, 34737
+DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 _MAX_RECORD = 1 << 20
 _MAX_DEPTH = 64
@@ -87,10 +87,10 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the projection's records by number, those of the header before those behind the points."""
-    found = {vlr.record_id: vlr.payload for vlr in header.vlrs if vlr.user == "LASF_Projection"}
+    found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
     evlrs, _ = find_evlrs(path, replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS)))
     for evlr in evlrs:
-        new = evlr.user == "LASF_Projection" and evlr.record_id in _IDS and evlr.record_id not in found
+        new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= _MAX_RECORD:
             with open(path, "rb") as file:
                 file.seek(evlr.start + EVLR_HEADER_SIZE)

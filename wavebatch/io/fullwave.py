@@ -18,6 +18,7 @@ from wavebatch.io.header import (
     WKT_BIT,
     LasHeader,
     Vlr,
+    build_wkt,
 )
 from wavebatch.io.pointfile import PointFile, waveform_head
 from wavebatch.io.publish import Draft, publish_together, refuse_existing, reporting
@@ -191,5 +192,5 @@ def _build_vlrs(digitizers: Sequence[Digitizer], wkt: str | None) -> list[Vlr]:
         payload = np.array([values], _DESCRIPTOR).tobytes()
         vlrs.append(Vlr(b"LASF_Spec", 99 + digitizer.index, payload, b"wave packet descriptor"))
     if wkt:
-        vlrs.append(Vlr(b"LASF_Projection", 2112, wkt.encode() + b"\0", b"OGC coordinate system WKT"))
+        vlrs.append(build_wkt(wkt))
     return vlrs

@@ -26,6 +26,9 @@ STANDARD_DTYPES = {number: PointFormat(number).dtype() for number in range(11)}
 
 EVLR_HEADER_SIZE = 60
 WAVEFORM_RECORD_ID = 65535
+PROJECTION = "LASF_Projection"
+"""User of the records that hold the CRS."""
+WKT_ID, GEOTIFF_ID = 2112, 34735
 _VLR = struct.Struct("<H16sHH32s")
 _EVLR = struct.Struct("<H16sHQ32s")
 _FRONT = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I12d")
@@ -235,6 +238,16 @@ def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
 def encode_evlr_header(user_id: bytes, record_id: int, length: int, description: bytes) -> bytes:
     """The 60 bytes in front of an extended record, which are also the first of a `.wdp` file."""
     return _EVLR.pack(0, user_id, record_id, length, description)
+
+
+def is_projection(vlr: Vlr | Evlr) -> bool:
+    """Whether it is a record of the CRS, however its user id is written."""
+    return vlr.user.lower() == PROJECTION.lower()
+
+
+def build_wkt(wkt: str) -> Vlr:
+    """The record that holds the WKT of a CRS."""
+    return Vlr(PROJECTION.encode(), WKT_ID, wkt.encode() + b"\0", b"OGC coordinate system WKT")
 
 
 def has_record(vlrs: Iterable[Vlr | Evlr], user: str, record_id: int) -> bool:

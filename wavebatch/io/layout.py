@@ -14,7 +14,7 @@ from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.carry import Carried, PacketSource, find_packets, plan_carried
 from wavebatch.io.convert import choose_format, copy_standard
 from wavebatch.io.extra import ExtraRecord, build_dtype
-from wavebatch.io.header import LasHeader, find_evlrs, has_record, read_header
+from wavebatch.io.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record, read_header
 from wavebatch.io.names import Naming, WrittenColumn, describe, name_columns
 
 
@@ -197,10 +197,10 @@ def plan_output(
 
 
 def _check_crs(path: Path, header: LasHeader, target: int) -> None:
-    if not header.point_format < 6 <= target or not has_record(header.vlrs, "LASF_Projection", 34735):
+    if not header.point_format < 6 <= target or not has_record(header.vlrs, PROJECTION, GEOTIFF_ID):
         return
     evlrs, _ = find_evlrs(path, header)
-    if not has_record([*header.vlrs, *evlrs], "LASF_Projection", 2112):
+    if not has_record([*header.vlrs, *evlrs], PROJECTION, WKT_ID):
         raise InputError(
             f"{path}: its CRS is given by GeoTIFF keys only, point format {target} needs WKT, and wavebatch does not "
             "convert them; keep the point format's family, or add a WKT record to the strip first"

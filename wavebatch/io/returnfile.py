@@ -12,7 +12,7 @@ from wavebatch import __version__
 from wavebatch.errors import ConfigError
 from wavebatch.io.cloud import CloudReader, split_numbers
 from wavebatch.io.extra import build_dtype
-from wavebatch.io.header import WKT_BIT, LasHeader, Vlr
+from wavebatch.io.header import WKT_BIT, LasHeader, build_wkt
 from wavebatch.io.pointfile import PointFile
 from wavebatch.io.publish import publish_together
 from wavebatch.io.rawbytes import widen
@@ -102,7 +102,7 @@ class ReturnWriter:
             creation=(1, 2025),
         )
         if modern and wkt:
-            header.vlrs.append(Vlr(b"LASF_Projection", 2112, wkt.encode() + b"\0", b"OGC coordinate system WKT"))
+            header.vlrs.append(build_wkt(wkt))
         self._file = PointFile(Path(target), header, self.dtype, (), overwrite=overwrite)
 
     def __enter__(self) -> ReturnWriter:

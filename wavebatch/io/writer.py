@@ -15,10 +15,13 @@ from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,
+    GEOTIFF_ID,
+    PROJECTION,
     WAVEFORM_RECORD_ID,
     WAVES_EXTERNAL,
     WAVES_INTERNAL,
     WKT_BIT,
+    WKT_ID,
     Evlr,
     LasHeader,
     Vlr,
@@ -155,7 +158,7 @@ def _build_header(
     if layout.packets is not None:
         encoding |= WAVES_INTERNAL if layout.packets.internal else WAVES_EXTERNAL
     if layout.point_format >= 6 and (
-        has_record([*vlrs, *evlrs], "LASF_Projection", 2112) or not has_record(vlrs, "LASF_Projection", 34735)
+        has_record([*vlrs, *evlrs], PROJECTION, WKT_ID) or not has_record(vlrs, PROJECTION, GEOTIFF_ID)
     ):
         encoding |= WKT_BIT
     return LasHeader(

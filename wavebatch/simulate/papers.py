@@ -50,6 +50,7 @@ def simulate_wang(
     phase = rng.uniform(-0.5, 0.5, (n, 1)) if noise_std else np.zeros((n, 1))
     return *simulate_echoes(recording, 30.0 + phase + time, FINE * amplitude, PULSE_SIGMA, rng), recording
 
+
 RETURN_TABLES: dict[str, tuple[float, tuple[float, ...]]] = {
     "orion-6": (0.65, (40.9, 42.3, 13.7, 3.1)),
     "orion-20": (0.65, (28.8, 33.8, 22.9, 14.5)),

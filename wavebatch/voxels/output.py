@@ -13,14 +13,23 @@ from wavebatch import __version__
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.facts import StripFacts
-from wavebatch.io.header import WKT_BIT, LasHeader, Vlr, has_record, read_header
+from wavebatch.io.header import (
+    PROJECTION,
+    WKT_BIT,
+    WKT_ID,
+    LasHeader,
+    Vlr,
+    build_wkt,
+    has_record,
+    is_projection,
+    read_header,
+)
 from wavebatch.io.npz import NpzWriter
 from wavebatch.io.pointfile import PointFile
 from wavebatch.io.publish import Draft
 from wavebatch.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
-_WKT = 2112
 
 
 def check_target(target: Path, strip: Path) -> None:
@@ -131,15 +140,15 @@ class LasVoxels:
 
 def _build_header(facts: StripFacts, origin: np.ndarray, size: float, meta: Mapping[str, Any]) -> LasHeader:
     source = read_header(facts.path)
-    vlrs = [vlr for vlr in source.vlrs if vlr.user == "LASF_Projection"]
-    if not has_record(vlrs, "LASF_Projection", _WKT) and (facts.crs or "").endswith("]"):
-        text = facts.crs.encode() + b"\0"  # from an extended record
-        if len(text) > 65535:
+    vlrs = [vlr for vlr in source.vlrs if is_projection(vlr)]
+    if not has_record(vlrs, PROJECTION, WKT_ID) and (facts.crs or "").endswith("]"):
+        record = build_wkt(facts.crs)  # from an extended record
+        if len(record.payload) > 65535:
             raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
-        vlrs.append(Vlr(b"LASF_Projection", _WKT, text, b"OGC coordinate system WKT"))
+        vlrs.append(record)
     modern = source.point_format >= 6
     encoding = source.global_encoding & 1
-    if modern and (has_record(vlrs, "LASF_Projection", _WKT) or not vlrs):
+    if modern and (has_record(vlrs, PROJECTION, WKT_ID) or not vlrs):
         encoding |= WKT_BIT
     text = json.dumps(meta, sort_keys=True, separators=(",", ":")).encode()
     return LasHeader(
