@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from strips import make_raw
 
 from wavebatch.cli import main
+from wavebatch.cli.common import printable
 from wavebatch.simulate import simulate_strip
 
 SIGNALLING = 0x7F800001
@@ -96,7 +97,8 @@ def test_names_of_files_may_hold_anything(tmp_path, name):
     for more in ([], ["--resume"]):
         done = CliRunner().invoke(main, ["run", str(strip), *out, *more, "--report", str(tmp_path / "batch.json")])
         assert done.exit_code == 0, done.stderr
-        assert done.stderr.count("\n") == 1 and "\x1b" not in done.stderr
+        assert all(line.startswith(printable(str(strip))) for line in done.stderr.splitlines()), done.stderr
+        assert "\x1b" not in done.stderr
     assert "is there already" in done.stderr
     assert json.loads((tmp_path / "batch.json").read_text("utf-8"))["strips"][0]["strip"] == str(strip)
     strip.write_bytes(b"nothing")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,21 @@ def check_target(target: Path, strip: Path) -> None:
     Draft(target, overwrite=True).discard()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class VoxelSpace:
+    """What a file says of its voxels beside their values."""
+
+    columns: Sequence[VoxelColumn]
+    facts: StripFacts
+    """Of the strip."""
+    origin: np.ndarray
+    """Lower corner of voxel 0, f8 (3,) [m]."""
+    size: float
+    """Of a voxel [m]."""
+    meta: Mapping[str, Any]
+    """How they were made."""
+
+
 class NpzVoxels:
     """Writes voxels to an .npz: `write`, then `commit`; as a context manager nothing remains unless committed.
 
@@ -48,20 +64,11 @@ class NpzVoxels:
     i lies between origin + i size and origin + (i + 1) size. No-data is NaN. Raises InputError where it cannot write.
     """
 
-    def __init__(
-        self,
-        target: Path,
-        columns: Sequence[VoxelColumn],
-        *,
-        facts: StripFacts,
-        origin: np.ndarray,
-        size: float,
-        meta: Mapping[str, Any],
-        overwrite: bool,
-    ) -> None:
-        text = json.dumps(meta, sort_keys=True)
-        self._single = {"origin": origin, "size": size, "crs": facts.crs or "", "meta": text}
-        dtypes = {"index": np.dtype(("<i4", (3,)))} | {column.name: np.dtype(f"<{column.dtype}") for column in columns}
+    def __init__(self, target: Path, space: VoxelSpace, *, overwrite: bool) -> None:
+        text = json.dumps(space.meta, sort_keys=True)
+        self._single = {"origin": space.origin, "size": space.size, "crs": space.facts.crs or "", "meta": text}
+        dtypes = {"index": np.dtype(("<i4", (3,)))}
+        dtypes |= {column.name: np.dtype(f"<{column.dtype}") for column in space.columns}
         self._file = NpzWriter(target, dtypes, overwrite=overwrite)
 
     def __enter__(self) -> NpzVoxels:
@@ -86,18 +93,8 @@ class LasVoxels:
     is kept.
     """
 
-    def __init__(
-        self,
-        target: Path,
-        columns: Sequence[VoxelColumn],
-        *,
-        facts: StripFacts,
-        origin: np.ndarray,
-        size: float,
-        meta: Mapping[str, Any],
-        overwrite: bool,
-    ) -> None:
-        self._columns = columns
+    def __init__(self, target: Path, space: VoxelSpace, *, overwrite: bool) -> None:
+        self._columns = space.columns
         records = [
             ExtraRecord.build(
                 column.name,
@@ -105,9 +102,9 @@ class LasVoxels:
                 column.meaning if column.unit == "-" else f"{column.meaning} [{column.unit}]",
                 no_data=column.no_data,
             )
-            for column in columns
+            for column in space.columns
         ]
-        header = _build_header(facts, origin, size, meta)
+        header = _build_header(space)
         self._returns = 0b1_0001 if header.point_format >= 6 else 0b1001
         self._dtype = build_dtype(header.point_format, records)
         self._file = PointFile(target, header, self._dtype, records, overwrite=overwrite)
@@ -138,8 +135,13 @@ class LasVoxels:
         self._file.draft.publish()
 
 
-def _build_header(facts: StripFacts, origin: np.ndarray, size: float, meta: Mapping[str, Any]) -> LasHeader:
-    source = read_header(facts.path)
+def open_voxels(target: Path, space: VoxelSpace, *, overwrite: bool) -> NpzVoxels | LasVoxels:
+    """The writer of the format that the target's suffix says."""
+    return (NpzVoxels if target.suffix.lower() == ".npz" else LasVoxels)(target, space, overwrite=overwrite)
+
+
+def _build_header(space: VoxelSpace) -> LasHeader:
+    facts, source = space.facts, read_header(space.facts.path)
     vlrs = [vlr for vlr in source.vlrs if is_projection(vlr)]
     if not has_record(vlrs, PROJECTION, WKT_ID) and (facts.crs or "").endswith("]"):
         record = build_wkt(facts.crs)  # from an extended record
@@ -150,13 +152,13 @@ def _build_header(facts: StripFacts, origin: np.ndarray, size: float, meta: Mapp
     encoding = source.global_encoding & 1
     if modern and (has_record(vlrs, PROJECTION, WKT_ID) or not vlrs):
         encoding |= WKT_BIT
-    text = json.dumps(meta, sort_keys=True, separators=(",", ":")).encode()
+    text = json.dumps(space.meta, sort_keys=True, separators=(",", ":")).encode()
     return LasHeader(
         version=(1, 4) if modern else source.version,
         point_format=6 if modern else 0,
         point_length=0,
-        scales=(0.5 * size,) * 3,
-        offsets=tuple(float(value) for value in origin),
+        scales=(0.5 * space.size,) * 3,
+        offsets=tuple(float(value) for value in space.origin),
         vlrs=[*vlrs, Vlr(b"wavebatch", 1, text, b"how these voxels were made (JSON)")],
         file_source_id=source.file_source_id,
         global_encoding=encoding,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from wavebatch.systemfile import SavedSurvey, describe_system
 from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.voxels.grid import COLUMNS, VoxelGrid, energy_unit
-from wavebatch.voxels.output import LasVoxels, NpzVoxels, check_target
+from wavebatch.voxels.output import VoxelSpace, check_target, open_voxels
 from wavebatch.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.voxels.rays import trace_profiles
 
@@ -136,23 +136,31 @@ def voxelize_strip(
                 _add_block(grid, counts, source.fill(block), pulse, options, ceiling)
                 if progress is not None:
                     progress(len(block), scan.packets)
-            voxels = _write(grid, reader, target, _describe(strip, options, pulse, calibration), overwrite)
+            meta = _describe(strip, options, pulse, calibration)
+            space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             return VoxelSummary(
                 **asdict(counts),
+                **_summarise(grid, options, pulse),
                 strip=str(strip),
                 output=str(target),
-                size=options.size,
-                voxels=voxels,
-                shape=tuple(grid.shape.tolist()),
-                origin=tuple((grid.low * options.size).tolist()),
-                outside=grid.outside,
-                energy=grid.energy,
-                method=options.deconvolution.method,
-                pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
-                noise=pulse.noise_std,
+                voxels=_write(grid, target, space, overwrite),
                 sensor=None if calibration is None else source.kind,
-                unknown=grid.unknown,
             )
+
+
+def _summarise(grid: VoxelGrid, options: VoxelOptions, pulse: SystemPulse) -> dict[str, Any]:
+    """What the grid says of itself when all is added, and how it was filled."""
+    return {
+        "size": grid.size,
+        "shape": tuple(grid.shape.tolist()),
+        "origin": tuple((grid.low * grid.size).tolist()),
+        "outside": grid.outside,
+        "energy": grid.energy,
+        "unknown": grid.unknown,
+        "method": options.deconvolution.method,
+        "pulse_fwhm": pulse.sigma_ref * FWHM_PER_SIGMA,
+        "noise": pulse.noise_std,
+    }
 
 
 def _find_pulse(
@@ -251,20 +259,10 @@ def _add_block(
     counts.clipped += int(profiles.clipped.sum())
 
 
-def _write(grid: VoxelGrid, reader: StripReader, target: Path, meta: Mapping[str, Any], overwrite: bool) -> int:
+def _write(grid: VoxelGrid, target: Path, space: VoxelSpace, overwrite: bool) -> int:
     """Writes the voxels; their number."""
     number = 0
-    kind = NpzVoxels if target.suffix.lower() == ".npz" else LasVoxels
-    writer = kind(
-        target,
-        grid.columns,
-        facts=reader.facts,
-        origin=grid.low * grid.size,
-        size=grid.size,
-        meta=meta,
-        overwrite=overwrite,
-    )
-    with writer:
+    with open_voxels(target, space, overwrite=overwrite) as writer:
         for index, columns in grid.pieces():
             writer.write(index, columns)
             number += len(index)
