@@ -142,8 +142,16 @@ def test_options_reach_the_cloud(tiny_strip, tmp_path):
 
 
 def test_the_wrong_direction_puts_echoes_elsewhere(tiny_strip, tmp_path):
+    warned = {}
     for sign in ("toward", "away"):
-        assert _run(tiny_strip, "-o", tmp_path / sign, "--direction", sign, "--profile", "fast").exit_code == 0
+        result = _run(tiny_strip, "-o", tmp_path / sign, "--direction", sign, "--profile", "fast")
+        assert result.exit_code == 0
+        warned[sign] = [line for line in result.stderr.splitlines() if ": warning: " in line]
+    assert warned["toward"] == []
+    (line,) = warned["away"]
+    assert line.startswith(f"{tiny_strip}: warning: --direction away overrides what the file says: ")
+    quiet = _run(tiny_strip, "-o", tmp_path / "away", "--direction", "away", "--profile", "fast", "--overwrite", "-q")
+    assert quiet.exit_code == 0 and quiet.stderr == ""
     report = json.loads((tmp_path / "away" / "tiny.report.json").read_text())
     assert report["strip"]["direction"]["sign"] == "away"
 

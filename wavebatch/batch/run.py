@@ -216,4 +216,5 @@ class _Batch:
             self._tell({**event, "error": outcome.error, "again": again})
         else:
             told = outcome.report.to_json()
-            self._tell({**event, "counts": told["counts"], "remarks": told["remarks"]})
+            more = {"counts": told["counts"], "remarks": told["remarks"], "warnings": strip.warnings}
+            self._tell({**event, **more})

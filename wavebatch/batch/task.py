@@ -57,6 +57,7 @@ class StripTask:
         self.pending: deque[Future] = deque()
         self.prepared: Prepared | None = None
         self.written = 0
+        self.warnings: list[str] = []
         self._options = options
         self._submitted = 0
         self._blob = b""
@@ -170,6 +171,7 @@ class StripTask:
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
         document = build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
         write_json(beside, document, overwrite=replaces)
+        self.warnings = document["warnings"]
         self.prepared.scan.close()
         return self._report
 

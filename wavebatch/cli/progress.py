@@ -69,7 +69,9 @@ class Progress:
             self._say(f"error: {_place(printable(strip), one_line(error))}")
         elif kind == "written" and self._level >= 0:
             self._say(printable(_summary(event, self._level > 0)))
-            for line in [*_reasons(event["counts"]["no_data"])] * (self._level > 0) + event["remarks"]:
+            warnings = [f"warning: {line}" for line in event["warnings"]]
+            reasons = [*_reasons(event["counts"]["no_data"])] * (self._level > 0)
+            for line in [*warnings, *reasons, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is there already"))
