@@ -194,3 +194,33 @@ def test_what_is_left_of_few_echoes_is_learned_too():
         return gaussian(x) + 0.06 * gaussian((x - 5.5) / 1.2) + 0.015 * gaussian((x - 12) / 3)
 
     assert np.mean([judge(*record(tailed, seed, n=300)[:2])[2] for seed in range(20, 26)]) > 0.993
+
+
+@pytest.mark.parametrize("seed", [13, 14])
+def test_echoes_that_the_receiver_compresses_stay_whole(seed):
+    """R5: above two thirds of the range the pulse flattens, and fits like two."""
+    time, height = (np.random.default_rng(seed).uniform(low, high, 3000) for low, high in ((20, 50), (2.5, 5.3)))
+    height = np.exp(height)
+    signal = height[:, None] * gaussian((np.arange(80) - time[:, None]) / 2.0)
+    noise = np.random.default_rng(seed + 100).standard_normal(signal.shape)
+    block = WaveformBlock.from_samples(np.rint(12 + 250 * np.tanh(signal / 250) + noise).astype(np.uint8))
+    system, echoes, whole, _ = judge(block, time)
+    assert 0 < system.misfit <= 0.03 and system.acceptance <= 18
+    strong = height > 150
+    assert whole > 0.985 and (echoes.count(len(block)) == 1)[strong].mean() > 0.95
+
+
+@pytest.mark.parametrize("seed", [15, 16])
+def test_pairs_of_strong_echoes_are_no_misfit(seed):
+    """A quarter of all echoes are two targets, 1.5 to 2 widths apart: they are still two."""
+    rng = np.random.default_rng(seed)
+    n = 3000
+    time, height, double = rng.uniform(20, 50, n), rng.uniform(15, 180, n), rng.random(n) < 0.25
+    x = (np.arange(80) - time[:, None]) / 2.0
+    signal = gaussian(x) + 0.7 * double[:, None] * gaussian(x - rng.uniform(1.5, 2.0, (n, 1)))
+    counts = 12 + height[:, None] * signal + rng.standard_normal(x.shape)
+    block = WaveformBlock.from_samples(np.clip(np.rint(counts), 0, 511).astype(np.uint16))
+    survey = survey_block(block)
+    number = choose_chain(survey).run(block, survey.system).count(n)
+    assert survey.system.misfit == 0
+    assert (number[double & (height > 60)] == 2).mean() > 0.95 and (number[~double] == 1).mean() > 0.98

@@ -275,6 +275,8 @@ class SystemPulse:
     """Count at which the survey saw samples clipped; None: only the digitizer's largest count is."""
     acceptance: float = 15.0
     """Least fall of chi2 for which an echo is added."""
+    misfit: float = 0.0
+    """How far strong echoes deviate from the pulse, as a share of them: falls of chi2 that this explains add none."""
     level_variance: float = 0.0
     """Of level ground's echoes seen from above, less the system pulse's [ns2]; not positive: surveys see slopes too."""
     width_scatter: float = 0.0

@@ -51,8 +51,25 @@ def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
 
 
-def _find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped."""
+def find_strong(block: WaveformBlock, system: SystemPulse) -> tuple[EchoTable, EchoTable]:
+    """The strongest fifth of the isolated echoes that are not clipped, and the third fifth.
+
+    Without those that targets have widened.
+    """
+    echoes = _find_clear(block, system, most=1.0)
+    if len(echoes) < FEW:
+        return echoes, echoes
+    low, high, strong = np.quantile(echoes.amplitude, (0.4, 0.6, 0.8))
+    parts = (echoes.amplitude >= strong, (echoes.amplitude >= low) & (echoes.amplitude < high))
+    narrow = echoes.sigma < WIDENED * find_mode(echoes.sigma)
+    return echoes.take(np.flatnonzero(parts[0] & narrow)), echoes.take(np.flatnonzero(parts[1] & narrow))
+
+
+def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -> EchoTable:
+    """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped.
+
+    most: largest amplitude, as a share of the largest count.
+    """
     n = len(block)
     noise = pooled_noise(block, system)
     echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
@@ -60,7 +77,7 @@ def _find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     echoes = echoes.take(strongest)
     top = system.saturation or float(block.samples.max())
     good = echoes.amplitude > MIN_SNR * system.noise_std
-    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < 0.75 * top)
+    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < most * top)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     return echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second)))
 

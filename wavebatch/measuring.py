@@ -46,6 +46,12 @@ FIRST_WIDTH = 2.0
 ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
 """Thresholds tried for one more echo, in chi2."""
 
+MISFITS = (0.005, 0.01, 0.015, 0.02, 0.03)
+"""Misfits of strong echoes tried, as shares of them."""
+
+MANY_TIMES = 4.0
+"""Split strong echoes, over split ones of middle strength, from which the pulse is what is wrong."""
+
 USEFUL = 0.75
 """Share of the split echoes that must be left for a raised threshold to have been of no use."""
 
@@ -246,16 +252,41 @@ def choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTable
     """
     if len(main) < ENOUGH_TO_LEARN:
         return system
-    rows, shares = np.arange(len(main)), []
+    part, shares = main, []
     for acceptance in ACCEPTANCES:
         # What a threshold leaves whole, a higher one does too: only the split ones are tried again.
-        part, time = block.rows(main.waveform[rows]), main.time[rows]
-        found = decompose_sample(part, replace(system, acceptance=acceptance))
-        near = np.abs(found.time - time[found.waveform]) < NEAR * system.sigma_ref
-        rows = rows[np.bincount(found.waveform[near], minlength=len(part)) > 1]
-        shares.append(len(rows) / len(main))
+        part = _keep_split(block, replace(system, acceptance=acceptance), part)
+        shares.append(len(part) / len(main))
         if shares[-1] <= SPLIT_SHARE:
             return replace(system, acceptance=acceptance)
         if len(shares) > 1 and shares[-1] > USEFUL * shares[-2]:
             return replace(system, acceptance=ACCEPTANCES[len(shares) - 2])
     return replace(system, acceptance=ACCEPTANCES[-1])
+
+
+def _keep_split(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Those of single echoes in whose place a decomposition finds several."""
+    part = block.rows(echoes.waveform)
+    found = decompose_sample(part, system)
+    near = np.abs(found.time - echoes.time[found.waveform]) < NEAR * system.sigma_ref
+    return echoes.take(np.flatnonzero(np.bincount(found.waveform[near], minlength=len(part)) > 1))
+
+
+def choose_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable, middle: EchoTable) -> SystemPulse:
+    """The system with the least misfit of strong echoes to the pulse that leaves them whole (R3, R5).
+
+    Receivers compress high amplitudes, and no pulse that weaker echoes taught fits these. strong, middle: the strongest
+    single echoes, and others of middle strength. 0 where less than 1.5 % of the strong ones are split, where it is not
+    many times as many as of the others, which pairs of targets would be alike, or where no misfit helps.
+    """
+    if len(strong) < ENOUGH_TO_LEARN:
+        return system
+    part = _keep_split(block, system, strong)
+    usual = len(_keep_split(block, system, middle)) / max(len(middle), 1)
+    if len(part) / len(strong) <= max(SPLIT_SHARE, MANY_TIMES * usual):
+        return system
+    for misfit in MISFITS:
+        part = _keep_split(block, replace(system, misfit=misfit), part)
+        if len(part) / len(strong) <= max(SPLIT_SHARE, usual):
+            return replace(system, misfit=misfit)
+    return system

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
-from wavebatch.learning import find_isolated, learn_pulse
+from wavebatch.learning import find_isolated, find_strong, learn_pulse
 from wavebatch.measuring import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -16,6 +16,7 @@ from wavebatch.measuring import (
     MIN_SNR,
     RESIDUAL_LOOK,
     choose_acceptance,
+    choose_misfit,
     decompose_sample,
     measure_gaussian,
     measure_residuals,
@@ -156,6 +157,7 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
         part = thin_block(block, RESIDUAL_LOOK)
         system = measure_residuals(part, system, decompose_sample(part, system))
         system = choose_acceptance(block, system, main)
+        system = choose_misfit(block, system, *find_strong(block, system))
     echoes = decompose_sample(block, system)
     system = replace(system, width_scatter=_measure_scatter(block, system, echoes))
     figures.update(_describe(block, system, echoes))

@@ -43,6 +43,7 @@ QUANTITIES: dict[str, Quantity] = {
     "ringing": Quantity("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
     "saturation_dn": Quantity("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
     "acceptance": Quantity("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
+    "misfit": Quantity("misfit", 0.0, 1.0, "of strong echoes to the pulse, as a share of them", optional=True),
     "level_variance_ns2": Quantity("level_variance", -1e8, 0.0, "of level ground's echoes less the pulse's", True),
     "width_scatter_ns": Quantity("width_scatter", 0.0, 1e4, "of echo widths beyond the errors of their fits", True),
     "divergence_mrad": Quantity("divergence", 1e-3, 100.0, "full angle of the beam, 1/e^2, from its data sheet", True),

@@ -183,6 +183,9 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
+    if system.misfit:
+        text = "of strong echoes to the pulse of weaker ones; what it explains adds no echo"
+        yield _line("misfit", f"{100 * system.misfit:g} % {text}")
 
 
 def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:

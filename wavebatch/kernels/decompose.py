@@ -21,6 +21,7 @@ from wavebatch.kernels.fit import (
 from wavebatch.kernels.gate import find_misfits
 from wavebatch.kernels.propose import propose_echo
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
+from wavebatch.units import SQRT_PI
 
 
 class Settings(NamedTuple):
@@ -36,6 +37,7 @@ class Settings(NamedTuple):
     max_iterations: int = 40
     grow: bool = True
     acceptance: float = 15.0
+    misfit: float = 0.0
     max_echoes: int = 6
     prior: WidthPrior | None = None
     gate_residual: float = 4.2
@@ -306,9 +308,17 @@ def _propose(
         Limits(limits.low[at], limits.high[at]),
         settings.width_ref,
     )
-    hopeful = gain > 0.5 * settings.acceptance
-    at, start = at[hopeful], start[hopeful]
+    least = _least_fall(settings, windows.std[at], fit.parameters[at])
+    hopeful = gain > 0.5 * least
+    at, start, least = at[hopeful], start[hopeful], least[hopeful]
     if not len(at):
         return None, none
     start[:, 1] += begin[at][:, None]
-    return Problem(at, start, fit.cost[at] - settings.acceptance), at
+    return Problem(at, start, fit.cost[at] - least), at
+
+
+def _least_fall(settings: Settings, std: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Fall of chi2 (m,) that one more echo needs: the acceptance, and what a misfit of the pulse itself may explain."""
+    amplitude, _, width = parameters.transpose(1, 0, 2)
+    energy = SQRT_PI * (amplitude * amplitude * width).sum(axis=1) / (std * std)
+    return settings.acceptance + settings.misfit**2 * energy

@@ -141,6 +141,7 @@ def adaptive(
         max_iterations=max_iterations,
         grow=True,
         acceptance=acceptance or system.acceptance,
+        misfit=system.misfit,
         max_echoes=max_echoes,
         prior=WidthPrior(ref, width_prior * ref) if width_prior > 0 else None,
         gate_residual=gate_residual,
