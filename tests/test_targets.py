@@ -94,7 +94,7 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     targets.write_text(f"name,reflectance,x,y,radius\nnear,0.2,{x},{y},40\nnowhere,0.5,{x + 1e5},{y},40\n")
     done = call("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
     assert done.exit_code == 0, done.output
-    assert "nowhere: reflectance 0.5, 0 echoes, too few, left out" in done.stderr
+    assert "nowhere: reflectance 0.5, 0 echoes, too few, left out" in done.stderr and "note: " not in done.stderr
     found = load_calibration(cal)
     assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
     assert found.strip == "flat.las" and "direction vectors" in found.conditions
@@ -106,6 +106,9 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     assert np.median(rho[rho != -9999]) == pytest.approx(0.2, rel=0.03)
     done = call("calibrate", ground, "--targets", targets, "-o", cal)
     assert done.exit_code == 1 and "exists" in done.stderr
+    targets.write_text(f"reflectance,x,y,radius\n0.2,{x},{y + 30},20\n0.5,{x},{y - 30},20\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "two.toml")
+    assert done.exit_code == 0 and "note: constants of the targets differ by a factor of 2." in done.stderr
 
 
 def test_targets_off_the_strip(tmp_path, ground):
@@ -113,7 +116,7 @@ def test_targets_off_the_strip(tmp_path, ground):
     targets.write_text(f"reflectance,x,y,radius\n0.2,{EAST + 9e5},{NORTH},40\n")
     done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "cal.toml")
     assert done.exit_code == 1
-    assert "no target has 10 clean single echoes (target 1 0)" in done.stderr
+    assert "no target has 10 clean single echoes (target 1: 0 echoes)" in done.stderr
     assert not (tmp_path / "cal.toml").exists()
 
 

@@ -149,7 +149,7 @@ def calibrate_strip(
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
     whole = _combine([result for result, _ in results], reflectance_error)
     if whole is None:
-        told = ", ".join(f"{result['name']} {result['echoes']}" for result, _ in results)
+        told = ", ".join(f"{result['name']}: {result['echoes']} echoes" for result, _ in results)
         raise InputError(f"{path}: no target has {LEAST_ECHOES} clean single echoes ({told}); check their coordinates")
     channels = _calibrate_channels(results, reflectance_error)
     # What has no constant of its own gets that of all together, which then is as uncertain as they differ.

@@ -11,6 +11,9 @@ from wavebatch.cli.common import debug_option, report_errors, talk
 from wavebatch.cli.options import direction_option, overwrite_option, system_option
 from wavebatch.cli.sensor import read_sensor, sensor_options
 
+LEAST_DOUBT = 0.03
+"""Relative error of a target, at least: constants that differ by six times this or its stated error are told."""
+
 
 @click.command()
 @click.argument("strip", type=click.Path(path_type=Path))
@@ -72,6 +75,10 @@ def calibrate(
         said = f"constant {target['constant']:.4g}, spread {100 * target['spread']:.1f} %, incidence " \
             f"{target['incidence_deg']:.1f} deg" if "constant" in target else "too few, left out"  # fmt: skip
         talk(f"{target['name']}: reflectance {target['reflectance']:g}, {target['echoes']} echoes, {said}")
+    constants = [target["constant"] for target in found.targets if "constant" in target]
+    ratio = max(constants) / min(constants)
+    if ratio > 1 + 6 * max(reflectance_error, LEAST_DOUBT) and not found.channels:  # channels may differ
+        talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
     for channel in found.channels:
         error, spread = 100 * channel["relative_error"], 100 * channel["spread"]
         numbers = f"constant {channel['constant']:.4g} +- {error:.1f} %, spread {spread:.1f} %"
