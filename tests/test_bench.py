@@ -90,7 +90,7 @@ def test_stiff_cases_count_failures_by_kind(document):
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
 
 
-def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say():
+def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(timed_here):
     small = replace(SMALL, peers=False, stability=False, pulses=0, waveforms=1200)
     rows = [run_bench(replace(small, seed=seed))["scenes"][0]["rows"] for seed in (5, 5, 6)]
     for first, again, other in zip(*rows, strict=True):

@@ -22,18 +22,7 @@ def test_every_method_has_a_chain():
         assert stages[1] == (name if name.startswith("detect") else "detect.maximum")
 
 
-class Here:
-    """What is measured in processes of their own, in this one: starting two dozen takes half a minute."""
-
-    def call(self, function, *arguments):
-        return function(*arguments)
-
-    def close(self):
-        pass
-
-
-def test_all_methods_stand_in_one_table(monkeypatch):
-    monkeypatch.setattr("wavebatch.bench.speed.Worker", Here)
+def test_all_methods_stand_in_one_table(timed_here):
     options = "--scene flat --waveforms 600 --pulses 0 --repeat 1 --no-peers --no-stability --all-methods --json"
     result = CliRunner().invoke(main, ["bench", *options.split()])
     assert result.exit_code == 0, result.output
