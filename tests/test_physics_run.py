@@ -121,6 +121,17 @@ def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, wide_strip,
     assert report(folder)["strip"]["sensor"]["share_covered"] == 1.0
 
 
+def test_heights_of_another_kind_are_told(tmp_path, wide_strip):
+    path = write_trajectory(tmp_path / "t.csv")
+    head, *rows = path.read_text().splitlines()
+    raised = [f"{left},{float(height) + 45.0}" for left, _, height in (row.rpartition(",") for row in rows)]
+    path.write_text("\n".join([head, *raised]))
+    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
+    assert done.exit_code == 0, done.output
+    (remark,) = report(tmp_path / "out")["remarks"]
+    assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
+
+
 def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip):
     path = tmp_path / "cal.toml"
     arguments = (tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", path, "--resume", "-v")

@@ -91,6 +91,15 @@ def test_a_trajectory_file(tmp_path, wide_strip, found):
     assert np.abs(given.trajectory.at(time) - found.trajectory.at(time)).max() < 0.02
 
 
+def test_a_trajectory_has_the_error_that_the_vectors_see(tmp_path, wide_strip):
+    told = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv")).describe()
+    assert told["range_error_m"] < 0.01 and abs(told["farther_than_by_vectors_m"]) < 0.01
+    given = find(wide_strip, trajectory=write_trajectory(tmp_path / "u.csv", off=(0.0, 0.0, 6.0)))
+    told = given.describe()
+    assert told["range_error_m"] == pytest.approx(6.0 * 0.97, rel=0.03) and given.error == pytest.approx(5.8, abs=0.2)
+    assert told["farther_than_by_vectors_m"] == pytest.approx(5.8, abs=0.2)
+
+
 def test_gaps_are_told(tmp_path, wide_strip):
     told = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv", stop=0.3)).describe()
     assert told["share_covered"] == pytest.approx(0.45, abs=0.05)

@@ -66,7 +66,7 @@ class SensorSource:
     trajectory: Trajectory | None = None
     height: float | None = None
     error: float = 0.0
-    """Standard deviation of the distance to the sensor [m]; 0 where the source does not say."""
+    """Standard deviation of the distance to the sensor [m], of a trajectory by what the vectors say; 0 if unknown."""
     facts: tuple[tuple[str, Any], ...] = ()
     """What reports say beside."""
 
@@ -83,7 +83,7 @@ class SensorSource:
 
     def describe(self) -> dict[str, Any]:
         """For reports."""
-        known = self.kind not in ("none", "trajectory")
+        known = self.kind != "none" and self.error > 0
         return {"source": self.kind, "range_error_m": round(self.error, 6) if known else None, **dict(self.facts)}
 
 
@@ -138,6 +138,7 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
+    off, error, sure = _compare_ranges(known, rays)
     facts = {
         "file": request.trajectory.name,
         "clocks": clocks,
@@ -146,8 +147,24 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
         "gaps_s": [[round(a, 3), round(b, 3)] for a, b in known.gaps(start, stop)[:20]],
         "angle_to_packet_vectors_deg": round(float(np.degrees(angle)), 4),
         "distance_m": _median_distance(known, rays),
+        "farther_than_by_vectors_m": off,
+        "by_vectors_error_m": sure,
     }
-    return SensorSource("trajectory", known, facts=tuple(facts.items()))
+    return SensorSource("trajectory", known, error=error, facts=tuple(facts.items()))
+
+
+def _compare_ranges(known: Trajectory, rays: Rays) -> tuple[float | None, float, float | None]:
+    """By how much ranges from a trajectory are longer than those from the packets' vectors [m]: median, root mean
+    square, and the error of the latter; None, 0 and None where vectors do not tell."""
+    path = estimate_path(rays, "direction vectors")
+    if path is None:
+        return None, 0.0, None
+    lengths = [rays.point - where.at(rays.time) for where in (known, path.trajectory)]
+    longer = np.sqrt((lengths[0] ** 2).sum(axis=1)) - np.sqrt((lengths[1] ** 2).sum(axis=1))
+    longer = longer[np.isfinite(longer)]
+    if not len(longer):
+        return None, 0.0, None
+    return round(float(np.median(longer)), 3), float(np.sqrt(np.mean(longer**2))), round(path.error, 6)
 
 
 def _median_distance(known: Trajectory, rays: Rays) -> float | None:

@@ -8,6 +8,7 @@ from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.batch.report import AMPLITUDE_BINS, RunReport
 from wavebatch.batch.work import Prepared
 from wavebatch.nodata import REASONS, NoData
+from wavebatch.sensor import SensorSource
 
 _ANGLE = "incidence_angle"
 
@@ -29,11 +30,15 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 }
 """Columns that mean something outside the file, and what they need beside the sensor's position."""
 
+LEAST_DOUBT = 2.0
+"""Median difference of ranges by the trajectory and by the packets' vectors that is told [m]."""
+
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """One line per column that was asked for and that no echo has, with the commonest reason and its remedy; one on
-    angles where the beam tells next to none; one where waveforms and returns have next to nothing in common."""
-    lines = [*_doubt_waveforms(prepared, report)]
+    angles where the beam tells next to none; one where waveforms and returns have next to nothing in common,
+    and one on a trajectory at odds with the packets' vectors."""
+    lines = [*_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -62,6 +67,18 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
             "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"
+        )
+
+
+def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
+    """What the packets' vectors say against a trajectory."""
+    told = sensor.describe()
+    farther, sure = told.get("farther_than_by_vectors_m"), told.get("by_vectors_error_m")
+    if farther is not None and sure is not None and abs(farther) > max(LEAST_DOUBT, 5.0 * sure):
+        which = "farther" if farther > 0 else "nearer"
+        yield (
+            f"range: by the trajectory echoes are {abs(farther):.1f} m {which} than by the packets' vectors, which "
+            f"are sure to {sure:.2g} m; are the heights of one above the geoid, of the other above the ellipsoid?"
         )
 
 
