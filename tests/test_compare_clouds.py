@@ -1,10 +1,13 @@
 """Clouds against clouds and truth: pairs, shares and differences that are known by construction."""
 
+import tracemalloc
+
 import laspy
 import numpy as np
 import pytest
 
 from wavebatch.blocks import EchoFlag
+from wavebatch.compare import pairing
 from wavebatch.compare.clouds import compare_clouds, compare_truth
 from wavebatch.compare.differences import SPEED, Differences, measure_lag
 from wavebatch.errors import ConfigError, InputError
@@ -56,6 +59,23 @@ def test_a_cloud_equals_itself_in_any_order(tmp_path):
     assert result.differences["time"].rms == 0
     assert result.differences["amplitude"].rms == 0
     assert "echo_width" not in result.differences
+
+
+def test_many_points_without_a_time_are_matched_in_bounded_memory(tmp_path, monkeypatch):
+    _, times, xyz, _ = make_pulses(2000)
+    rng = np.random.default_rng(2)
+    loose = xyz[0] + rng.uniform(0, [2000, 2000, 0.01], (20_000, 3))
+    every, place = np.append(times, np.zeros(20_000)), np.concatenate([xyz, loose])
+    write_cloud(tmp_path / "a.las", every, place)
+    write_cloud(tmp_path / "b.las", every[:-500], place[:-500])
+    tracemalloc.start()
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
+    assert result.matched_by == "gps_time" and (result.missed, result.extra) == (0, 500)
+    monkeypatch.setattr(pairing, "MOST_PAIRS", 15_000)
+    with pytest.raises(InputError, match="without a time of their own"):
+        compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
 
 
 @pytest.mark.parametrize("rows", [400_000, 100])

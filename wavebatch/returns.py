@@ -12,7 +12,7 @@ import numpy as np
 from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
 from wavebatch.blocks import EchoFlag
 from wavebatch.errors import ConfigError, InputError
-from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, time_keys
+from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.io.returnfile import ReturnReader
 from wavebatch.units import HALF_C
 
@@ -101,7 +101,7 @@ def pulses_told_apart(reader: ReturnReader) -> bool:
     if not reader.has_gps_time:
         return False
     rows = next(reader.read_pieces(), None)
-    return rows is None or not len(rows) or len(np.unique(rows["gps_time"])) * 16 >= len(rows)
+    return rows is None or tell_pulses_apart(rows["gps_time"])
 
 
 def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:

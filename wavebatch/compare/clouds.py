@@ -9,16 +9,13 @@ import numpy as np
 
 from wavebatch.blocks import EchoFlag
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader
 from wavebatch.units import FWHM_PER_SIGMA
 
 PASSED_THROUGH = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
 """Points with one of these flags are not echoes that somebody found."""
-
-_MOST_PER_PULSE = 32
-"""More points per GPS time than this, on average, and it does not tell pulses apart."""
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
 PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
@@ -76,7 +73,7 @@ def _can_group(reader: CloudReader) -> bool:
     if not reader.has_gps_time:
         return False
     rows = next(reader.read_pieces(), None)
-    return rows is None or not len(rows) or len(np.unique(rows["gps_time"])) * _MOST_PER_PULSE >= len(rows)
+    return rows is None or tell_pulses_apart(rows["gps_time"])
 
 
 def _share_times(first: CloudReader, second: CloudReader) -> bool:

@@ -9,8 +9,14 @@ from scipy.spatial import cKDTree
 
 from wavebatch.compare.breakdown import Breakdown, Table
 from wavebatch.compare.differences import SPEED, Differences, Spread
-from wavebatch.errors import ConfigError
+from wavebatch.errors import ConfigError, InputError
 from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
+
+MOST_PER_PULSE = 64
+"""Echoes of one GPS time beyond which it is no pulse's."""
+
+MOST_PAIRS = 20_000_000
+"""Of such echoes: about 100 bytes each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,15 +177,43 @@ def pair_echoes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a and b that are the same echo: of one pulse and at most `reach` [m] apart, one to one, nearest first.
 
-    pulse_a, pulse_b: whole numbers (k,); xyz_a, xyz_b: positions f8 (k, 3) [m].
+    pulse_a, pulse_b: whole numbers from 0 on (k,); xyz_a, xyz_b: positions f8 (k, 3) [m]. Raises InputError where
+    very many echoes of one pulse lie within reach of each other.
     """
+    number = max(pulse_a.max(initial=0), pulse_b.max(initial=0)) + 1
+    most = np.maximum(*(np.bincount(pulse, minlength=number) for pulse in (pulse_a, pulse_b)))
+    crowd = most > MOST_PER_PULSE
+    calm_a, calm_b = (np.flatnonzero(~crowd[pulse]) for pulse in (pulse_a, pulse_b))
     # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
-    left, right = list_pairs(pulse_a, xyz_a[:, 2], pulse_b, xyz_b[:, 2], reach)
+    left, right = list_pairs(pulse_a[calm_a], xyz_a[calm_a, 2], pulse_b[calm_b], xyz_b[calm_b, 2], reach)
+    left, right = calm_a[left], calm_b[right]
+    if crowd.any():
+        more = _list_crowded(pulse_a, xyz_a, pulse_b, xyz_b, crowd, reach)
+        left, right = (np.concatenate(both) for both in zip((left, right), more, strict=True))
     distance = np.linalg.norm(xyz_a[left] - xyz_b[right], axis=1)
     near = np.flatnonzero(distance <= reach)
     left, right = left[near], right[near]
     kept = pair_nearest(left, right, distance[near], len(xyz_a), len(xyz_b))
     return left[kept], right[kept]
+
+
+def _list_crowded(
+    pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, crowd: np.ndarray, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs within reach of pulses that are none: of points without a time of their own heights choose too few."""
+    rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
+    if not len(rows_a) or not len(rows_b):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    trees = cKDTree(xyz_a[rows_a]), cKDTree(xyz_b[rows_b])
+    if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
+        raise InputError(
+            f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others, and "
+            "lie too close together to be told apart; leave out the points without a time of their own"
+        )
+    near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="ndarray")
+    left, right = rows_a[near["i"]], rows_b[near["j"]]
+    same = pulse_a[left] == pulse_b[right]
+    return left[same], right[same]
 
 
 def check_tolerance(tolerance_ns: float) -> float:

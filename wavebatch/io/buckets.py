@@ -17,6 +17,9 @@ BUCKET_ROWS = 400_000
 MOST_BUCKETS = 72
 """Every bucket is an open file, of each side where two are compared: systems allow 256 at least."""
 
+MOST_RETURNS = 16
+"""Points per GPS time, on average, beyond which it is no pulse's."""
+
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 Sorter = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -85,6 +88,11 @@ def count_buckets(rows: int, held: int | None = None) -> int:
 def sort_by_time(gps_time: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows and their buckets by GPS time f8 (n,) [s]: those of one pulse in one, different pulses spread evenly."""
     return np.arange(len(gps_time)), spread_keys(time_keys(gps_time), number)
+
+
+def tell_pulses_apart(gps_time: np.ndarray) -> bool:
+    """Whether times (n,) of points are those of their pulses: on average no more than a pulse can have share one."""
+    return len(np.unique(gps_time)) * MOST_RETURNS >= len(gps_time)
 
 
 def time_keys(gps_time: np.ndarray) -> np.ndarray:
