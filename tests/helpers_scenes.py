@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from wavebatch.blocks import EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.simulate import Scene, find_scene, simulate_blocks
 
 

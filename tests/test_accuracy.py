@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.config import load_profile
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.evaluate import score
 from wavebatch.kernels.bounds import crlb
 from wavebatch.simulate import Recording, find_scene, simulate_block

@@ -9,7 +9,7 @@ from batch_tools import make_job, read_cloud, run_one
 
 from wavebatch.batch.assemble import assemble_returns, gather_echoes
 from wavebatch.batch.work import prepare_strip
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import StageError
 from wavebatch.io.strip import StripReader
 from wavebatch.kernels.pulses import LONGEST_PULSE

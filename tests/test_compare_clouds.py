@@ -6,10 +6,10 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch.blocks import EchoFlag
 from wavebatch.compare import pairing
 from wavebatch.compare.clouds import compare_clouds, compare_truth
 from wavebatch.compare.differences import SPEED, Differences, measure_lag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io import buckets
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader

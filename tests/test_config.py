@@ -65,7 +65,9 @@ def _wrong(old, new):
         (_wrong("= 5", '= "5"'), ["threshold must be a number", "'5'"]),
         (_wrong("= 5", "= true"), ["threshold must be a number", "True"]),
         (_wrong("= 5", "= inf"), ["threshold must be a finite number"]),
+        (_wrong("= 5", "= -5"), ["(detect.maximum): threshold must lie between 0 and 1e+06, it is -5.0"]),
         (_wrong("= 3", "= 3.0"), ["steps must be an integer", "3.0"]),
+        (_wrong("= 3", "= 101"), ["steps must lie between 0 and 100, it is 101"]),
         (_wrong('stage = "noise.pooled"', "guard = 3.0"), ["[[chain]] 1", "stage is missing"]),
         (_wrong('"noise.pooled"', "7"), ["[[chain]] 1", "stage must be a string"]),
         (_wrong("= 5", "= "), ["not valid TOML", "line 6"]),
@@ -85,6 +87,28 @@ def test_wrong_chains_are_refused_in_one_line_that_says_where(tmp_path, text, wo
     assert "\n" not in message and "wrong.toml" in message
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+def test_every_number_has_a_range_that_holds_its_default(name):
+    for parameter in STAGES[name].parameters.values():
+        if parameter.choices is None and not isinstance(parameter.default, bool | str):
+            low, high = parameter.range
+            assert low <= parameter.default <= high, parameter.name
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('"detect.constant_fraction"\nfraction = 0.0', "fraction must lie between 0 and 1, got 0"),
+        ('"detect.wavelet"\nscale = 40.0', "scale is the level of the b3 wavelet, at most 15, it is 40"),
+    ],
+)
+def test_values_that_only_the_stage_knows_to_be_wrong_are_no_bugs(text, message):
+    chain = parse_chain(_wrong('"detect.maximum"\nthreshold = 5', text), "x")
+    block = WaveformBlock.from_samples(np.full((2, 40), 12, np.uint8))
+    with pytest.raises(ConfigError, match=message):
+        chain.run(block, SystemPulse(2.0))
 
 
 def test_unreadable_chain_files_are_config_errors(tmp_path):

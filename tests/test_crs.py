@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strips import descriptor, make_raw, vlr
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.cli import main
+from wavebatch.echoes import EchoTable
 from wavebatch.io.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate.strip import WKT

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import EchoTable, Noise, WaveformBlock
+from wavebatch.blocks import Noise, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels import render
 from wavebatch.kernels.bounds import crlb
 from wavebatch.kernels.pulse import GAUSSIAN

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.fit import Windows
 from wavebatch.kernels.gauss_newton import step_undamped

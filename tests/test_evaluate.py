@@ -9,7 +9,7 @@ from helpers_scenes import make_block, make_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.evaluate import ErrorStats, Scorer, find_isolated, list_pairs, match_echoes, score
 from wavebatch.kernels.bounds import crlb
 

@@ -4,7 +4,8 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.closed_form import fit_closed_form
 from wavebatch.stages.decompose import closed_form
 

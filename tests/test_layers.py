@@ -10,7 +10,7 @@ MODULES = sorted(ROOT.rglob("*.py"))
 
 RANKS = [
     {"errors", "units", "words", "allocator", "evensample"},
-    {"kernels", "blocks", "trajectory", "nodata"},
+    {"kernels", "blocks", "echoes", "trajectory", "nodata"},
     {"chain", "io", "pictures"},
     {"stages"},
     {"config", "measuring", "learning", "survey", "systemfile", "inspection", "simulate", "evaluate", "areas",

@@ -7,11 +7,12 @@ import pytest
 
 from wavebatch import stages  # noqa: F401 - registers them
 from wavebatch.angles import SLOPE, predict_angles
-from wavebatch.blocks import COLUMNS as COLUMNS_TABLE
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.calibration import with_physics
 from wavebatch.chain import STAGES
 from wavebatch.config import load_profile
+from wavebatch.echoes import COLUMNS as COLUMNS_TABLE
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.io.names import describe
 from wavebatch.kernels.bounds import crlb
 from wavebatch.kernels.incidence import spread_of_angle

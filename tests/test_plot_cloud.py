@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wavebatch.blocks import COLUMNS, EchoFlag
 from wavebatch.cli import main
+from wavebatch.echoes import COLUMNS, EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.evensample import EvenSample
 from wavebatch.io import cloud as io_cloud

@@ -11,10 +11,11 @@ from click.testing import CliRunner
 from strips import make_raw
 
 from wavebatch.bench.plot import _draw_panel, _place_labels
-from wavebatch.blocks import EchoFlag, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
 from wavebatch.config import load_profile, parse_chain
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io import strip as io_strip
 from wavebatch.io.strip import StripReader

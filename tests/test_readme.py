@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from wavebatch.blocks import COLUMNS, FLAG_MEANINGS, EchoFlag
 from wavebatch.cli import COMMANDS
 from wavebatch.config import list_profiles, parse_chain
+from wavebatch.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
 
 TEXT = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
 

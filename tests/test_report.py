@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wavebatch.batch.report import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import StageError
 from wavebatch.units import FWHM_PER_SIGMA
 

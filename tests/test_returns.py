@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch import returns
-from wavebatch.blocks import EchoFlag
 from wavebatch.cli.stats import stats
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import InputError
 from wavebatch.io import buckets
 from wavebatch.io.extra import ExtraRecord, build_dtype

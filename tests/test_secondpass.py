@@ -18,10 +18,10 @@ from wavebatch.batch.run import run_batch
 from wavebatch.batch.secondpass import SecondPass, process_tile
 from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
-from wavebatch.blocks import RAY
 from wavebatch.chain import STAGES, Step
 from wavebatch.cli import main
 from wavebatch.config import parse_chain
+from wavebatch.echoes import RAY
 from wavebatch.errors import ConfigError
 from wavebatch.io import spool
 from wavebatch.io.layout import plan_output

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from wavebatch.auto import choose_chain
-from wavebatch.blocks import EchoFlag, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError
 from wavebatch.kernels.noise import find_levels
 from wavebatch.kernels.pulse import PulseShape, measure_pulse

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError
 from wavebatch.kernels.radiometry import backscatter
 from wavebatch.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.blocks import EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
 from wavebatch.choice import COSTS
 from wavebatch.config import list_profiles, load_profile
+from wavebatch.echoes import EchoTable
 from wavebatch.evaluate import score
 from wavebatch.simulate import find_pulse, known_system
 from wavebatch.survey import survey_block

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.blocks import COLUMNS
+from wavebatch.echoes import COLUMNS
 from wavebatch.errors import ConfigError
 from wavebatch.io.names import STYLES, describe, name_columns, normalise
 

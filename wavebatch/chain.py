@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.errors import ConfigError, StageError
 
 KINDS: dict[str, tuple[tuple[str, ...], type]] = {

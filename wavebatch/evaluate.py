@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.bounds import crlb
 from wavebatch.units import MAD_TO_STD
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
 from wavebatch.stages.decompose import adaptive, closed_form

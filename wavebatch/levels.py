@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoFlag
 from wavebatch.kernels.incidence import spread_of_angle
 from wavebatch.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 from wavebatch.stages.angle import added_variance

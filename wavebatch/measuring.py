@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.noise import estimate_noise
 from wavebatch.kernels.render import render_echoes
 from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.io.returnfile import ReturnReader

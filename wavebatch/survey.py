@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.learning import find_isolated, find_strong, learn_pulse
 from wavebatch.measuring import (
     ENOUGH_TO_LEARN,

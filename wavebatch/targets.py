@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.config import load_profile
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.strip import StripReader

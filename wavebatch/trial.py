@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.evaluate import match_echoes
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.render import render_echoes

@@ -14,7 +14,8 @@ import numpy as np
 from s1_wang import find_raw_maxima
 from table import Table, main
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.evaluate import match_echoes
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.signal import SMOOTH_GAIN

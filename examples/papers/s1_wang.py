@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from table import Table, main
 
-from wavebatch.blocks import EchoTable
+from wavebatch.echoes import EchoTable
 from wavebatch.evaluate import score
 from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
 from wavebatch.kernels.signal import find_peaks

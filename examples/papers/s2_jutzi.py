@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from table import Table, main
 
-from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.fit import Limits, Windows, fit_windows
 from wavebatch.kernels.gauss_newton import step_undamped

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.batch.report import RunReport, count_flags
-from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import StageError
 from wavebatch.io.rawbytes import widen
 from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import StageError
 from wavebatch.units import FWHM_PER_SIGMA
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from wavebatch.batch.report import RunReport
 from wavebatch.batch.work import unpack
-from wavebatch.blocks import COLUMNS, RAY
 from wavebatch.chain import Step
+from wavebatch.echoes import COLUMNS, RAY
 from wavebatch.io.layout import OutputLayout
 from wavebatch.io.rowstore import RowStore
 from wavebatch.io.spool import Spool

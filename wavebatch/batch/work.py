@@ -16,10 +16,11 @@ from wavebatch.angles import angle_parameters
 from wavebatch.auto import without_columns
 from wavebatch.batch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.report import RunReport
-from wavebatch.blocks import COLUMNS, RAY, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import Choice, Request, make_choice, sample_size
+from wavebatch.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit

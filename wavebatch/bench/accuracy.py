@@ -9,7 +9,8 @@ import numpy as np
 
 from wavebatch.bench.figures import Figure, root_mean_square, share
 from wavebatch.bench.truth import describe_truth, find_bounds
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.evaluate import QUANTITIES, find_isolated, match_echoes
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.survey import Survey, survey_block

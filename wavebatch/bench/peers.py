@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.bench.worker import Worker, WorkerDied
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.stages.detect import maximum
 from wavebatch.stages.noise import pooled
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import InputError
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import PulseModel, Recording, Scene, find_scene

@@ -11,9 +11,10 @@ import numpy as np
 
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
 from wavebatch.bench.hazards import CASES, Case, make_scene
-from wavebatch.blocks import EchoFlag, EchoTable, SystemPulse
+from wavebatch.blocks import SystemPulse
 from wavebatch.chain import Chain
 from wavebatch.config import effective
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.simulate.draws import LogUniform, Mixture

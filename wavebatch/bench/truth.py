@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.signal import SMOOTH_GAIN
 from wavebatch.simulate.pulses import PulseModel, main_lobe, spread_lobes
 from wavebatch.simulate.render import Recording, paint_echoes

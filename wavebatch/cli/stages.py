@@ -75,7 +75,7 @@ def _prose(stage: Stage) -> str:
 
 
 def _explain(stage: Stage) -> str:
-    from wavebatch.blocks import COLUMNS
+    from wavebatch.echoes import COLUMNS
 
     told = _describe(stage)
     parts = [f"{stage.name}\n\n{told['text']}"]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
+from wavebatch.echoes import EchoFlag
 from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.evaluate import ErrorStats
 from wavebatch.evensample import EvenSample
 from wavebatch.kernels.bounds import crlb

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import Step
+from wavebatch.echoes import EchoTable
 from wavebatch.evensample import EvenSample
 from wavebatch.stages.models import rebuild_waveforms
 from wavebatch.stages.shapes import clip_level

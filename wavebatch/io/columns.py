@@ -11,7 +11,7 @@ import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo
 
-from wavebatch.blocks import COLUMNS
+from wavebatch.echoes import COLUMNS
 from wavebatch.errors import ConfigError
 from wavebatch.io.cloud import CloudReader, find_columns
 from wavebatch.io.names import normalise

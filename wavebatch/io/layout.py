@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import COLUMNS
+from wavebatch.echoes import COLUMNS
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.carry import Carried, PacketSource, find_packets, plan_carried
 from wavebatch.io.convert import choose_format, copy_standard

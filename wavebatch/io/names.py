@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from laspy import PointFormat
 
-from wavebatch.blocks import COLUMNS, Column
+from wavebatch.echoes import COLUMNS, Column
 from wavebatch.errors import ConfigError
 from wavebatch.io.extra import ExtraRecord
 from wavebatch.io.header import STANDARD_DTYPES

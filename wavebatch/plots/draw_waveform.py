@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.pictures import open_picture, plain_text
 from wavebatch.plots.waveform import WaveformView
 from wavebatch.units import FWHM_PER_SIGMA

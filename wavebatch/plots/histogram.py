@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError
 from wavebatch.evensample import EvenSample
 from wavebatch.io.columns import ColumnFacts

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.strip import StripReader, StripScan, Unit
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag
+from wavebatch.echoes import EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.columns import ColumnFacts, ColumnReader, check_alike
 from wavebatch.words import nearest

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
+from wavebatch.echoes import EchoTable
 from wavebatch.io.strip import StripReader, StripScan
 from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
 from wavebatch.plots.packets import Place

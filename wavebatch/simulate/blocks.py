@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.simulate.geometry import Flight, Rays, trace_rays
 from wavebatch.simulate.render import Recording, paint_echoes, record_counts

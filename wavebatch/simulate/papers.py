@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.simulate.draws import FoldedWidth, LogNormal, WithinDepth
 from wavebatch.simulate.given import FINE, fine_recording, simulate_echoes
 from wavebatch.simulate.pulses import PulseModel

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable
+from wavebatch.echoes import EchoTable
 from wavebatch.simulate.render import Recording
 from wavebatch.units import FWHM_PER_SIGMA
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, WaveformBlock
+from wavebatch.blocks import WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.evaluate import find_isolated
 from wavebatch.io.fullwave import FullwaveWriter

@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.incidence import angle_of_spread, angles_of_variance, paper_table, pulse_table, spread_variance
 from wavebatch.nodata import SUFFIX, NoData, explain
 from wavebatch.stages.physics import is_alone, sensor_distance

@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.gate import residual_moments
 from wavebatch.kernels.match import match_returns
 from wavebatch.kernels.pulse import PulseShape, evaluate_pulse

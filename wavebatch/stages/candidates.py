@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.signal import transpose_samples
 
 

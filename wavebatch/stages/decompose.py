@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.closed_form import fit_closed_form
 from wavebatch.kernels.cluster import Candidates, Clusters, cluster_candidates
 from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters

@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.bounds import bound_time
 from wavebatch.kernels.cluster import estimate_starts, start_errors
 from wavebatch.kernels.pulse import GAUSSIAN

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.cluster import Candidates, Clusters, cut_windows
 from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit import batch_size, evaluate_model, gram_matrix, parameter_errors

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.cluster import estimate_starts
 from wavebatch.kernels.filters import (
     curvature_taps,

@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.asdf import (
     COLUMNS_AT_A_TIME,
     Minima,

@@ -6,8 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.deconvolve import deconvolve_richardson_lucy
 from wavebatch.kernels.filters import curvature_taps, filter_energy, filter_symmetric, refine_peaks
 from wavebatch.kernels.runs import list_samples

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.stages.shapes import clip_level
 
 NEIGHBOURS = 5

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import EchoFlag, EchoTable
+from wavebatch.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.decompose import UNRESOLVED
 
 OVERLAP = 2.0

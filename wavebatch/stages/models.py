@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.blocks import EchoTable, SystemPulse, WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Step
+from wavebatch.echoes import EchoTable
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
 from wavebatch.kernels.render import render_echoes
 from wavebatch.stages.decompose_models import reference_shape, skewed_shape

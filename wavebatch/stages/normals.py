@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import RAY, EchoTable, Noise, SystemPulse, WaveformBlock
+from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
+from wavebatch.echoes import RAY, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.kernels.normals import measure_normals
 
