@@ -1,7 +1,9 @@
 """Chain files: what is taken, what is refused and with which words."""
 
+import numpy as np
 import pytest
 
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain
 from wavebatch.config import effective, list_profiles, load_chain, load_profile, parse_chain
 from wavebatch.errors import ConfigError

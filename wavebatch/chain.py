@@ -25,6 +25,27 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
 """Per kind of stage: its data arguments, in order, and what it returns. Chains hold the kinds in this order."""
 
 
+_MANY = 1e6
+RANGES: dict[str, tuple[float, float]] = {
+    **dict.fromkeys(("threshold", "t_diff", "significance", "acceptance"), (0.0, _MANY)),
+    **dict.fromkeys(("gate_residual", "gate_hermite", "tolerance"), (0.0, _MANY)),
+    **dict.fromkeys(("fraction", "similarity", "reference_error"), (0.0, 1.0)),
+    **dict.fromkeys(("max_iterations", "max_echoes"), (1, 1000)),
+    **dict.fromkeys(("scale", "width_prior", "guard", "duration"), (0.0, 100.0)),
+    **dict.fromkeys(("level", "limit"), (0.1, _MANY)),
+    "iterations": (1, 10_000),
+    "steps": (0, 100),
+    "reach": (0.5, 20.0),
+    "kappa": (-1.0, 1.0),
+    "samples": (2, 65_535),
+    "divergence": (0.0, 100.0),
+    "max_error": (1e-3, 180.0),
+    "radius": (1e-3, 1000.0),
+    "min_points": (4, 10_000),
+}
+"""Least and largest value of numeric parameters by name, which means the same in every stage."""
+
+
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """One keyword argument of a stage: its key in the chain file."""
@@ -34,6 +55,8 @@ class Parameter:
     default: Any
     meaning: str
     choices: tuple[Any, ...] | None = None
+    range: tuple[float, float] | None = None
+    """Least and largest value; None where it is no number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +129,9 @@ def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Para
         if parameter.default is parameter.empty or parameter.name not in meanings:
             raise StageError(f"stage {name}: parameter {parameter.name} needs a default and a line in the docstring")
         kinds, choices = _read_hint(hints[parameter.name])
+        limits = RANGES.get(parameter.name) if {int, float} & set(kinds) and choices is None else None
         parameters[parameter.name] = Parameter(
-            parameter.name, kinds, parameter.default, meanings[parameter.name], choices
+            parameter.name, kinds, parameter.default, meanings[parameter.name], choices, limits
         )
     return parameters
 

@@ -100,6 +100,9 @@ def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
     if parameter.choices is not None and value not in parameter.choices:
         choices = ", ".join(_format_value(choice) for choice in parameter.choices)
         raise ConfigError(f"{where}: {key} must be one of {choices}, it is {_format_value(value)}")
+    if parameter.range is not None and not parameter.range[0] <= value <= parameter.range[1]:
+        low, high = parameter.range
+        raise ConfigError(f"{where}: {key} must lie between {low:g} and {high:g}, it is {value!r}")
     return value
 
 

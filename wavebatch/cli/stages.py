@@ -59,7 +59,12 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "makes": list(stage.makes),
         "needs": list(stage.needs),
         "parameters": {
-            name: {"type": _types(parameter), "default": parameter.default, "meaning": parameter.meaning}
+            name: {
+                "type": _types(parameter),
+                "default": parameter.default,
+                "range": parameter.range,
+                "meaning": parameter.meaning,
+            }
             for name, parameter in stage.parameters.items()
         },
         "example": format_step(stage.name, defaults),
@@ -85,9 +90,10 @@ def _explain(stage: Stage) -> str:
     if stage.needs:
         parts.append(f"Needs: {', '.join(stage.needs)}")
     if told["parameters"]:
-        lines = [
-            f"  {name} ({p['type']}, default {p['default']}): {p['meaning']}" for name, p in told["parameters"].items()
-        ]
+        lines = []
+        for name, p in told["parameters"].items():
+            limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
+            lines.append(f"  {name} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
         parts.append("Parameters:\n" + "\n".join(lines))
     parts.append("In a chain file:\n\n" + told["example"].rstrip())
     return "\n\n".join(parts)

@@ -9,6 +9,7 @@ import numpy as np
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.echoes import EchoTable
+from wavebatch.errors import ConfigError
 from wavebatch.kernels.cluster import estimate_starts, find_runs
 from wavebatch.kernels.filters import (
     curvature_taps,
@@ -117,7 +118,7 @@ def constant_fraction(
     level: least height above the baseline, in standard deviations of the smoothed noise.
     """
     if not 0 < fraction < 1:
-        raise ValueError(f"fraction must lie between 0 and 1, got {fraction}")
+        raise ConfigError(f"fraction must lie between 0 and 1, got {fraction}")
     smoothed = smooth_121(signal_above(block, noise))
     n = smoothed.shape[1]
     ref = system.sigma_ref / block.spacing

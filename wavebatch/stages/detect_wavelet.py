@@ -9,6 +9,7 @@ import numpy as np
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
 from wavebatch.echoes import EchoTable
+from wavebatch.errors import ConfigError
 from wavebatch.kernels.deconvolve import deconvolve_richardson_lucy
 from wavebatch.kernels.filters import curvature_taps, filter_energy, filter_symmetric, refine_peaks
 from wavebatch.kernels.runs import list_samples
@@ -19,6 +20,9 @@ from wavebatch.stages.reference import reference_pulse
 
 HAT_WIDTH = 0.75
 """Width of the Mexican hat that counts like the B3 wavelet, in system widths (ALGORITHMS 1.2)."""
+
+COARSEST = 15
+"""Level of the B3 transform that spans the longest waveforms."""
 
 AT_A_TIME = 1024
 """Waveforms whose arrays stay in the cache together."""
@@ -47,6 +51,8 @@ def wavelet(
     signal = signal_above(block, noise)
     if wavelet == "b3":
         level = max(round(scale), 1) if scale > 0 else b3_level(ref)
+        if level > COARSEST:
+            raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
         detail, gain = b3_detail(signal, level), b3_gain(level)
     else:
         taps = curvature_taps(max(scale / block.spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
