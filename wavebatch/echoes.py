@@ -51,6 +51,15 @@ FLAG_MEANINGS: dict[EchoFlag, str] = {
     EchoFlag.RETURN_LIMIT: "return number exceeds what the point format can hold; written as the largest",
 }
 
+UNCLEAN = (
+    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
+    | EchoFlag.AT_BOUND
+)  # fmt: skip
+"""Echoes with one of these say little of sensor and surface: their width or amplitude is not that of one echo."""
+
+PASSED_THROUGH = EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO
+"""Points with one of these are not echoes that somebody found."""
+
 
 @dataclass(frozen=True, slots=True)
 class Column:

@@ -13,16 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoFlag
+from wavebatch.echoes import UNCLEAN
 from wavebatch.kernels.incidence import spread_of_angle
 from wavebatch.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 from wavebatch.stages.angle import added_variance
 from wavebatch.stages.physics import is_alone, level_angle
-
-_UNCLEAN = (
-    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
-    | EchoFlag.AT_BOUND
-)  # fmt: skip
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
@@ -73,7 +68,7 @@ def _measure(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     system = replace(system, level_variance=0.0, width_scatter=0.0)
     echoes = decompose_sample(block, system)
     clean = is_alone(block, echoes) & (echoes.amplitude > MIN_SNR * system.noise_std)
-    echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(_UNCLEAN)) == 0)))
+    echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
     off = block.origin[row] + block.direction[row] * echoes.time[:, None] - block.sensor[row]

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
-from wavebatch.echoes import EchoFlag
+from wavebatch.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.io.returnfile import ReturnReader
@@ -19,7 +19,6 @@ from wavebatch.units import HALF_C
 _BIN = 0.01
 _BINS = 10_000
 _MOST_PAIR = 15
-_PASSED = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
 _LEAST_PAIRS = 100
 _EDGE = 0.001
@@ -145,7 +144,7 @@ def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
     shaped["key"] = key
     for name in ("xyz", "number", "total"):
         shaped[name] = rows[name]
-    shaped["echo"] = (rows["flags"] & _PASSED) == 0
+    shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
     return shaped
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.learning import find_isolated, find_strong, learn_pulse
 from wavebatch.measuring import (
     ENOUGH_TO_LEARN,
@@ -30,12 +30,6 @@ SAMPLE = 8192
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
-
-
-_UNCLEAN = (
-    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
-    | EchoFlag.AT_BOUND
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +165,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     From those narrower than the system pulse: slopes and plants only widen. 0 with too few of them.
     """
     clear = (echoes.count(len(block))[echoes.waveform] == 1) & (echoes.amplitude > MIN_SNR * system.noise_std)
-    clear &= (echoes.flags & np.uint16(_UNCLEAN)) == 0
+    clear &= (echoes.flags & np.uint16(UNCLEAN)) == 0
     below = clear & (echoes.sigma < system.sigma_ref)
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:
         return 0.0

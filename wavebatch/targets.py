@@ -16,7 +16,7 @@ from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.config import load_profile
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.errors import ConfigError, InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.strip import StripReader
@@ -37,10 +37,6 @@ SCANNERS = 4
 
 _CORNERS = 64
 _BLOCK = 8192
-_UNCLEAN = (
-    EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
-    | EchoFlag.AT_BOUND | EchoFlag.UNANCHORED
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +186,7 @@ def _collect(
 
 def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Target], found: list[_Found]) -> None:
     alone = echoes.count(len(block))[echoes.waveform] == 1
-    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(_UNCLEAN)) == 0)))
+    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     xyz = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
     ray = xyz - block.sensor[echoes.waveform]
     distance = np.sqrt((ray * ray).sum(axis=1))

@@ -90,7 +90,9 @@ def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally
     """Adds the echoes that both clouds have, bucket by bucket of pulses."""
     for cloud in (widths, normals):
         if not cloud.has_gps_time:
-            raise InputError(f"{cloud.path}: has no GPS times, by which echoes of two clouds are matched")
+            raise InputError(
+                f"{cloud.path}: has no GPS times, by which echoes of two clouds are matched; write one cloud of both"
+            )
     number = count_buckets(max(widths.point_count, normals.point_count))
     with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
         for cloud, buckets in ((widths, first), (normals, second)):

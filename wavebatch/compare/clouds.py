@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.echoes import EchoFlag
+from wavebatch.echoes import PASSED_THROUGH
 from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader
 from wavebatch.units import FWHM_PER_SIGMA
-
-PASSED_THROUGH = np.uint16(EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO)
-"""Points with one of these flags are not echoes that somebody found."""
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
 PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
@@ -49,7 +46,7 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> C
 def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
     """Pieces of a cloud without the points that were passed through."""
     for rows in reader.read_pieces():
-        yield rows[(rows["flags"] & PASSED_THROUGH) == 0]
+        yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
 
 
 def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Comparison:

@@ -208,7 +208,9 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
     while np.mean(fits_keys(start - middle, step, begin, end, size)) < _MOST_FITTING:
         size *= 2
         if size > _LARGEST:
-            raise InputError(f"{path}: its coordinates are spread over more than a grid can hold: damaged")
+            raise InputError(
+                f"{path}: its coordinates are spread over more than a grid can hold; see what `wavebatch check` says"
+            )
     if size > options.size:
         raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
     return middle
