@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.blocks import WaveformBlock
+from wavebatch.blocks import ReturnTable, WaveformBlock
 from wavebatch.errors import InputError
 from wavebatch.io.crs import CrsUnits
 from wavebatch.io.rays import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
@@ -160,6 +160,10 @@ def test_height_is_the_last_resort():
     assert sensor[:3, 2] == pytest.approx(800.0)
     assert np.linalg.norm(sensor[:3], axis=1) == pytest.approx(800.0 / np.cos(0.5))
     assert np.isnan(sensor[3]).all()
+    xyz = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -14.0], [0.0, 0.0, -5.0]])
+    returns = ReturnTable(np.array([0, 0, 2], np.int32), np.array([10.0, 90.0, 30.0]), np.arange(3), xyz)
+    above = SensorSource("flight height", height=800.0).fill(replace(block, returns=returns)).sensor
+    assert above[:3, 2] == pytest.approx([786.0, 800.0, 795.0])
     assert NOBODY.fill(block).sensor is None
 
 

@@ -77,8 +77,12 @@ class SensorSource:
         if self.height is None:
             return block
         down = -block.direction[:, 2:]
+        # Waveforms begin above what they hit: the height is that above the lowest return of each packet.
+        low = block.origin[:, 2].copy()
+        if block.returns is not None:
+            np.minimum.at(low, block.returns.waveform, block.returns.xyz[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
-            back = block.direction * (self.height / down)
+            back = block.direction * ((low[:, None] + self.height - block.origin[:, 2:]) / down)
         return replace(block, sensor=np.where(down > 0, block.origin - back, np.nan))
 
     def describe(self) -> dict[str, Any]:
