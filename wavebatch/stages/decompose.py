@@ -15,7 +15,7 @@ from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit import WidthPrior
 from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal import smooth_121, transpose_samples
-from wavebatch.stages.flags import drop_unproven, flag_echoes
+from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
 from wavebatch.stages.merge import drop_twins, merge_unresolved
 from wavebatch.stages.shapes import (
     ShapeLimits,
@@ -283,7 +283,7 @@ def describe_solutions(
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system)
-    return flag_echoes(block, noise, system, table)
+    return flag_echoes(block, noise, system, clear_lone(table))
 
 
 def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
@@ -44,6 +46,15 @@ def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
     delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
     reach = max([4 * system.sigma_ref, *delays])
     return table.take(np.flatnonzero(~_faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)))
+
+
+def clear_lone(table: EchoTable) -> EchoTable:
+    """The table without OVERLAPPED where no other echo of the waveform has it: what they were fitted with is gone."""
+    overlapped = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
+    merged = (table.flags & np.uint16(EchoFlag.MERGED)) != 0
+    number = np.bincount(table.waveform[overlapped], minlength=int(table.waveform.max(initial=0)) + 1)
+    lone = overlapped & ~merged & (number[table.waveform] == 1)
+    return replace(table, flags=np.where(lone, table.flags & ~np.uint16(EchoFlag.OVERLAPPED), table.flags))
 
 
 def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: float, *, before: bool) -> np.ndarray:
