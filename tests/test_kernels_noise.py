@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.blocks import WaveformBlock
+from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.kernels.noise import estimate_noise
 from wavebatch.simulate import Recording, simulate_block
@@ -73,7 +73,7 @@ def test_coloured_noise_shows_in_the_smoothed_std(rho, factor):
     block, _ = simulate_block("flat", 4000, np.random.default_rng(5), recording=recording)
     pooled = estimate_noise(block.samples.T.astype(np.float32), 6)
     assert pooled.smoothed_std / pooled.std == pytest.approx(factor, rel=0.03)
-    assert survey.measure_block(block).noise_std >= 0.99 * pooled.smoothed_std
+    assert survey.survey_block(block).system.noise_std >= 0.99 * pooled.smoothed_std
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
@@ -85,7 +85,7 @@ def test_baselines_of_waveforms_are_recovered(spread):
     y = base + rng.standard_normal((n, 80))
     y += 90 * np.exp(-0.5 * ((np.arange(80) - rng.uniform(20, 60, (n, 1))) / 2.0) ** 2)
     block = WaveformBlock.from_samples(np.rint(y).astype(np.uint8))
-    noise = STAGES["noise.pooled"].function(block, survey.measure_block(block))
+    noise = STAGES["noise.pooled"].function(block, survey.survey_block(block).system)
     error = np.abs(noise.baseline - base[:, 0])
     own = np.hypot(1, QUANTISATION_STD) / np.sqrt(60)
     lost = error > 1
@@ -100,7 +100,7 @@ def test_tail_noise_follows_a_drifting_baseline():
     rng = np.random.default_rng(9)
     base = np.linspace(10, 90, n)[:, None]
     block = WaveformBlock.from_samples(np.rint(base + rng.standard_normal((n, 64))).astype(np.uint8))
-    noise = STAGES["noise.tail"].function(block, survey.SystemPulse(2.0, noise_std=0.5), samples=20)
+    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise_std=0.5), samples=20)
     assert np.abs(noise.baseline - base[:, 0]).max() < 1.5
     assert np.median(noise.std) == pytest.approx(1.04, rel=0.1)
 

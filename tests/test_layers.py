@@ -13,9 +13,9 @@ RANKS = [
     {"kernels", "blocks", "echoes", "trajectory", "nodata"},
     {"chain", "io", "pictures"},
     {"stages"},
-    {"config", "measuring", "learning", "survey", "systemfile", "inspection", "simulate", "evaluate", "areas",
+    {"config", "survey", "systemfile", "inspection", "simulate", "evaluate", "areas",
      "polygons", "returns", "slices", "synthesize"},
-    {"angles", "levels", "outlook", "auto", "trial", "choice", "sensor", "calibration", "plots"},
+    {"angles", "outlook", "auto", "trial", "choice", "sensor", "calibration", "plots"},
     {"targets", "voxels", "compare", "batch"},
     {"bench"},
     {"cli"},
@@ -30,6 +30,7 @@ INSIDE = {
         {"inputs", "report", "assemble"}, {"work"}, {"remarks", "secondpass"}, {"record"},
         {"task", "workers", "cluster"}, {"plan"}, {"run"},
     ],
+    "survey": [{"measuring"}, {"learning", "levels"}, {"scene"}],
     "compare": [{"differences", "breakdown", "goodness"}, {"pairing"}, {"clouds", "angles"}, {"chains"}],
 }
 """The same within packages whose modules do one thing after another."""

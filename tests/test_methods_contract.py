@@ -46,7 +46,7 @@ def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
 def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
     block = scene_blocks()["mixed"].rows(slice(0, 29))
-    system = survey.measure_block(block)
+    system = survey.survey_block(block).system
     whole = call(name, parameters, block, system)
     assert len(whole) > 15
     for size in (1, 7):
@@ -60,7 +60,7 @@ def test_parts_of_a_block_do_not_show(monkeypatch):
     from wavebatch.stages import detect_correlation, detect_wavelet
 
     block = scene_blocks()["mixed"].rows(slice(0, 60))
-    system = survey.measure_block(block)
+    system = survey.survey_block(block).system
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
     monkeypatch.setattr(detect_correlation, "COLUMNS_AT_A_TIME", 7)

@@ -20,7 +20,7 @@ from wavebatch.nodata import REASONS, NoData, count_reasons, explain
 from wavebatch.simulate.blocks import simulate_pulses
 from wavebatch.simulate.geometry import AIR_SPEED
 from wavebatch.simulate.scenes import find_scene
-from wavebatch.survey import measure_block
+from wavebatch.survey import survey_block
 from wavebatch.units import HALF_C
 
 SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
@@ -166,7 +166,7 @@ def test_angles_of_simulated_slopes():
         block = with_sensor(made)
         # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
         known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence}
-        system = system or replace(measure_block(block), **known)
+        system = system or replace(survey_block(block).system, **known)
         echoes = chain.run(block, system)
         true = np.degrees(made.rays.incidence)[echoes.waveform]
         off.append(echoes.attributes["incidence_angle"] - true)

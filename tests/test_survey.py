@@ -10,9 +10,9 @@ from wavebatch.auto import choose_chain
 from wavebatch.blocks import WaveformBlock
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.io.strip import StripReader
-from wavebatch.measuring import FIRST_LOOK
 from wavebatch.simulate import PulseModel, find_pulse
 from wavebatch.survey import join_digitizers, survey_block, survey_blocks
+from wavebatch.survey.measuring import FIRST_LOOK
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])

@@ -11,12 +11,12 @@ from helpers_scenes import make_scene
 
 from wavebatch.blocks import SystemPulse
 from wavebatch.cli import main
-from wavebatch.levels import measure_level
 from wavebatch.simulate import find_scene, simulate_strip
 from wavebatch.simulate.blocks import simulate_seed_block
 from wavebatch.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT
 from wavebatch.survey import survey_block
+from wavebatch.survey.levels import measure_level
 
 SCENE = find_scene("village")
 

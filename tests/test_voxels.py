@@ -25,7 +25,7 @@ from wavebatch.simulate.geometry import Flight
 from wavebatch.simulate.pulses import find_pulse
 from wavebatch.simulate.render import Recording
 from wavebatch.simulate.strip import WKT, StripOptions
-from wavebatch.survey import Survey, measure_block
+from wavebatch.survey import Survey, survey_block
 from wavebatch.systemfile import SavedSurvey
 from wavebatch.units import HALF_C, SQRT_2PI
 from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
@@ -122,7 +122,7 @@ def test_energy_is_that_of_the_echoes(scene, least, most, seed):
 def test_energy_of_learned_pulses_is_that_of_the_waveforms(name, seed):
     recording = Recording(n_samples=160, pulse=find_pulse(name), baseline_spread=0.0)
     block, truth = simulate_block("flat", 3000, np.random.default_rng(seed), recording=recording)
-    system = measure_block(block)
+    system = survey_block(block).system
     assert len(system.components) > 1
     profiles = deconvolve_block(block, system, Deconvolution())
     energy = profiles.value.sum() * profiles.area

@@ -8,9 +8,9 @@ from wavebatch.angles import predict_angles
 from wavebatch.auto import ANGLE
 from wavebatch.choice import sample_size
 from wavebatch.io.strip import StripReader, StripScan
-from wavebatch.levels import measure_level
 from wavebatch.sensor import SensorRequest, find_sensor
 from wavebatch.survey import Decision, Survey
+from wavebatch.survey.levels import measure_level
 
 
 def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float) -> Survey:

@@ -24,8 +24,8 @@ from wavebatch.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.errors import ConfigError
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
-from wavebatch.levels import measure_level
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.survey.levels import measure_level
 from wavebatch.words import nearest
 
 BLOCK_SAMPLES = 1 << 22

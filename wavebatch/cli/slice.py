@@ -14,7 +14,7 @@ from wavebatch.errors import InputError
 from wavebatch.io.publish import refuse_existing
 from wavebatch.io.strip import StripReader
 from wavebatch.slices import SegmentWriter, SliceOptions, cut_slice, draw_slice, find_segments, read_scan_lines
-from wavebatch.survey import measure
+from wavebatch.survey import survey_blocks
 
 _SURVEYED = 2000
 
@@ -71,7 +71,7 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
         scan = reader.scan()
         sigma = options["sigma"]
         if sigma is None:
-            sigma = measure(reader.sample_blocks(scan, _SURVEYED), learn=False).sigma_ref
+            sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
         settings = SliceOptions(options["geometry"], options["std"], sigma, options["shortest"], options["most"])
         counts = _find(reader, scan, settings, output, lines, png, options["overwrite"])
     if not counts["lines"]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from wavebatch.units import FWHM_PER_SIGMA
 
@@ -245,6 +244,9 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
 
     Height, place of the peak and width are taken out of it.
     """
+    # SciPy's interpolate takes longer to import than a small block to decompose: only who needs it pays.
+    from scipy.interpolate import CubicSpline
+
     step = x[1] - x[0]
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
     spline = CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))

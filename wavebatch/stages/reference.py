@@ -66,5 +66,5 @@ def _read_pulse(text: str) -> Reference:
         samples = np.append(samples, 0.0)
     samples = samples / samples.max()
     top = np.array([int(np.argmax(samples))])
-    peak, _ = refine_peaks(samples[:, None], np.zeros(1, np.int64), top)
-    return Reference(samples, float(peak[0]))
+    peak, height = refine_peaks(samples[:, None], np.zeros(1, np.int64), top)
+    return Reference(samples / height[0], float(peak[0]))

@@ -12,11 +12,11 @@ from wavebatch.errors import ConfigError
 from wavebatch.kernels.deconvolve import deconvolve_gold, deconvolve_richardson_lucy, deconvolve_wiener, wiener_taps
 from wavebatch.kernels.profiles import fit_height, keep_signal, measure_offsets, window_signal
 from wavebatch.kernels.signal import SMOOTH_GAIN, smooth_121, widen
-from wavebatch.learning import AFTER, BEFORE
 from wavebatch.stages.candidates import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.reference import reference_pulse
 from wavebatch.stages.shapes import clip_level
+from wavebatch.survey.learning import AFTER, BEFORE
 
 METHODS = ("richardson_lucy", "gold", "wiener")
 ITERATIONS = {"richardson_lucy": 40, "gold": 100}

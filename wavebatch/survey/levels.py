@@ -15,9 +15,9 @@ import numpy as np
 from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.echoes import UNCLEAN
 from wavebatch.kernels.incidence import spread_of_angle
-from wavebatch.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 from wavebatch.stages.angle import added_variance
 from wavebatch.stages.physics import is_alone, level_angle
+from wavebatch.survey.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""

@@ -9,8 +9,9 @@ import numpy as np
 
 from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.learning import find_isolated, find_strong, learn_pulse
-from wavebatch.measuring import (
+from wavebatch.stages.shapes import clip_level
+from wavebatch.survey.learning import find_isolated, find_strong, learn_pulse
+from wavebatch.survey.measuring import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
@@ -23,7 +24,6 @@ from wavebatch.measuring import (
     measure_residuals,
     thin_block,
 )
-from wavebatch.stages.shapes import clip_level
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -50,11 +50,6 @@ class Survey:
     figures: Mapping[str, float]
     """Shares of the scene, isolated echoes, amplitudes, and the misfit of every pulse model tried."""
     decisions: tuple[Decision, ...]
-
-
-def measure(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> SystemPulse:
-    """The strip's system pulse from blocks sampled over it (see `survey_blocks`)."""
-    return survey_blocks(blocks, learn=learn).system
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
@@ -131,11 +126,6 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     noise = measure_gaussian(block, system.sigma_ref / block.spacing)
     kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "saturation")
     return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
-
-
-def measure_block(block: WaveformBlock, *, learn: bool = True) -> SystemPulse:
-    """The system pulse from one block of waveforms (see `survey_block`)."""
-    return survey_block(block, learn=learn).system
 
 
 def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
