@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
 
@@ -101,7 +101,7 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
         return (p[0] * pulse - stack.value) * weight
 
     low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
-    result = least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
+    result = scipy.optimize.least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
     amplitude, delay, sigma, kappa = result.x
     rms = float(np.sqrt(np.mean((misfit(result.x) / weight) ** 2)))
     return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
@@ -132,7 +132,7 @@ def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200
     width = abs(start[2])
     low = np.tile([-1.0, stack.lag[0], 0.35 * width], len(start) // 3)
     high = np.tile([2.0, stack.lag[-1], 12.0 * width], len(start) // 3)
-    result = least_squares(
+    result = scipy.optimize.least_squares(
         lambda p: (_sum(p, stack.lag) - stack.value) * weight,
         np.clip(start, low, high),
         jac=lambda p: _slopes(p, stack.lag) * weight[:, None],

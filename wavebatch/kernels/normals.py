@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.incidence import STEEPEST
 from wavebatch.kernels.planes import fit_planes, is_flat, measure_angles
@@ -63,14 +63,15 @@ class Surroundings:
 
     def __init__(self, xyz: np.ndarray) -> None:
         self._xyz = np.ascontiguousarray(xyz, np.float64)
-        self._tree = cKDTree(self._xyz, balanced_tree=False, compact_nodes=False)
+        self._tree = scipy.spatial.cKDTree(self._xyz, balanced_tree=False, compact_nodes=False)
 
     def find(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Pairs (point, neighbour) at most `radius` apart, sorted: numbers of points (k,), and offsets [m] (k, 3)."""
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
         # The tree rounds distances as its own boxes make it; the exact test below is the same in every tree.
-        near = cKDTree(points).sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
+        tree = scipy.spatial.cKDTree(points)
+        near = tree.sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
         key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])
         point, neighbour = np.divmod(key, len(self._xyz))
         offset = self._xyz[neighbour] - points[point]

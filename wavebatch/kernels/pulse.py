@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.units import FWHM_PER_SIGMA
 
@@ -244,12 +245,9 @@ def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
 
     Height, place of the peak and width are taken out of it.
     """
-    # SciPy's interpolate takes longer to import than a small block to decompose: only who needs it pays.
-    from scipy.interpolate import CubicSpline
-
     step = x[1] - x[0]
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])
-    spline = CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
+    spline = scipy.interpolate.CubicSpline(x, np.concatenate([np.zeros(3), value, np.zeros(3)]))
     fine = np.arange(x[0], x[-1], step / 64)
     height, peak, full, _ = _measure_one(spline(fine), fine)
     unit = full / FWHM_PER_SIGMA
