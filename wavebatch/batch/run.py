@@ -217,4 +217,6 @@ class _Batch:
         else:
             told = outcome.report.to_json()
             more = {"counts": told["counts"], "remarks": told["remarks"], "warnings": strip.warnings}
+            if strip.prepared is not None:
+                more["sensor"] = strip.prepared.sensor.describe()
             self._tell({**event, **more})

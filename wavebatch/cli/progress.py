@@ -70,8 +70,8 @@ class Progress:
         elif kind == "written" and self._level >= 0:
             self._say(printable(_summary(event, self._level > 0)))
             warnings = [f"warning: {line}" for line in event["warnings"]]
-            reasons = [*_reasons(event["counts"]["no_data"])] * (self._level > 0)
-            for line in [*warnings, *reasons, *event["remarks"]]:
+            more = [*_tell_sensor(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
+            for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is there already"))
@@ -100,6 +100,21 @@ def _size(path: Path) -> int:
 def _place(strip: str, line: str) -> str:
     """The line with the strip in front, unless it names it already."""
     return line if strip in line else f"{strip}: {line}"
+
+
+def _tell_sensor(sensor: dict[str, Any]) -> Iterator[str]:
+    """Where the sensor was, and how one knows."""
+    words = {
+        "distance_m": "{:.0f} m away",
+        "height_m": "{:.0f} m above the points",
+        "speed_m_s": "{:.1f} m/s",
+        "heading_deg": "heading {:.0f} degrees",
+        "smoothness_m": "smooth to {:.3f} m",
+        "range_error_m": "ranges to {:.3f} m",
+    }
+    told = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
+    if told:
+        yield f"sensor from {sensor['source']}: {', '.join(told)}"
 
 
 def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
