@@ -97,6 +97,15 @@ def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
     assert any(line.startswith("limit") for line in whole.warnings)
 
 
+@pytest.mark.parametrize(("deep", "limited"), [(1, False), (40, True)])
+def test_a_few_deep_pulses_are_no_limit_of_the_sensor(tmp_path, deep, limited):
+    count = np.r_[np.ones(50, int), np.full(deep, 4)]
+    number = np.concatenate([np.arange(1, n + 1) for n in count])
+    total, time = np.repeat(count, count), np.repeat(1.0 + np.arange(len(count)), count)
+    found = count_returns([write_cloud(tmp_path / "c.las", time, -2.0 * number, number, total)])[1]
+    assert any(line.startswith("limit") for line in found.warnings) == limited
+
+
 def test_flags_are_counted_and_points_without_echo_are_no_pair(tmp_path):
     flags = [0, EchoFlag.NO_ECHO, 0, EchoFlag.WEAK | EchoFlag.OVERLAPPED, EchoFlag.OVERLAPPED, 0, 0]
     found = count_returns([write_cloud(tmp_path / "c.las", **SMALL, flags=flags)])[1]

@@ -24,6 +24,9 @@ _LEAST_PAIRS = 100
 _EDGE = 0.001
 """Share of the separations that may lie below what is called the dead zone: a few doubled points do not hide it."""
 
+_SURE = 3.0
+"""Standard deviations by which more pulses must have the most returns than one less, to be a limit of the sensor."""
+
 
 @dataclass(frozen=True, slots=True)
 class Separation:
@@ -266,7 +269,8 @@ class _Tally:
                 f"would be {hidden:.3f} more returns per pulse"
             )
         most = int(np.flatnonzero(self.by_count).max(initial=0))
-        if most >= 3 and self.by_count[most] > self.by_count[most - 1]:
+        last, before = int(self.by_count[most]), int(self.by_count[max(most - 1, 0)])
+        if most >= 3 and last - before > _SURE * math.sqrt(last + before):
             lines.append(
                 f"limit: {self.by_count[most] / pulses:.1%} of the pulses have {most} returns, more than have "
                 f"{most - 1}; the sensor records no more than {most}, and what lies behind is not there"
