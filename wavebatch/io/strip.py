@@ -19,6 +19,7 @@ from wavebatch.io.rawbytes import take_records, widen
 from wavebatch.io.scan import StripScan, raise_problem
 from wavebatch.io.scanner import locate, scan_strip, unique_entries
 from wavebatch.io.sharing import expand, group_keys
+from wavebatch.kernels.signal import recorded_lengths
 from wavebatch.units import PS_PER_NS
 
 __all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
@@ -196,7 +197,7 @@ class StripReader:
                 return
 
     def read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
-        """As `read_blocks`, of the packets `rows` (k,) of the unit only."""
+        """As `read_blocks`, of the packets `rows` (k,) of the unit only; zeros that only fill packets are left out."""
         geometry = _Geometry(unit, self.facts)
         table = unit.packets
         kinds = (table.digitizer[rows].astype(np.int64) << 32) | table.n_samples[rows]
@@ -211,7 +212,13 @@ class StripReader:
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
                 samples = self._packets.read(table.offset[chosen], n_samples, digitizer.bits)
-                yield geometry.build_block(chosen, digitizer, samples), chosen
+                length = recorded_lengths(samples)
+                for recorded in np.unique(length).tolist():
+                    part = np.flatnonzero(length == recorded)
+                    kept = samples if len(part) == len(chosen) else samples[part]
+                    kept = np.ascontiguousarray(kept[:, :recorded])
+                    kept.flags.writeable = False
+                    yield geometry.build_block(chosen[part], digitizer, kept), chosen[part]
 
 
 class _Geometry:

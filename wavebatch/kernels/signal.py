@@ -8,6 +8,30 @@ SMOOTH_GAIN = np.sqrt(6.0) / 4.0
 """Standard deviation of white noise after one pass of the [1 2 1]/4 filter (0.61237)."""
 
 
+LEAST_PADDING, LEAST_RECORDED, LEAST_LEVEL = 8, 16, 3
+"""Zeros at the end of a waveform that are padding: so many, behind so many samples that are all at least so high."""
+
+
+def recorded_lengths(samples: np.ndarray) -> np.ndarray:
+    """Samples of each waveform before the zeros that fill it up to the length of its packet, i8 (n,).
+
+    samples: raw counts (n, s). Zeros belong to a recording whose level reaches down to them: they are padding only
+    where nothing before them comes near.
+    """
+    n, s = samples.shape
+    length = np.full(n, s, np.int64)
+    if s < LEAST_RECORDED + LEAST_PADDING:
+        return length
+    rows = np.flatnonzero(samples[:, -1] == 0)
+    rows = rows[(samples[rows, -LEAST_PADDING:] == 0).all(axis=1)]
+    if len(rows):
+        real = s - np.argmax(samples[rows, ::-1] != 0, axis=1)
+        low = (samples[rows] < LEAST_LEVEL) & (np.arange(s) < real[:, None])
+        padded = (real < s) & (real >= LEAST_RECORDED) & ~low.any(axis=1)
+        length[rows[padded]] = real[padded]
+    return length
+
+
 def transpose_samples(samples: np.ndarray) -> np.ndarray:
     """Raw counts (n, s) as contiguous float32 (s, n)."""
     return samples.T.astype(np.float32, order="C")

@@ -66,23 +66,41 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
 
 
 def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
-    """The samples of each digitizer, those of its commonest length, as one block; the largest first.
+    """The samples of each digitizer as one block, cut to one length; the largest first.
 
     Samples of long waveforms count up to 256 each: it takes many waveforms to learn a pulse.
     """
-    groups: dict[tuple[int, int], list[WaveformBlock]] = {}
+    groups: dict[int, list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
-            groups.setdefault((block.digitizer.index, block.samples.shape[1]), []).append(block)
-    sizes = {key: sum(map(len, group)) * min(key[1], COUNTED) for key, group in groups.items()}
-    largest: dict[int, WaveformBlock] = {}
-    for key in sorted(groups, key=lambda key: (-sizes[key], key)):
-        if key[0] not in largest:
-            digitizer = groups[key][0].digitizer
-            samples = np.concatenate([block.samples for block in groups[key]])
-            block = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
-            largest[key[0]] = replace(block, digitizer=replace(digitizer, n_samples=key[1]))
-    return list(largest.values())
+            groups.setdefault(block.digitizer.index, []).append(block)
+    joined = [_join(group) for _, group in sorted(groups.items())]
+    return sorted(joined, key=lambda block: -_weigh(block.samples.shape[1], len(block)))
+
+
+def _join(group: list[WaveformBlock]) -> WaveformBlock:
+    """Waveforms of one digitizer as one block: those of the length with most samples, if these are half of all.
+
+    Otherwise those that are long enough, cut to the length that keeps most samples.
+    """
+    lengths = np.repeat([block.samples.shape[1] for block in group], [len(block) for block in group])
+    kinds, numbers = np.unique(lengths, return_counts=True)
+    weights = [_weigh(*kind) for kind in zip(kinds.tolist(), numbers.tolist(), strict=True)]
+    longest = int(kinds[np.argmax(weights)])
+    if 2 * max(weights) < sum(weights):
+        weights = [_weigh(s, int(np.count_nonzero(lengths >= s))) for s in kinds.tolist()]
+        length, longest = int(kinds[np.argmax(weights)]), int(kinds[-1])
+    else:
+        length = longest
+    digitizer = replace(group[0].digitizer, n_samples=length)
+    chosen = [block.samples[:, :length] for block in group if length <= block.samples.shape[1] <= longest]
+    block = WaveformBlock.from_samples(np.concatenate(chosen), spacing=digitizer.spacing, bits=digitizer.bits)
+    return replace(block, digitizer=digitizer)
+
+
+def _weigh(length: int, number: int) -> int:
+    """Samples that count for a survey."""
+    return min(length, COUNTED) * number
 
 
 def _add_digitizers(found: Survey, main: WaveformBlock, others: list[WaveformBlock], *, learn: bool) -> Survey:
