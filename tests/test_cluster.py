@@ -116,23 +116,37 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
     from wavebatch.batch.run import run_batch
     from wavebatch.batch.task import BatchOptions
 
-    seen = []
     with distributed.Client(dask.address, set_as_default=False) as client:
+        client.wait_for_workers(2)
         client.run(_spool_everything)
         try:
-            options = BatchOptions(tmp_path, scheduler=dask.address)
-            result = run_batch([make_job(strips / "b.las")], options, lambda _: seen.extend(tmp_path.rglob("spool")))
+            result = run_batch([make_job(strips / "b.las")], BatchOptions(tmp_path, scheduler=dask.address))
         finally:
-            client.run(_spool_everything, 1 << 20)
+            made = [folder for folders in client.run(_spool_as_ever).values() for folder in folders]
     assert result.outcomes[0].error is None
-    assert seen, "nothing was spooled"
+    assert made and all(folder.startswith(str(tmp_path)) for folder in made)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.laz", "b.report.json"]
 
 
-def _spool_everything(kept=0):
-    from wavebatch.io import spool
+def _spool_everything():
+    """Makes a worker spool to disk, and note where."""
+    from wavebatch.io import scratch, spool
 
-    spool.KEPT = kept
+    spool.made, spool.kept, spool.KEPT = [], spool.KEPT, 0
+
+    def make_folder():
+        spool.made.append(str(scratch.make_folder()))
+        return scratch.Path(spool.made[-1])
+
+    spool.make_folder = make_folder
+
+
+def _spool_as_ever():
+    """Takes that back; the folders that were made."""
+    from wavebatch.io import scratch, spool
+
+    spool.KEPT, spool.make_folder = spool.kept, scratch.make_folder
+    return spool.made
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://none.invalid:8786", "tcp://", "a:b"])
