@@ -61,8 +61,9 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
     main, *others = join_digitizers(blocks) or [None]
     if main is None:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
-    found = survey_block(main, learn=learn)
-    return _add_digitizers(found, main, others, learn=learn) if others else found
+    plain = measure_gaussian(main)
+    found = _survey(main, plain, learn=learn)
+    return _add_digitizers(found, plain, main, others, learn=learn) if others else found
 
 
 def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
@@ -86,15 +87,16 @@ def _join(group: list[WaveformBlock]) -> WaveformBlock:
     lengths = np.repeat([block.samples.shape[1] for block in group], [len(block) for block in group])
     kinds, numbers = np.unique(lengths, return_counts=True)
     weights = [_weigh(*kind) for kind in zip(kinds.tolist(), numbers.tolist(), strict=True)]
-    longest = int(kinds[np.argmax(weights)])
-    if 2 * max(weights) < sum(weights):
-        weights = [_weigh(s, int(np.count_nonzero(lengths >= s))) for s in kinds.tolist()]
-        length, longest = int(kinds[np.argmax(weights)]), int(kinds[-1])
+    length = int(kinds[np.argmax(weights)])
+    if 2 * max(weights) >= sum(weights):
+        kept = [block for block in group if block.samples.shape[1] == length]
     else:
-        length = longest
+        weights = [_weigh(s, int(np.count_nonzero(lengths >= s))) for s in kinds.tolist()]
+        length = int(kinds[np.argmax(weights)])
+        kept = [block for block in group if block.samples.shape[1] >= length]
     digitizer = replace(group[0].digitizer, n_samples=length)
-    chosen = [block.samples[:, :length] for block in group if length <= block.samples.shape[1] <= longest]
-    block = WaveformBlock.from_samples(np.concatenate(chosen), spacing=digitizer.spacing, bits=digitizer.bits)
+    samples = np.concatenate([block.samples[:, :length] for block in kept])
+    block = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
     return replace(block, digitizer=digitizer)
 
 
@@ -103,9 +105,13 @@ def _weigh(length: int, number: int) -> int:
     return min(length, COUNTED) * number
 
 
-def _add_digitizers(found: Survey, main: WaveformBlock, others: list[WaveformBlock], *, learn: bool) -> Survey:
-    """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see."""
-    plain = measure_gaussian(main)
+def _add_digitizers(
+    found: Survey, plain: SystemPulse, main: WaveformBlock, others: list[WaveformBlock], *, learn: bool
+) -> Survey:
+    """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see.
+
+    plain: of the main one, as `measure_gaussian` finds it.
+    """
     systems, counts, scenes = {}, [len(main)], [found.figures]
     for block in others:
         own = found.system
@@ -150,7 +156,11 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
-    system = measure_gaussian(block)
+    return _survey(block, measure_gaussian(block), learn=learn)
+
+
+def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
+    """As survey_block, from noise and width as `measure_gaussian` finds them."""
     figures: dict[str, float] = {}
     if learn:
         main = find_isolated(block, system)
