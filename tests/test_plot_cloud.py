@@ -8,7 +8,7 @@ import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from wavebatch.cli import main
@@ -122,6 +122,9 @@ def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
 
 
 @settings(max_examples=200, deadline=None)
+@example(low=0.0, span=5e-324, step=0.0, bins=None, exact=False)
+@example(low=1e-310, span=9e-301, step=0.0, bins=None, exact=False)
+@example(low=0.0, span=1e-299, step=0.0, bins=None, exact=False)
 @given(
     low=st.floats(-1e9, 1e9),
     span=st.floats(0, 1e9),

@@ -24,6 +24,9 @@ _MOST_STEPS = 1e15
 
 PERCENTILES = (5.0, 50.0, 95.0)
 
+_LEAST_SPAN = 1e-300
+"""Range below which values are one: numbers are too coarse there to be divided into bins."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Histogram:
@@ -136,8 +139,8 @@ def place_edges(
     looks fuller than its neighbours: edges lie half a step beside values, the outer ones a little outside. exact:
     without steps the outer edges are low and high; else bins of a width that is chosen lie on multiples of it.
     """
-    if high <= low:
-        half = 0.5 * step or 1e-3 * abs(low) or 0.5
+    if high - low < _LEAST_SPAN:
+        half = max(0.5 * step or 1e-3 * abs(low) or 0.5, high - low)
         return np.array([low - half, low + half])
     width = (high - low) / bins if bins else _choose_width(sample, high - low)
     if step > 0 and max(abs(low), abs(high)) / step < _MOST_STEPS:
