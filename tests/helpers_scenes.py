@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from wavebatch.blocks import WaveformBlock
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate import Scene, find_scene, simulate_blocks
 
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.config import load_profile
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.evaluate import score
-from wavebatch.kernels.bounds import crlb
+from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.simulate import Recording, find_scene, simulate_block
 from wavebatch.stages.merge import merge_unresolved
 

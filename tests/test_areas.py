@@ -13,7 +13,7 @@ from wavebatch import areas as module
 from wavebatch import returns
 from wavebatch.areas import Grid, PolygonSet
 from wavebatch.cli.stats import SHOWN, stats
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 from wavebatch.io import buckets
 from wavebatch.polygons import Polygon, find_inside, load_polygons
 from wavebatch.returns import count_returns

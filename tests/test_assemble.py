@@ -9,10 +9,10 @@ from batch_tools import make_job, read_cloud, run_one
 
 from wavebatch.batch.assemble import assemble_returns, gather_echoes
 from wavebatch.batch.work import prepare_strip
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import StageError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import StageError
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.pulses import LONGEST_PULSE
+from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
 
 
 def _spoil(points):

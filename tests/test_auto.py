@@ -7,8 +7,8 @@ import pytest
 from helpers_scenes import make_block, make_scene
 
 from wavebatch.auto import LOST, chain_text, choose_chain, decide, left_out, widest_chain, without_columns
-from wavebatch.blocks import SystemPulse
 from wavebatch.config import load_profile, parse_chain
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.evaluate import score
 from wavebatch.simulate import find_pulse
 from wavebatch.survey import Decision, Survey, survey_block

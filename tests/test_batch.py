@@ -12,7 +12,7 @@ from wavebatch.batch.plan import LEAST_MEMORY, check_outputs, plan_memory, plan_
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.task import BatchOptions, StripTask
 from wavebatch.batch.work import RunOptions, choose_columns, prepare_strip
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.writer import read_provenance
 
 

@@ -18,11 +18,11 @@ from wavebatch.bench.scenes import find_bench_scene, shape_scene
 from wavebatch.bench.stability import FAILURES, count_changes, count_failures, list_cases
 from wavebatch.bench.table import format_document
 from wavebatch.bench.worker import Worker, WorkerDied, peak_memory
-from wavebatch.blocks import SystemPulse
 from wavebatch.cli import main
 from wavebatch.config import load_profile
-from wavebatch.echoes import EchoTable
-from wavebatch.errors import ConfigError, InputError, StageError
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
 from wavebatch.survey import Survey
 

@@ -9,9 +9,9 @@ from wavebatch.bench.figures import SURVEY_SCATTER, Figure, median_range, root_m
 from wavebatch.bench.pareto import choose_cheapest, find_front, parse_length
 from wavebatch.bench.promises import format_promises, judge
 from wavebatch.bench.truth import describe_truth, effective_noise, find_bounds
-from wavebatch.echoes import EchoTable
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.bounds import crlb, crlb_joint
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.kernels.fit.bounds import crlb, crlb_joint
 from wavebatch.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.simulate.render import paint_echoes
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.bounds import bound_amplitude, bound_energy, crlb, crlb_joint
+from wavebatch.kernels.fit.bounds import bound_amplitude, bound_energy, crlb, crlb_joint
 
 
 def numeric_bounds(parameters, noise_std, spacing, n_samples):

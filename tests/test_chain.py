@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from wavebatch import chain as chain_module
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import KINDS, STAGES, Chain, Step, stage
 from wavebatch.config import list_profiles, load_profile
-from wavebatch.echoes import EchoTable
-from wavebatch.errors import ConfigError, StageError
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, noise_std=1.0)
 

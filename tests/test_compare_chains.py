@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
 from wavebatch.compare import chains
 from wavebatch.compare.chains import ChainRun, Contender, find_contender, match_chains, match_sides
 from wavebatch.compare.clouds import compare_clouds
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.strip import StripReader
 
 

@@ -9,11 +9,11 @@ import pytest
 from wavebatch.compare import pairing
 from wavebatch.compare.clouds import compare_clouds, compare_truth
 from wavebatch.compare.differences import SPEED, Differences, measure_lag
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io import buckets
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
-from wavebatch.kernels.bounds import crlb
+from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.simulate import StripOptions, TruthReader, simulate_strip
 
 

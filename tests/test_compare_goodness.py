@@ -4,10 +4,10 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Step
 from wavebatch.compare.goodness import FitQuality, measure_fit
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.models import MODELS, rebuild_waveforms
 
 FINE = 100.0

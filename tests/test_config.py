@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain
 from wavebatch.config import effective, list_profiles, load_chain, load_profile, parse_chain
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 
 GOOD = """
 [[chain]]
@@ -130,7 +130,7 @@ def test_choices_are_checked(monkeypatch):
     from typing import Literal
 
     import wavebatch.chain as chain_module
-    from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
+    from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
     monkeypatch.setattr(chain_module, "STAGES", STAGES.copy())
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.convergence import fit_best, fit_sensor, pairs_of_returns, range_error, sensor_at
+from wavebatch.kernels.geometry.ray_convergence import fit_best, fit_sensor, pairs_of_returns, range_error, sensor_at
 
 START = np.array([5e5, 5.4e6, 1000.0])
 

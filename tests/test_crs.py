@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strips import descriptor, make_raw, vlr
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.cli import main
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.io.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate.strip import WKT
 from wavebatch.stages.attributes import position
-from wavebatch.units import HALF_C
 
 US = 1200 / 3937
 GEOG = 'GEOGCS["NAD83",DATUM["D",SPHEROID["GRS 1980",6378137,298.257222101]],UNIT["degree",0.0174532925199433]]'

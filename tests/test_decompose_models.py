@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.fit import Windows
-from wavebatch.kernels.gauss_newton import step_undamped
-from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.gauss_newton import step_undamped
+from wavebatch.kernels.fit.least_squares import Windows
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.simulate.papers import PULSE_SIGMA
-from wavebatch.units import HALF_C
 
 FINE = 100.0
 """Counts per unit of amplitude."""

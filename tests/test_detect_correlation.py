@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.evaluate import match_echoes
-from wavebatch.kernels.asdf import (
+from wavebatch.kernels.signal.square_differences import (
     find_minima,
     keep_prominent,
     pad_samples,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import Noise, WaveformBlock
 from wavebatch.chain import STAGES
+from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import PULSE_SIGMA as SIGMA
 

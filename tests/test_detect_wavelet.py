@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from wavebatch import stages  # noqa: F401
-from wavebatch.blocks import SystemPulse
 from wavebatch.chain import STAGES
-from wavebatch.kernels.deconvolve import (
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.signal.deconvolve import (
     convolve_pulse,
     correlate_pulse,
     deconvolve_gold,
     deconvolve_richardson_lucy,
     deconvolve_wiener,
 )
-from wavebatch.kernels.wavelet import b3_detail, b3_gain, b3_level
+from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import WANG_CASES, simulate_wang
 

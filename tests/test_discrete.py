@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli.simulate import simulate
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.returns import count_returns
 from wavebatch.simulate import DiscreteReceiver, StripOptions, find_scene, simulate_block, simulate_returns
 from wavebatch.simulate.canopy import CANOPIES

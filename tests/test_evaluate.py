@@ -9,9 +9,9 @@ from helpers_scenes import make_block, make_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.evaluate import ErrorStats, Scorer, find_isolated, list_pairs, match_echoes, score
-from wavebatch.kernels.bounds import crlb
+from wavebatch.kernels.fit.bounds import crlb
 
 
 def match_naively(found, truth, tolerance):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from writer_tools import BACKENDS, random_points, read_raw, write_strip
 
-from wavebatch.blocks import Digitizer
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.extra import ExtraRecord
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.header import find_evlrs, read_header

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.simulate import FINE, Recording, fine_recording, known_noise, known_system, simulate_echoes
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.incidence import (
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
     angles_of_variance,
     build_table,

@@ -3,7 +3,7 @@
 import pytest
 
 from wavebatch.batch.inputs import find_files, find_strips
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 
 @pytest.fixture

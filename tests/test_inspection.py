@@ -9,7 +9,7 @@ from strips import descriptor, make_raw
 from writer_tools import data_file
 
 from wavebatch.cli import main
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.inspection import check_file, describe_strip
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"

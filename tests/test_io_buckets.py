@@ -3,7 +3,7 @@ import errno
 import numpy as np
 import pytest
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.buckets import MOST_BUCKETS, Buckets, count_buckets, sort_by_time, spread_keys, time_keys
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])

@@ -9,7 +9,7 @@ import pytest
 from strips import make_raw
 from writer_tools import data_file
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.cloud import CloudReader
 from wavebatch.io.header import STANDARD_DTYPES
 from wavebatch.io.returnfile import ReturnReader

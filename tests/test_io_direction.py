@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from strips import TOWARD, make_raw, read_all
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io import sharing, strip
 from wavebatch.io.strip import StripReader
 

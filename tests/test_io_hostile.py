@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from strips import make_raw
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.inspection import check_file
 from wavebatch.io.strip import StripReader
 

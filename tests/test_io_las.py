@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from strips import make_raw, read_all, vlr
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import las
 from wavebatch.io.strip import StripReader
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.npz import NpzWriter
 
 

@@ -7,7 +7,7 @@ import pytest
 from strips import descriptor, make_raw, read_all, read_plainly, record_head, vlr
 from writer_tools import data_file
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import packets
 from wavebatch.io.packets import PacketFile, PacketPlace
 from wavebatch.io.strip import StripReader

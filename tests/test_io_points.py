@@ -11,7 +11,7 @@ import pytest
 from strips import make_raw, vlr
 from writer_tools import data_file, read_raw
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import laszippoints, lazpoints
 from wavebatch.io.las import read_checked_header
 from wavebatch.io.laszippoints import LaszipPoints

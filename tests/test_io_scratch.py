@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import scratch
 from wavebatch.io.scratch import make_folder, owning_scratch, remove_orphans, use_scratch
 from wavebatch.io.spool import Spool

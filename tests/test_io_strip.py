@@ -8,8 +8,8 @@ import pytest
 from strips import TOWARD, descriptor, make_raw, read_all, read_plainly, vlr
 from writer_tools import data_file, read_raw
 
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import InputError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import InputError
 from wavebatch.io import sharing, spool, strip
 from wavebatch.io.strip import StripReader
 

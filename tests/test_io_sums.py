@@ -5,7 +5,7 @@ import tempfile
 import numpy as np
 import pytest
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import sums as module
 from wavebatch.io.sums import KeyedSums
 

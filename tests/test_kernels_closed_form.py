@@ -4,9 +4,9 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.closed_form import fit_closed_form
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import fit_closed_form
 from wavebatch.stages.decompose import closed_form
 
 VECTOR = 37.5 * np.exp(-0.5 * ((np.arange(31) - 14.3) / 1.8) ** 2)

@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit import (
+from wavebatch.kernels.fit.least_squares import (
     OUTSIDE,
     Limits,
     WidthPrior,
@@ -14,7 +14,7 @@ from wavebatch.kernels.fit import (
     gram_matrix,
     parameter_errors,
 )
-from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 
 NOISE = 1.0
 LENGTH = 32

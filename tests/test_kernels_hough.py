@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.hough import THETA_STEP, _Accumulator, find_lines
-from wavebatch.kernels.sweep import LAG, find_sweeps
+from wavebatch.kernels.geometry.hough import THETA_STEP, _Accumulator, find_lines
+from wavebatch.kernels.geometry.scan_lines import LAG, find_sweeps
 from wavebatch.simulate.papers import paint_slice
 
 

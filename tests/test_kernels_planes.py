@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from wavebatch.kernels import normals
-from wavebatch.kernels.normals import MOST_PER_CELL, Gap, Surroundings, measure_normals, thin_out
-from wavebatch.kernels.planes import (
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels.geometry import normals
+from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, measure_normals, thin_out
+from wavebatch.kernels.geometry.planes import (
     LEAST_SPREAD,
     OUTLYING,
     SMOOTH,
@@ -16,8 +17,7 @@ from wavebatch.kernels.planes import (
     is_flat,
     measure_angles,
 )
-from wavebatch.kernels.tiles import cut_tiles, is_inside, sort_into_tiles
-from wavebatch.units import MAD_TO_STD
+from wavebatch.kernels.geometry.tiles import cut_tiles, is_inside, sort_into_tiles
 
 SETTINGS = {"radius": 1.5, "min_points": 8, "max_error": 5.0}
 

@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseShape, evaluate_pulse
 
 SHAPES = {
     "gaussian": PulseShape(),

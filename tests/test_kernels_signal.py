@@ -4,15 +4,15 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.cluster import find_runs
-from wavebatch.kernels.filters import (
+from wavebatch.kernels.fit.cluster import find_runs
+from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
     filter_symmetric,
     gaussian_taps,
     refine_peaks,
 )
-from wavebatch.kernels.signal import (
+from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     find_peaks,
     find_quiet,

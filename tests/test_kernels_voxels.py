@@ -5,9 +5,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from wavebatch.kernels import voxels
-from wavebatch.kernels.profiles import keep_signal, measure_offsets, window_signal
-from wavebatch.kernels.voxels import (
+from wavebatch.kernels.geometry import voxels
+from wavebatch.kernels.geometry.voxels import (
     KEY_BITS,
     accumulate_profile,
     cross_voxels,
@@ -18,6 +17,7 @@ from wavebatch.kernels.voxels import (
     total_until,
     unpack_index,
 )
+from wavebatch.kernels.signal.profiles import keep_signal, measure_offsets, window_signal
 
 
 def walk(start, step, begin, end, size):

@@ -5,9 +5,9 @@ import pytest
 from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
 from wavebatch import survey
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
 VARIANTS = [

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wavebatch.cli.common import print_json
-from wavebatch.nodata import NoData, count_reasons, explain, without_nan
+from wavebatch.core.no_data import NoData, count_reasons, explain, without_nan
 
 
 def test_json_has_null_for_what_is_no_number(capsys):

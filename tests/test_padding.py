@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli import main
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.signal import LEAST_LEVEL, LEAST_PADDING, LEAST_RECORDED, recorded_lengths
+from wavebatch.kernels.signal.signal import LEAST_LEVEL, LEAST_PADDING, LEAST_RECORDED, recorded_lengths
 from wavebatch.simulate import StripOptions, simulate_strip
 
 

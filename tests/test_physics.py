@@ -7,21 +7,21 @@ import pytest
 
 from wavebatch import stages  # noqa: F401 - registers them
 from wavebatch.angles import SLOPE, predict_angles
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.calibration import with_physics
 from wavebatch.chain import STAGES
 from wavebatch.config import load_profile
-from wavebatch.echoes import COLUMNS as COLUMNS_TABLE
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.io.names import describe
-from wavebatch.kernels.bounds import crlb
-from wavebatch.kernels.incidence import spread_of_angle
-from wavebatch.nodata import REASONS, NoData, count_reasons, explain
+from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.simulate.blocks import simulate_pulses
 from wavebatch.simulate.geometry import AIR_SPEED
 from wavebatch.simulate.scenes import find_scene
 from wavebatch.survey import survey_block
-from wavebatch.units import HALF_C
 
 SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
 NAMES = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")

@@ -12,9 +12,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from wavebatch.cli import main
-from wavebatch.echoes import COLUMNS, EchoFlag
-from wavebatch.errors import ConfigError, InputError
-from wavebatch.evensample import EvenSample
+from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.even_sample import EvenSample
 from wavebatch.io import cloud as io_cloud
 from wavebatch.io.columns import ColumnReader
 from wavebatch.plots import raster, values

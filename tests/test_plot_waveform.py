@@ -11,15 +11,15 @@ from click.testing import CliRunner
 from strips import make_raw
 
 from wavebatch.bench.plot import _draw_panel, _place_labels
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
 from wavebatch.config import load_profile, parse_chain
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io import strip as io_strip
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.pictures import open_picture, plain_text
 from wavebatch.plots.packets import MOST, Wanted, find_places
 from wavebatch.plots.waveform import build_views, read_views

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block
 
-from wavebatch.blocks import Noise, SystemPulse
 from wavebatch.chain import STAGES
+from wavebatch.core.waveforms import Noise, SystemPulse
 from wavebatch.stages import shapes
 
 SYSTEMS = {

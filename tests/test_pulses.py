@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.pulses import LONGEST_PULSE, find_nearest, find_pulses, number_returns
+from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE, find_nearest, find_pulses, number_returns
 
 
 def test_runs_of_equal_time_are_pulses():

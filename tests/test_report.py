@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from wavebatch.batch.report import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import StageError
-from wavebatch.units import FWHM_PER_SIGMA
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import StageError
+from wavebatch.core.units import FWHM_PER_SIGMA
 
 
 def _report(**changes):

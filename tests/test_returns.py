@@ -9,8 +9,8 @@ from click.testing import CliRunner
 
 from wavebatch import returns
 from wavebatch.cli.stats import stats
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import InputError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import InputError
 from wavebatch.io import buckets
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.header import LasHeader

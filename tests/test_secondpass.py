@@ -21,8 +21,8 @@ from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.chain import STAGES, Step
 from wavebatch.cli import main
 from wavebatch.config import parse_chain
-from wavebatch.echoes import RAY
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import RAY
+from wavebatch.core.errors import ConfigError
 from wavebatch.io import spool
 from wavebatch.io.layout import plan_output
 from wavebatch.simulate import simulate_strip

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.blocks import ReturnTable, WaveformBlock
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
+from wavebatch.core.trajectory import ADJUSTED
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.io.crs import CrsUnits
 from wavebatch.io.rays import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
 from wavebatch.io.strip import StripReader
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
-from wavebatch.trajectory import ADJUSTED
-from wavebatch.units import HALF_C
 
 
 def find(path, **request):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.radiometry import backscatter
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError
+from wavebatch.kernels.physics.radiometry import backscatter
 from wavebatch.simulate import SCENES, PulseModel, Recording, find_pulse, find_scene, shape_pulse, simulate_block
 from wavebatch.simulate.blocks import SEED_BLOCK, flag_truth, simulate_blocks
 from wavebatch.simulate.geometry import AIR_SPEED, GROUND, TERRAINS, Flight, trace_rays

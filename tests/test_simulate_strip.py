@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.simulate import StripOptions, TruthReader, simulate_strip
 from wavebatch.simulate.blocks import SEED_BLOCK
 from wavebatch.simulate.geometry import AIR_SPEED
@@ -170,7 +170,7 @@ def test_vectors_away_differ_in_sign_only(tmp_path):
 
 
 def test_close_echoes_share_a_return_of_the_strongest():
-    from wavebatch.echoes import EchoTable
+    from wavebatch.core.echoes import EchoTable
 
     recording = find_scene("mixed").recording
     truth = EchoTable.build([0, 0, 0, 1, 2, 2], [20, 22, 40, 30, -3, 50], [50, 90, 40, 2, 80, 60], [2] * 6)

@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli.slice import slice_
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import EAST, GROUND, NORTH, Flight

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.blocks import Noise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.chain import STAGES
 from wavebatch.config import list_profiles, load_profile
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.simulate import simulate_block
 
 PROFILES = list_profiles()

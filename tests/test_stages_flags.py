@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.stages.flags import clear_lone
 
 

@@ -10,11 +10,11 @@ from click.testing import CliRunner
 
 from wavebatch.cli.synthesize import synthesize
 from wavebatch.compare.clouds import compare_clouds
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.inspection import check_file
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.radar import pass_atmosphere, receive_power, spread_cross_section
-from wavebatch.kernels.rays import fit_rays, group_pulses
+from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
+from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
 from wavebatch.simulate import DiscreteReceiver, StripOptions, simulate_returns
 from wavebatch.synthesize import Radar, SynthesisOptions, synthesize_strip
 

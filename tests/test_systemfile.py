@@ -9,8 +9,8 @@ from helpers_scenes import make_block
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wavebatch.blocks import SystemPulse
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.survey import Decision, Survey, survey_block
 from wavebatch.systemfile import (
     QUANTITIES,

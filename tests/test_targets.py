@@ -10,14 +10,14 @@ from click.testing import CliRunner
 
 from wavebatch.calibration import format_calibration, load_calibration, parse_calibration
 from wavebatch.cli import main
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import MAD_TO_STD
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import find_scene, simulate_strip, strip
 from wavebatch.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS
 from wavebatch.targets import Target, fit_normal, load_targets
-from wavebatch.units import MAD_TO_STD
 
 
 def call(*arguments):

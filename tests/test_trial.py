@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.blocks import WaveformBlock
 from wavebatch.choice import COSTS
 from wavebatch.config import list_profiles, load_profile
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.evaluate import score
 from wavebatch.simulate import find_pulse, known_system
 from wavebatch.survey import survey_block
 from wavebatch.trial import Prediction, predict_errors, simulate_again
-from wavebatch.units import HALF_C
 
 CHAINS = {name: load_profile(name) for name in COSTS}
 

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 from helpers_scenes import make_scene
 
-from wavebatch.blocks import SystemPulse
 from wavebatch.cli import main
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import find_scene, simulate_strip
 from wavebatch.simulate.blocks import simulate_seed_block
 from wavebatch.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays

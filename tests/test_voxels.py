@@ -11,13 +11,14 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch.blocks import Digitizer, SystemPulse
 from wavebatch.calibration import Calibration
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C, SQRT_2PI
+from wavebatch.core.waveforms import Digitizer, SystemPulse
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.header import read_header
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.radiometry import backscatter, cross_section
+from wavebatch.kernels.physics.radiometry import backscatter, cross_section
 from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.blocks import simulate_block
@@ -27,7 +28,6 @@ from wavebatch.simulate.render import Recording
 from wavebatch.simulate.strip import WKT, StripOptions
 from wavebatch.survey import Survey, survey_block
 from wavebatch.systemfile import SavedSurvey
-from wavebatch.units import HALF_C, SQRT_2PI
 from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
 from wavebatch.voxels.ceiling import Ceiling
 from wavebatch.voxels.profile import _pulse_taps, deconvolve_block
@@ -371,7 +371,7 @@ def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target, m
     for block_size, held in ((97, 1 << 20), (600, 500), (1500, 3)):
         voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, overwrite=True, **options)
         assert (tmp_path / target).read_bytes() == whole
-    monkeypatch.setattr("wavebatch.kernels.voxels.AT_A_TIME", 700)
+    monkeypatch.setattr("wavebatch.kernels.geometry.voxels.AT_A_TIME", 700)
     voxelize(strip, tmp_path / target, 0.8, overwrite=True, **options)
     assert (tmp_path / target).read_bytes() == whole
 

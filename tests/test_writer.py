@@ -13,7 +13,7 @@ import pytest
 from writer_tools import BACKENDS, data_file, read_raw, write_source, write_strip
 
 from wavebatch import __version__
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io import laz
 from wavebatch.io.extra import ExtraRecord
 from wavebatch.io.header import Vlr, find_evlrs, read_header
@@ -484,7 +484,7 @@ FULL_DISK = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.layout import plan_output
 from wavebatch.io.writer import CloudWriter
 source, target = map(Path, sys.argv[1:3])

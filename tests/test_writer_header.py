@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from writer_tools import data_file, write_source, write_strip
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.header import HEADER_SIZES, LasHeader, Vlr, encode_evlr_header, find_evlrs, read_header
 from wavebatch.io.layout import plan_output
 

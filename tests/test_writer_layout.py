@@ -8,7 +8,7 @@ import pytest
 from numpy.lib.recfunctions import repack_fields
 from writer_tools import data_file, random_points, read_raw, write_source, write_strip
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.extra import ExtraRecord
 from wavebatch.io.header import STANDARD_DTYPES, Vlr
 from wavebatch.io.layout import plan_output

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wavebatch.echoes import COLUMNS
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.names import STYLES, describe, name_columns, normalise
 
 ALL = tuple(COLUMNS)

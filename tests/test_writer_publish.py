@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io import publish
 from wavebatch.io.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
 from wavebatch.systemfile import write_text

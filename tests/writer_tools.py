@@ -8,7 +8,7 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch.blocks import Digitizer
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.extra import build_dtype
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.header import LasHeader, Vlr, encode_evlr_header

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse
 from wavebatch.chain import Chain
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.incidence import angle_of_spread, angles_of_variance, spread_of_angle
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.angle import LEAST_WIDTH
 
 SLOPE = 30.0

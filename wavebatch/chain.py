@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
-from wavebatch.errors import ConfigError, StageError
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
 KINDS: dict[str, tuple[tuple[str, ...], type]] = {
     "noise": (("block", "system"), Noise),

@@ -11,10 +11,10 @@ import numpy as np
 
 from wavebatch import survey
 from wavebatch.auto import choose_chain, decide, widest_chain
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
 from wavebatch.config import load_profile
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.strip import StripReader, StripScan
 from wavebatch.survey import Decision, Survey
 from wavebatch.systemfile import SavedSurvey, describe_system

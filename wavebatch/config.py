@@ -12,8 +12,8 @@ from typing import Any
 
 from wavebatch import stages  # noqa: F401  (fills STAGES)
 from wavebatch.chain import STAGES, Chain, Parameter, Stage, Step
-from wavebatch.errors import ConfigError
-from wavebatch.words import nearest
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 _TYPE_WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", type(None): "nothing"}
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.bounds import crlb
-from wavebatch.units import MAD_TO_STD
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.kernels.fit.bounds import crlb
 
 TOLERANCE_NS = 1.5
 """A found and a true echo further apart than this are not the same echo."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.config import load_chain
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.audit import audit_header
 from wavebatch.io.strip import StripFacts, StripReader, StripScan
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.publish import Draft, refuse_existing, reporting
 
 if TYPE_CHECKING:

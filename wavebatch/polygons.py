@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

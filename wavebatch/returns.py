@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
-from wavebatch.echoes import PASSED_THROUGH, EchoFlag
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C
 from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.io.returnfile import ReturnReader
-from wavebatch.units import HALF_C
 
 _BIN = 0.01
 _BINS = 10_000

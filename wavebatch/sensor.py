@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import WaveformBlock
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
+from wavebatch.core.trajectory import Trajectory, solve_offset
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.io.rays import Rays, sample_rays
 from wavebatch.io.strip import StripReader, StripScan
 from wavebatch.io.trajectoryfile import read_trajectory
-from wavebatch.kernels.convergence import SensorFit, fit_best, range_error, sensor_at
-from wavebatch.trajectory import Trajectory, solve_offset
+from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
 
 NODE_SECONDS = 0.5
 """Time between two positions that are estimated from rays."""

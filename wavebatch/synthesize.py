@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import Digitizer
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.fullwave import FullwaveWriter
 from wavebatch.io.header import is_projection, read_header
 from wavebatch.io.returnfile import ReturnReader
-from wavebatch.kernels.radar import receive_power, spread_cross_section
-from wavebatch.kernels.rays import fit_rays, group_pulses
+from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
+from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.simulate.pulses import PulseModel
 from wavebatch.simulate.render import Recording, paint_echoes, record_counts
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
 
 INTENSITIES = ("peak", "reflectance")
 MARGIN = 6.0

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from wavebatch import __version__
-from wavebatch.blocks import SystemPulse
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.waveforms import SystemPulse
 from wavebatch.io.publish import Draft, is_stream, open_stream, reporting
 from wavebatch.survey import Decision, Survey
-from wavebatch.words import nearest
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
 

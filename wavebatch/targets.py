@@ -12,19 +12,19 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.config import load_profile
-from wavebatch.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.strip import StripReader
-from wavebatch.kernels.planes import fit_normal
-from wavebatch.kernels.radiometry import calibrate_echoes
+from wavebatch.kernels.geometry.planes import fit_normal
+from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.polygons import find_inside, read_features
 from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
-from wavebatch.units import MAD_TO_STD
 
 LEAST_ECHOES = 10
 """Echoes on a target below which it is left out."""

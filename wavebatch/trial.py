@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import HALF_C, QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.evaluate import match_echoes
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.render import render_echoes
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.stages.decompose import adaptive
 from wavebatch.stages.detect import maximum
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
-from wavebatch.units import HALF_C, QUANTISATION_STD
 
 WAVEFORMS = 2048
 """Waveforms of a trial."""

@@ -13,10 +13,10 @@ from collections.abc import Callable
 import numpy as np
 from table import Table, main
 
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.evaluate import score
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
-from wavebatch.kernels.signal import find_peaks
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.simulate import (
     FINE,
     find_scene,

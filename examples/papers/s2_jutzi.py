@@ -13,18 +13,18 @@ from functools import partial
 import numpy as np
 from table import Table, main
 
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.fit import Limits, Windows, fit_windows
-from wavebatch.kernels.gauss_newton import step_undamped
-from wavebatch.kernels.pulse import GAUSSIAN
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.gauss_newton import step_undamped
+from wavebatch.kernels.fit.least_squares import Limits, Windows, fit_windows
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import PULSE_SIGMA, paint_slice
 from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments
 from wavebatch.stages.decompose_models import gauss_newton
 from wavebatch.stages.detect import matched_filter
 from wavebatch.stages.detect_edges import sustained_threshold
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from table import Table, main
 
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.incidence import (
+from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.incidence import (
     FWHM_PER_TAU,
     angles_of_variance,
     direct_width,
@@ -25,7 +26,6 @@ from wavebatch.kernels.incidence import (
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.stages.decompose import gaussian
 from wavebatch.stages.detect import maximum
-from wavebatch.units import FWHM_PER_SIGMA, C
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from table import Table, main
 
-from wavebatch.kernels.radar import pass_atmosphere, receive_power, spread_cross_section
+from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
 from wavebatch.returns import ReturnStats, count_returns
 from wavebatch.simulate import DiscreteReceiver, Recording, simulate_returns
 from wavebatch.simulate.papers import RETURN_TABLES

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.batch.report import RunReport, count_flags
-from wavebatch.blocks import WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.errors import StageError
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import StageError
+from wavebatch.core.no_data import count_reasons
+from wavebatch.core.units import PS_PER_NS
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.io.rawbytes import widen
-from wavebatch.kernels.pulses import find_nearest, find_pulses, number_returns
-from wavebatch.nodata import count_reasons
-from wavebatch.units import PS_PER_NS
+from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
 if TYPE_CHECKING:
     from wavebatch.io.layout import OutputLayout

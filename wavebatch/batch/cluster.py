@@ -17,7 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, InvalidS
 from pathlib import Path
 from typing import Any
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.publish import reporting
 from wavebatch.io.scratch import owning_scratch, use_scratch
 

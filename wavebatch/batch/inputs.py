@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 SUFFIXES = (".las", ".laz")
 

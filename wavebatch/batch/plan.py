@@ -10,7 +10,7 @@ from typing import Any
 from wavebatch.batch.record import cloud_path
 from wavebatch.batch.task import BatchOptions, StripTask
 from wavebatch.batch.work import StripJob, plan_layout
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 LEAST_MEMORY = 300 << 20
 """Bytes that one process needs with the smallest blocks."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.batch.report import AMPLITUDE_BINS, RunReport
 from wavebatch.batch.work import Prepared
-from wavebatch.nodata import REASONS, NoData
+from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.sensor import SensorSource
 
 _ANGLE = "incidence_angle"

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import StageError
-from wavebatch.units import FWHM_PER_SIGMA
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import StageError
+from wavebatch.core.units import FWHM_PER_SIGMA
 
 COUNTS: dict[str, str] = {
     "points_in": "points of the strip",

@@ -20,7 +20,7 @@ from wavebatch.batch.report import RunReport
 from wavebatch.batch.task import BatchOptions, StripTask
 from wavebatch.batch.work import StripJob
 from wavebatch.batch.workers import Workers
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.publish import remove_stale, reporting
 
 

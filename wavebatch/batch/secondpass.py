@@ -22,13 +22,13 @@ import numpy as np
 from wavebatch.batch.report import RunReport
 from wavebatch.batch.work import unpack
 from wavebatch.chain import Step
-from wavebatch.echoes import COLUMNS, RAY
+from wavebatch.core.echoes import COLUMNS, RAY
+from wavebatch.core.no_data import NoData
 from wavebatch.io.layout import OutputLayout
 from wavebatch.io.rowstore import RowStore
 from wavebatch.io.spool import Spool
-from wavebatch.kernels.normals import FINENESS, Gap, Surroundings, thin_out
-from wavebatch.kernels.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
-from wavebatch.nodata import NoData
+from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
+from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
 
 TILE_POINTS = 150_000
 """Points of a tile, about, without its buffer."""

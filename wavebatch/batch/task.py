@@ -28,7 +28,7 @@ from wavebatch.batch.report import RunReport
 from wavebatch.batch.secondpass import SecondPass, process_tile
 from wavebatch.batch.work import Prepared, StripJob, prepare_strip, process_packed_unit
 from wavebatch.batch.workers import Workers
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.fingerprint import take_fingerprint
 from wavebatch.io.publish import refuse_existing
 from wavebatch.io.writer import CloudWriter

@@ -16,17 +16,17 @@ from wavebatch.angles import angle_parameters
 from wavebatch.auto import without_columns
 from wavebatch.batch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.report import RunReport
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import Choice, Request, make_choice, sample_size
-from wavebatch.echoes import COLUMNS, RAY, EchoTable
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.layout import OutputLayout, plan_output
 from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.survey.levels import measure_level
-from wavebatch.words import nearest
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""

@@ -12,7 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from pathlib import Path
 from typing import Any
 
-from wavebatch.allocator import keep_freed_memory
+from wavebatch.core.memory import keep_freed_memory
 from wavebatch.io.scratch import owning_scratch, use_scratch
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")

@@ -9,12 +9,12 @@ import numpy as np
 
 from wavebatch.bench.figures import Figure, root_mean_square, share
 from wavebatch.bench.truth import describe_truth, find_bounds
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.evaluate import QUANTITIES, find_isolated, match_echoes
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.survey import Survey, survey_block
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 
 CLEAR = 10.0
 """Signal to noise from which an echo's error is compared with its bound."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.nodata import without_nan
+from wavebatch.core.no_data import without_nan
 
 NOTHING = float("nan")
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 _UNITS = {"m": 100.0, "cm": 1.0, "mm": 0.1}
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.bench.worker import Worker, WorkerDied
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.detect import maximum
 from wavebatch.stages.noise import pooled
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.errors import InputError
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.strip import StripReader
 from wavebatch.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.simulate.draws import Drawn
 from wavebatch.survey import SAMPLE, survey_blocks
-from wavebatch.units import QUANTISATION_STD
 
 BENCH_SCENES: dict[str, str] = {
     "mixed": "mixed",

@@ -15,8 +15,8 @@ from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.worker import Worker, peak_memory
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.simulate import Scene, simulate_strip
 
 PREPARATION = ("scan", "survey")

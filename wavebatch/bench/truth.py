@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.signal import SMOOTH_GAIN
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 from wavebatch.simulate.pulses import PulseModel, main_lobe, spread_lobes
 from wavebatch.simulate.render import Recording, paint_echoes
-from wavebatch.units import FWHM_PER_SIGMA, QUANTISATION_STD
 
 _GRID = 49
 _STEP = 0.02

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from wavebatch.errors import StageError
+from wavebatch.core.errors import StageError
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _START = "from wavebatch.bench.worker import serve; serve()"
@@ -86,7 +86,7 @@ class Worker:
 
 def serve() -> None:
     """Answers calls on stdin until it ends; whatever else writes to stdout is sent to stderr."""
-    from wavebatch.allocator import keep_freed_memory
+    from wavebatch.core.memory import keep_freed_memory
 
     keep_freed_memory()
     replies = os.fdopen(os.dup(1), "wb")

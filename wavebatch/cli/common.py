@@ -12,7 +12,7 @@ from typing import IO, Any
 
 import click
 
-from wavebatch.errors import ConfigError, InputError, StageError
+from wavebatch.core.errors import ConfigError, InputError, StageError
 
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
@@ -67,7 +67,7 @@ class NearestGroup(click.Group):
         """As click does it, with a better line."""
         name = args[0] if args else ""
         if name and not name.startswith("-") and name not in self.list_commands(ctx):
-            from wavebatch.words import nearest
+            from wavebatch.core.suggest import nearest
 
             ctx.fail(f"no command {name!r}; {nearest(name, self.list_commands(ctx))}")
         return super().resolve_command(ctx, args)
@@ -85,7 +85,7 @@ def printable(text: str) -> str:
 
 def print_json(value: Any) -> None:
     """`value` as JSON with sorted keys on stdout; null for what is no number, so that every reader takes it."""
-    from wavebatch.nodata import without_nan
+    from wavebatch.core.no_data import without_nan
 
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     click.echo(text.encode(errors="backslashreplace").decode())

@@ -94,7 +94,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     noise, echoes with their errors, and where the returns of the file lie. The chain is chosen and run as `wavebatch
     run` does it. Exit code: 0, 1 where the strip cannot be read or the picture not be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.errors import ConfigError
+    from wavebatch.core.errors import ConfigError
     from wavebatch.pictures import check_picture
     from wavebatch.plots.packets import Wanted
     from wavebatch.plots.values import read_flags
@@ -189,7 +189,7 @@ def _select(column: str | None, options: dict[str, Any]) -> Any:
 
 
 def _refuse_for_flags(options: dict[str, Any]) -> None:
-    from wavebatch.errors import ConfigError
+    from wavebatch.core.errors import ConfigError
 
     for name, option in (("bins", "--bins"), ("limits", "--range"), ("each", "--each")):
         if options[name]:
@@ -217,7 +217,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     the cells. Exit code: 0, 1 where a cloud cannot be read or the picture not be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.batch.inputs import find_files
-    from wavebatch.errors import ConfigError
+    from wavebatch.core.errors import ConfigError
     from wavebatch.pictures import check_picture
     from wavebatch.plots.raster import grid_values
 

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.common import one_line, printable
-from wavebatch.nodata import REASONS, NoData
+from wavebatch.core.no_data import REASONS, NoData
 
 KINDS = ("auto", "bar", "json", "none")
 

@@ -14,7 +14,7 @@ import click
 from wavebatch.cli.common import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
 from wavebatch.cli.options import direction_option, headerless_option, overwrite_option, system_option
 from wavebatch.cli.sensor import read_sensor, sensor_options
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
 """Some strips are not written; none is."""
@@ -179,8 +179,8 @@ def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
     """
     from wavebatch.choice import Request, widest
     from wavebatch.config import list_profiles, load_chain, load_profile
+    from wavebatch.core.suggest import nearest
     from wavebatch.systemfile import load_survey
-    from wavebatch.words import nearest
 
     profile = options["profile"] or "auto"
     request = Request(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from wavebatch.sensor import SensorRequest

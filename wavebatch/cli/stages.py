@@ -9,8 +9,8 @@ import click
 
 from wavebatch.cli.common import debug_option, print_json, report_errors
 from wavebatch.cli.options import json_option
-from wavebatch.errors import ConfigError
-from wavebatch.words import nearest
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 if TYPE_CHECKING:
     from wavebatch.chain import Parameter, Stage
@@ -80,7 +80,7 @@ def _prose(stage: Stage) -> str:
 
 
 def _explain(stage: Stage) -> str:
-    from wavebatch.echoes import COLUMNS
+    from wavebatch.core.echoes import COLUMNS
 
     told = _describe(stage)
     parts = [f"{stage.name}\n\n{told['text']}"]

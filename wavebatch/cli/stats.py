@@ -17,7 +17,7 @@ from wavebatch.areas import AreaStats, Grid, PolygonSet
 from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option, overwrite_option
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.publish import refuse_existing
 from wavebatch.polygons import load_polygons
 from wavebatch.returns import ReturnStats, count_returns

@@ -13,7 +13,7 @@ from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import direction_option, headerless_option, json_option, overwrite_option
 
 if TYPE_CHECKING:
-    from wavebatch.blocks import SystemPulse
+    from wavebatch.core.waveforms import SystemPulse
     from wavebatch.io.strip import StripReader, StripScan
     from wavebatch.systemfile import SavedSurvey
 
@@ -67,7 +67,7 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey, and what else is told about the strip."""
     from wavebatch.choice import read_sample, survey_sample
-    from wavebatch.errors import InputError
+    from wavebatch.core.errors import InputError
     from wavebatch.io.fingerprint import take_fingerprint
     from wavebatch.io.strip import StripReader
     from wavebatch.outlook import survey_angles
@@ -167,7 +167,7 @@ def _name_model(system: SystemPulse) -> str:
 
 
 def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
-    from wavebatch.units import FWHM_PER_SIGMA
+    from wavebatch.core.units import FWHM_PER_SIGMA
 
     system, figures = saved.survey.system, saved.survey.figures
     width = system.sigma_ref * FWHM_PER_SIGMA

@@ -9,7 +9,7 @@ import numpy as np
 
 from wavebatch.compare.differences import SPEED
 from wavebatch.compare.pairing import check_tolerance, pair_echoes
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.anglefile import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
 from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
 
 _OCTAVES = 18
 """Classes of amplitude: below 1, then one per doubling; the last one takes all that is larger."""

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.echoes import PASSED_THROUGH
+from wavebatch.core.echoes import PASSED_THROUGH
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
 from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
 from wavebatch.simulate.truth import TruthReader
-from wavebatch.units import FWHM_PER_SIGMA
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
 PACKET_DTYPE = np.dtype([("gps_time", "<f8")])

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.even_sample import EvenSample
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
 from wavebatch.evaluate import ErrorStats
-from wavebatch.evensample import EvenSample
-from wavebatch.kernels.bounds import crlb
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
+from wavebatch.kernels.fit.bounds import crlb
 
 SPEED = 0.9997 * HALF_C
 """Metres along the ray per ns."""

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import Step
-from wavebatch.echoes import EchoTable
-from wavebatch.evensample import EvenSample
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.even_sample import EvenSample
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.models import rebuild_waveforms
 from wavebatch.stages.shapes import clip_level
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from wavebatch.compare.breakdown import Breakdown, Table
 from wavebatch.compare.differences import SPEED, Differences, Spread
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
 
 MOST_PER_PULSE = 64

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, ExtraRecord, choose_no_data, read_records
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,

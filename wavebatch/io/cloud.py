@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo, DimensionKind
 
-from wavebatch.echoes import COLUMNS
+from wavebatch.core.echoes import COLUMNS
 from wavebatch.io.cloudpoints import CloudPoints
 from wavebatch.io.names import STYLES
 from wavebatch.io.rawbytes import widen

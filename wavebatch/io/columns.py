@@ -11,12 +11,12 @@ import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo
 
-from wavebatch.echoes import COLUMNS
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 from wavebatch.io.cloud import CloudReader, find_columns
 from wavebatch.io.names import normalise
 from wavebatch.io.rawbytes import widen
-from wavebatch.words import nearest
 
 VALUE_DTYPE = np.dtype([("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("flags", "<u2")])
 """One point: position [m], the column's value (NaN: no data), EchoFlag bits (0 where the cloud has no flags)."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.header import STANDARD_DTYPES, LasHeader
 
 WITHOUT_WAVES = {4: 1, 5: 3, 9: 6, 10: 8}

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.io.rawbytes import widen
-from wavebatch.units import HALF_C, PS_PER_NS
 
 OPTIONS = ("auto", "toward", "away")
 VECTORS = ("x_t", "y_t", "z_t")

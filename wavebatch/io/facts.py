@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import Digitizer
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.crs import CrsUnits, read_crs
 from wavebatch.io.las import CheckedHeader
 from wavebatch.io.packets import Descriptors, PacketPlace

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 
 _ENDS = 1 << 20
 _PIECE = 1 << 14

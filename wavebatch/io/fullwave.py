@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.blocks import Digitizer
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import PS_PER_NS
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.extra import ExtraRecord, build_dtype
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,
@@ -22,7 +23,6 @@ from wavebatch.io.header import (
 )
 from wavebatch.io.pointfile import PointFile, waveform_head
 from wavebatch.io.publish import Draft, publish_together, refuse_existing, reporting
-from wavebatch.units import PS_PER_NS
 
 _FORMATS = {(1, 3): (4, 5), (1, 4): (4, 5, 9, 10), (1, 5): (9, 10)}
 _DESCRIPTOR = np.dtype(

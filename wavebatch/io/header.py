@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from laspy import PointFormat
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.rawbytes import open_regular
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}

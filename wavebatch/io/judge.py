@@ -7,7 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.io.direction import RANGE_RATIO, measure_ratio
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.packets import MAX_SAMPLES, refuse_compressed

@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, ExtraRecord, build_dtype, read_records
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,

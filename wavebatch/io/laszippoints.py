@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.las import CheckedHeader
 from wavebatch.io.rawbytes import guarded
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.echoes import COLUMNS
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.carry import Carried, PacketSource, find_packets, plan_carried
 from wavebatch.io.convert import choose_format, copy_standard
 from wavebatch.io.extra import ExtraRecord, build_dtype

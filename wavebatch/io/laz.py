@@ -10,7 +10,7 @@ from typing import Any, BinaryIO, Protocol
 import lazrs
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
 
 try:

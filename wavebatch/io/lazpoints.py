@@ -9,7 +9,7 @@ from pathlib import Path
 import lazrs
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.header import LasHeader, has_record
 from wavebatch.io.las import CheckedHeader
 from wavebatch.io.laszippoints import LaszipPoints

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from laspy import PointFormat
 
-from wavebatch.echoes import COLUMNS, Column
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import COLUMNS, Column
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.extra import ExtraRecord
 from wavebatch.io.header import STANDARD_DTYPES
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import Digitizer
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import PS_PER_NS
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,
     WAVEFORM_RECORD_ID,
@@ -21,7 +22,6 @@ from wavebatch.io.header import (
 )
 from wavebatch.io.las import CheckedHeader
 from wavebatch.io.rawbytes import read_exactly
-from wavebatch.units import PS_PER_NS
 
 MAX_SAMPLES = 1 << 16
 """Waveforms longer than this are taken for damage."""

@@ -9,7 +9,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.io.header import (
     WAVEFORM_RECORD_ID,

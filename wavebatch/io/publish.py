@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 
 try:
     import fcntl

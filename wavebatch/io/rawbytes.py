@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 
 
 def open_regular(path: Path) -> BinaryIO:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.io.direction import read_toward
 from wavebatch.io.rawbytes import widen
 from wavebatch.io.scanner import locate
 from wavebatch.io.strip import StripReader, StripScan
-from wavebatch.units import HALF_C, PS_PER_NS
 
 MOST_SLICES = 4096
 """Places of a strip at which rays are taken."""

@@ -9,7 +9,7 @@ import laspy
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.cloud import CloudReader, split_numbers
 from wavebatch.io.extra import build_dtype
 from wavebatch.io.header import WKT_BIT, LasHeader, build_wkt

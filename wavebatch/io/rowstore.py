@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.publish import Draft, reporting
 
 PIECE = 1 << 16

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.facts import StripFacts
 from wavebatch.io.judge import REASON_TEXTS, Reason
 from wavebatch.io.spool import Spool

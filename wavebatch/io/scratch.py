@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 
 try:
     import fcntl

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.blocks import Digitizer, ReturnTable, WaveformBlock
+from wavebatch.core.units import PS_PER_NS
+from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.io.direction import check_option, read_toward
 from wavebatch.io.facts import StripFacts, collect_facts
 from wavebatch.io.judge import INDEX_BITS, Judge
@@ -19,8 +20,7 @@ from wavebatch.io.rawbytes import take_records, widen
 from wavebatch.io.scan import StripScan, raise_problem
 from wavebatch.io.scanner import locate, scan_strip, unique_entries
 from wavebatch.io.sharing import expand, group_keys
-from wavebatch.kernels.signal import recorded_lengths
-from wavebatch.units import PS_PER_NS
+from wavebatch.kernels.signal.signal import recorded_lengths
 
 __all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
 

@@ -11,7 +11,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.scratch import reporting_scratch, scratch_place
 
 HELD = 1 << 18

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import InputError
-from wavebatch.trajectory import Trajectory, apply_lever_arm
+from wavebatch.core.errors import InputError
+from wavebatch.core.trajectory import Trajectory, apply_lever_arm
 
 SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.io.extra import EXTRA_BYTES_RECORD_ID
 from wavebatch.io.header import (
     EVLR_HEADER_SIZE,

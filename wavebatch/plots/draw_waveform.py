@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.pictures import open_picture, plain_text
 from wavebatch.plots.waveform import WaveformView
-from wavebatch.units import FWHM_PER_SIGMA
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import ConfigError
-from wavebatch.evensample import EvenSample
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.even_sample import EvenSample
 from wavebatch.io.columns import ColumnFacts
 from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits
 

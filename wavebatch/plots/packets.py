@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.io.strip import StripReader, StripScan, Unit
 
 FARTHEST = 1e-3

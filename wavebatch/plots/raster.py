@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import ConfigError, InputError
-from wavebatch.evensample import EvenSample
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.even_sample import EvenSample
 from wavebatch.io.buckets import Buckets, count_buckets
 from wavebatch.io.columns import ColumnFacts
 from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits

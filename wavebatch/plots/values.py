@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.suggest import nearest
 from wavebatch.io.columns import ColumnFacts, ColumnReader, check_alike
-from wavebatch.words import nearest
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; what lies far beyond them is damage or a rarity."""

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Chain
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.strip import StripReader, StripScan
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.plots.packets import Place
 from wavebatch.stages.models import MODELS
 from wavebatch.stages.shapes import clip_level, model_parameters, shape_limits

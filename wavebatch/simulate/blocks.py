@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.errors import ConfigError
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate.geometry import Flight, Rays, trace_rays
 from wavebatch.simulate.render import Recording, paint_echoes, record_counts
 from wavebatch.simulate.scenes import Scene, find_scene

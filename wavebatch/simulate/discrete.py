@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

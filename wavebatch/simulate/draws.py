@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.core.units import C
 from wavebatch.simulate.render import Recording
-from wavebatch.units import C
 
 
 @dataclass(frozen=True, slots=True, eq=False)

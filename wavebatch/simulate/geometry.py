@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.units import HALF_C
+from wavebatch.core.units import HALF_C
 
 AIR_SPEED = 0.9997 * HALF_C
 """One-way metres per two-way ns in air, as vendors store it."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.simulate.blocks import flag_truth
 from wavebatch.simulate.draws import tabulate_echoes
 from wavebatch.simulate.pulses import PulseModel

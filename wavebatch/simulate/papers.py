@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wavebatch.blocks import WaveformBlock
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate.draws import FoldedWidth, LogNormal, WithinDepth
 from wavebatch.simulate.given import FINE, fine_recording, simulate_echoes
 from wavebatch.simulate.pulses import PulseModel
 from wavebatch.simulate.render import Recording
 from wavebatch.simulate.scenes import Scene
-from wavebatch.units import FWHM_PER_SIGMA
 
 WAGNER = Scene(
     "wagner",

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
-from wavebatch.words import nearest
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wavebatch.blocks import Digitizer
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import Digitizer
 from wavebatch.simulate.pulses import PulseModel, main_lobe, spread_lobes
-from wavebatch.units import QUANTISATION_STD
 
 REACH = 5.5
 """Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.echoes import EchoTable
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.simulate.render import Recording
-from wavebatch.units import FWHM_PER_SIGMA
 
 WEAKEST = 3.0
 """Echoes below this many standard deviations of the noise give no return."""

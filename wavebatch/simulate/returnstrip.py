@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C
 from wavebatch.io.returnfile import FORMATS, ReturnWriter
 from wavebatch.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
 from wavebatch.simulate.discrete import DiscreteReceiver
@@ -16,7 +17,6 @@ from wavebatch.simulate.geometry import EAST, NORTH, Flight
 from wavebatch.simulate.returns import Returns
 from wavebatch.simulate.scenes import Scene, find_scene
 from wavebatch.simulate.strip import WKT, StripOptions, cut_pulses, locate, place_points, set_returns
-from wavebatch.units import HALF_C
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.radiometry import transmit
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.simulate.canopy import CANOPIES, Canopy
 from wavebatch.simulate.draws import (
     Drawn,
@@ -25,8 +27,6 @@ from wavebatch.simulate.geometry import GROUND, Flight, Rays
 from wavebatch.simulate.hazards import HAZARDS, draw_hazards
 from wavebatch.simulate.pulses import PulseModel, find_pulse
 from wavebatch.simulate.render import Recording
-from wavebatch.units import FWHM_PER_SIGMA
-from wavebatch.words import nearest
 
 GROUND_REFLECTS, ROOFS_REFLECT = 0.2, 0.4
 """Diffuse reflectances in scenes with light."""

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.npz import NpzWriter
 
 ECHO_COLUMNS: dict[str, str] = {

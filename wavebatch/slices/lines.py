@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 from wavebatch.io.sharing import expand
 from wavebatch.io.strip import StripReader, StripScan, Unit
-from wavebatch.kernels.sweep import find_sweeps
+from wavebatch.kernels.geometry.scan_lines import find_sweeps
 
 LEAST_PULSES = 8
 """Shorter lines are left out."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
+from wavebatch.core.errors import ConfigError
 from wavebatch.io.publish import Draft, refuse_existing, reporting
 from wavebatch.pictures import open_picture
 from wavebatch.slices.segments import Segment, Slice

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.hough import HoughLine, find_lines
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C
+from wavebatch.kernels.geometry.hough import HoughLine, find_lines
 from wavebatch.slices.lines import ScanLine
-from wavebatch.units import HALF_C
 
 GEOMETRIES = ("plane", "time")
 _GAP, _PULSES_PER_GAP = 10.0, 3.0

@@ -6,11 +6,17 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.incidence import angle_of_spread, angles_of_variance, paper_table, pulse_table, spread_variance
-from wavebatch.nodata import SUFFIX, NoData, explain
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.physics.incidence import (
+    angle_of_spread,
+    angles_of_variance,
+    paper_table,
+    pulse_table,
+    spread_variance,
+)
 from wavebatch.stages.physics import is_alone, sensor_distance
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
 

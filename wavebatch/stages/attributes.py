@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.gate import residual_moments
-from wavebatch.kernels.match import match_returns
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
-from wavebatch.kernels.render import render_echoes
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.fit.residual_test import residual_moments
+from wavebatch.kernels.geometry.match_returns import match_returns
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 
 
 @stage("attribute", makes=("amplitude", "amplitude_err"))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.signal import transpose_samples
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.signal import transpose_samples
 
 
 def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.closed_form import fit_closed_form
-from wavebatch.kernels.cluster import Candidates, Clusters, cluster_candidates
-from wavebatch.kernels.decompose import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit import WidthPrior
-from wavebatch.kernels.pulse import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
-from wavebatch.kernels.signal import smooth_121, transpose_samples
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import SQRT_PI
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.closed_form import fit_closed_form
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
+from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
+from wavebatch.kernels.fit.least_squares import WidthPrior
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
+from wavebatch.kernels.signal.signal import smooth_121, transpose_samples
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
 from wavebatch.stages.merge import drop_twins, merge_unresolved
 from wavebatch.stages.shapes import (
@@ -25,7 +26,6 @@ from wavebatch.stages.shapes import (
     pulse_shape,
     shape_limits,
 )
-from wavebatch.units import SQRT_PI
 
 MARGIN = 1.2
 """Windows extend this many system widths beyond the signal above the noise."""

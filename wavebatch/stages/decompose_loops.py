@@ -7,14 +7,14 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.bounds import bound_time
-from wavebatch.kernels.cluster import estimate_starts, start_errors
-from wavebatch.kernels.pulse import GAUSSIAN
-from wavebatch.kernels.render import render_echoes
-from wavebatch.kernels.signal import smooth_121
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.cluster import estimate_starts, start_errors
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.signal import smooth_121
 from wavebatch.stages.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.decompose import gaussian
 from wavebatch.stages.detect_correlation import asdf

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.cluster import estimate_starts
-from wavebatch.kernels.filters import (
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.cluster import estimate_starts
+from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
     filter_symmetric,
     gaussian_taps,
     refine_peaks,
 )
-from wavebatch.kernels.signal import SMOOTH_GAIN, find_peaks, smooth_121
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.candidates import make_table, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)

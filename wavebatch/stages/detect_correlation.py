@@ -6,10 +6,12 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.asdf import (
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.filters import refine_peaks
+from wavebatch.kernels.signal.signal import find_peaks
+from wavebatch.kernels.signal.square_differences import (
     COLUMNS_AT_A_TIME,
     Minima,
     find_minima,
@@ -19,8 +21,6 @@ from wavebatch.kernels.asdf import (
     slide_taps,
     square_differences,
 )
-from wavebatch.kernels.filters import refine_peaks
-from wavebatch.kernels.signal import find_peaks
 from wavebatch.stages.candidates import candidate_table, signal_above
 from wavebatch.stages.reference import reference_pulse
 

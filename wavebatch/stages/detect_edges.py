@@ -6,22 +6,22 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoTable
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.cluster import estimate_starts, find_runs
-from wavebatch.kernels.filters import (
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.cluster import estimate_starts, find_runs
+from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_antisymmetric,
     filter_energy,
     filter_symmetric,
     slope_taps,
 )
-from wavebatch.kernels.runs import highest_samples, run_moments, walk_down
-from wavebatch.kernels.signal import SMOOTH_GAIN, find_peaks, smooth_121
+from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.candidates import candidate_table, signal_above
-from wavebatch.units import FWHM_PER_SIGMA
 
 
 def _smoothed_width(ref: float) -> float:

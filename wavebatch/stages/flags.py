@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.shapes import clip_level
 
 NEIGHBOURS = 5

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.decompose import UNRESOLVED
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.kernels.fit.grow import UNRESOLVED
 
 OVERLAP = 2.0
 """Widths of the narrower echo within which two may be one: further apart, a weak one's poor time says nothing."""

@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.chain import Step
-from wavebatch.echoes import EchoTable
-from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
-from wavebatch.kernels.render import render_echoes
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.stages.decompose_models import reference_shape, skewed_shape
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
 

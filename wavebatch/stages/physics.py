@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
 from wavebatch.chain import stage
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels import radiometry
-from wavebatch.nodata import SUFFIX, NoData, explain
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.physics import radiometry
 
 _POSITION = ("x", "y", "z")
 

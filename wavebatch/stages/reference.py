@@ -7,10 +7,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.filters import refine_peaks
-from wavebatch.kernels.pulse import evaluate_pulse
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
+from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.stages.shapes import pulse_measures, pulse_shape, shape_limits
 
 ReferenceKind = Literal["gaussian", "system", "given"]

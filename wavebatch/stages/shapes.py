@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.kernels.pulse import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
-from wavebatch.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:

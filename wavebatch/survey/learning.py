@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.learn import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.stages.decompose import adaptive, closed_form
 from wavebatch.stages.detect import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.shapes import pulse_measures, pulse_shape, shape_limits
 from wavebatch.survey.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
-from wavebatch.units import FWHM_PER_SIGMA, QUANTISATION_STD
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""

@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import UNCLEAN
-from wavebatch.kernels.incidence import spread_of_angle
+from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.angle import added_variance
 from wavebatch.stages.physics import is_alone, level_angle
 from wavebatch.survey.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.blocks import Noise, SystemPulse, WaveformBlock
-from wavebatch.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.noise import estimate_noise
-from wavebatch.kernels.render import render_echoes
-from wavebatch.kernels.signal import SMOOTH_GAIN, transpose_samples
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.signal.noise import estimate_noise
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, transpose_samples
 from wavebatch.stages.decompose import adaptive, closed_form
 from wavebatch.stages.detect import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
-from wavebatch.units import MAD_TO_STD, QUANTISATION_STD
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""

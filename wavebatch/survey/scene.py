@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.shapes import clip_level
 from wavebatch.survey.learning import find_isolated, find_strong, learn_pulse
 from wavebatch.survey.measuring import (

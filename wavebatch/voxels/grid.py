@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.io.sums import HELD, KeyedSums
-from wavebatch.kernels.voxels import (
+from wavebatch.kernels.geometry.voxels import (
     Crossings,
     cross_voxels,
     differences_along,

@@ -7,11 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.errors import ConfigError
-from wavebatch.kernels.deconvolve import deconvolve_gold, deconvolve_richardson_lucy, deconvolve_wiener, wiener_taps
-from wavebatch.kernels.profiles import fit_height, keep_signal, measure_offsets, window_signal
-from wavebatch.kernels.signal import SMOOTH_GAIN, smooth_121, widen
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.deconvolve import (
+    deconvolve_gold,
+    deconvolve_richardson_lucy,
+    deconvolve_wiener,
+    wiener_taps,
+)
+from wavebatch.kernels.signal.profiles import fit_height, keep_signal, measure_offsets, window_signal
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
 from wavebatch.stages.candidates import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.reference import reference_pulse

@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from wavebatch.blocks import SystemPulse, WaveformBlock
-from wavebatch.kernels import radiometry
-from wavebatch.kernels.voxels import accumulate_profile
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.geometry.voxels import accumulate_profile
+from wavebatch.kernels.physics import radiometry
 from wavebatch.voxels.profile import Profiles
 
 MOST_SECTION = 2.0**14

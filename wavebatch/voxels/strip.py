@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.blocks import SystemPulse, WaveformBlock
 from wavebatch.calibration import Calibration
 from wavebatch.choice import read_sample, survey_sample
-from wavebatch.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.io.publish import refuse_existing
 from wavebatch.io.strip import StripReader, StripScan
 from wavebatch.io.sums import HELD
-from wavebatch.kernels.voxels import fits_keys
+from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
 from wavebatch.systemfile import SavedSurvey, describe_system
-from wavebatch.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.voxels.output import VoxelSpace, check_target, open_voxels

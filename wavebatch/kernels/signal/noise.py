@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.signal import SMOOTH_GAIN, find_quiet, quiet_mean, smooth_121
-from wavebatch.units import QUANTISATION_STD
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, smooth_121
 
 ROUNDS = 4
 """Times that level and quiet samples are found from each other."""

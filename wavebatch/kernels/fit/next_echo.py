@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit import Limits, Windows, add_ridge, parameter_units
-from wavebatch.kernels.gate import hermite_moments
+from wavebatch.kernels.fit.least_squares import Limits, Windows, add_ridge, parameter_units
+from wavebatch.kernels.fit.residual_test import hermite_moments
 
 LEAST_NEW = 0.03
 """Share of a new echo's energy that the present echoes must not be able to explain."""

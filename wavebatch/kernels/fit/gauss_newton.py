@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit import Windows, add_ridge, evaluate_model, gram_matrix, parameter_units, solve_symmetric
-from wavebatch.kernels.pulse import PulseShape
+from wavebatch.kernels.fit.least_squares import (
+    Windows,
+    add_ridge,
+    evaluate_model,
+    gram_matrix,
+    parameter_units,
+    solve_symmetric,
+)
+from wavebatch.kernels.fit.pulse_shape import PulseShape
 
 LEAST_WIDTH = 0.1
 """Width [samples] below which a fit is lost."""

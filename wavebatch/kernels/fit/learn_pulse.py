@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # parts of it load when they are first asked for
 
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 STEP = 0.2
 """Grid of the stack [samples]."""

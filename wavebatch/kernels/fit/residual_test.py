@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.kernels.fit import Windows
-from wavebatch.kernels.pulse import evaluate_unit
-from wavebatch.kernels.signal import SMOOTH_GAIN
+from wavebatch.kernels.fit.least_squares import Windows
+from wavebatch.kernels.fit.pulse_shape import evaluate_unit
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 
 HERMITE_REACH = 5.0
 """Half-widths over which the Gauss-Hermite moments run."""

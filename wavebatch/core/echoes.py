@@ -8,7 +8,7 @@ from enum import IntFlag
 
 import numpy as np
 
-from wavebatch.errors import StageError
+from wavebatch.core.errors import StageError
 
 
 class EchoFlag(IntFlag):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.fit import OUTSIDE, Windows
-from wavebatch.kernels.signal import SMOOTH_GAIN
+from wavebatch.kernels.fit.least_squares import OUTSIDE, Windows
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 
 RUN_LEVEL = 2.0
 """Noise standard deviations of the smoothed signal above which echoes are one run."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 ROWS = 8192
 """Echoes painted at a time."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.errors import InputError
+from wavebatch.core.errors import InputError
 
 WEEK = 604_800.0
 """Seconds of a GPS week."""

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # parts of it load when they are first asked for
 
-from wavebatch.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA
 
 NO_SKEW = 1e-6
 """Below this |kappa| a pulse is treated as symmetric."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.deconvolve import convolve_pulse
-from wavebatch.kernels.signal import sum_samples
+from wavebatch.kernels.signal.deconvolve import convolve_pulse
+from wavebatch.kernels.signal.signal import sum_samples
 
 ROUND = 8
 """Windows are as long as a multiple of this, so that many waveforms share a length."""

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.cluster import Candidates, Clusters, cut_windows
-from wavebatch.kernels.fit import (
+from wavebatch.core.units import SQRT_PI
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, cut_windows
+from wavebatch.kernels.fit.least_squares import (
     Fit,
     Limits,
     WidthPrior,
@@ -18,10 +19,9 @@ from wavebatch.kernels.fit import (
     fit_windows,
     parameter_errors,
 )
-from wavebatch.kernels.gate import find_misfits
-from wavebatch.kernels.propose import propose_echo
-from wavebatch.kernels.pulse import GAUSSIAN, PulseShape
-from wavebatch.units import SQRT_PI
+from wavebatch.kernels.fit.next_echo import propose_echo
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.residual_test import find_misfits
 
 
 class Settings(NamedTuple):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.units import FWHM_PER_SIGMA, C
+from wavebatch.core.units import FWHM_PER_SIGMA, C
 
 STEEPEST = np.radians(80.0)
 """Angles beyond it are not known (H14)."""

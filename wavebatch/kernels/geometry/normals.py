@@ -7,8 +7,8 @@ from enum import IntEnum
 import numpy as np
 import scipy  # parts of it load when they are first asked for
 
-from wavebatch.kernels.incidence import STEEPEST
-from wavebatch.kernels.planes import fit_planes, is_flat, measure_angles
+from wavebatch.kernels.geometry.planes import fit_planes, is_flat, measure_angles
+from wavebatch.kernels.physics.incidence import STEEPEST
 
 PAIRS = 500_000
 """Neighbours that are worked on at a time, about: 100 bytes each."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD
 
 OUTLYING = 4.0
 """Points further from the plane than this many robust standard deviations do not count."""

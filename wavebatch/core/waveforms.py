@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wavebatch.errors import StageError
-from wavebatch.units import QUANTISATION_STD
+from wavebatch.core.errors import StageError
+from wavebatch.core.units import QUANTISATION_STD
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.pulse import PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 BATCH_VALUES = 500_000
 """Numbers in the rows of one batch: large enough for NumPy, small enough for the cache."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.filters import filter_symmetric
-from wavebatch.kernels.signal import sum_samples
+from wavebatch.kernels.signal.filters import filter_symmetric
+from wavebatch.kernels.signal.signal import sum_samples
 
 FLOOR = np.float32(1e-6)
 """Least value of a model that data are divided by, in units of its background."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.cluster import solve_parabola
+from wavebatch.kernels.fit.cluster import solve_parabola
 
 
 def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

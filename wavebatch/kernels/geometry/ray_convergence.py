@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD
 
 LARGEST_CONDITION = 1e5
 """Of a single position from all directions: above it they are too much alike to say where they meet."""

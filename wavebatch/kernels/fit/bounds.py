@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.units import SQRT_PI
+from wavebatch.core.units import SQRT_PI
 
 
 def bound_time(amplitude: np.ndarray, sigma: np.ndarray, noise_std: np.ndarray | float, spacing: float) -> np.ndarray:

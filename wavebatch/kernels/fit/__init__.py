@@ -1,0 +1,1 @@
+"""Fits of echoes to waveforms: start values, least squares, growth, and tests of the residual."""

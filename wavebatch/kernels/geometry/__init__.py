@@ -1,0 +1,1 @@
+"""Planes, normals, rays, lines and grids."""

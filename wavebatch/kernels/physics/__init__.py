@@ -1,0 +1,1 @@
+"""Radiometry, incidence angles and the lidar equation."""

@@ -1,0 +1,1 @@
+"""Filters and estimates on waveforms: arrays in, arrays out."""
