@@ -57,7 +57,7 @@ def wide_strip(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def edit_points() -> Callable[[Path, Path, Callable[[np.ndarray], np.ndarray]], Path]:
     """`edit_points(source, target, change)`: a copy of a LAS file whose records are those that `change` makes."""
-    from wavebatch.io.header import STANDARD_DTYPES, read_header
+    from wavebatch.files.las.header import STANDARD_DTYPES, read_header
 
     def edit(source: Path, target: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
         header = read_header(source)

@@ -8,8 +8,8 @@ from pathlib import Path
 import lazrs
 import numpy as np
 
-from wavebatch.io.header import STANDARD_DTYPES
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.files.strip.reader import StripReader
 
 HEADER_SIZES = {3: 235, 4: 375, 5: 393}
 TOWARD = np.array([0.02, -0.01, 0.148]) / 1000.0

@@ -14,8 +14,8 @@ from wavebatch import returns
 from wavebatch.areas import Grid, PolygonSet
 from wavebatch.cli.stats import SHOWN, stats
 from wavebatch.core.errors import ConfigError
-from wavebatch.io import buckets
-from wavebatch.polygons import Polygon, find_inside, load_polygons
+from wavebatch.files.disk import buckets
+from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.returns import count_returns
 
 

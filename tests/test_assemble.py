@@ -11,7 +11,7 @@ from wavebatch.batch.assemble import assemble_returns, gather_echoes
 from wavebatch.batch.work import prepare_strip
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
 
 

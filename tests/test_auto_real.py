@@ -7,7 +7,7 @@ import pytest
 
 from wavebatch.auto import choose_chain
 from wavebatch.choice import read_sample, survey_sample
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 
 AFTER_PULSE = (9.0, 12.0)
 """Where the RIEGL's after-pulse lies behind an echo [ns]; it has 4 % of its amplitude."""

@@ -13,7 +13,7 @@ from wavebatch.batch.run import run_batch
 from wavebatch.batch.task import BatchOptions, StripTask
 from wavebatch.batch.work import RunOptions, choose_columns, prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io.writer import read_provenance
+from wavebatch.files.cloud.writer import read_provenance
 
 
 def _report(folder, stem):
@@ -171,7 +171,7 @@ def test_a_failure_while_writing_leaves_nothing(tiny_strip, tmp_path, monkeypatc
     def fail(self, rows):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("wavebatch.io.writer.CloudWriter.write", fail)
+    monkeypatch.setattr("wavebatch.files.cloud.writer.CloudWriter.write", fail)
     outcome = run_one(tiny_strip, tmp_path)
     assert outcome.status == "failed" and "No space left" in str(outcome.error)
     assert _files(tmp_path) == []

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from wavebatch.choice import Request, make_choice, widest
 from wavebatch.cli import main
 from wavebatch.config import parse_chain
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import simulate_strip
 
 

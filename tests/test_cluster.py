@@ -130,22 +130,22 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
 
 def _spool_everything():
     """Makes a worker spool to disk, and note where."""
-    from wavebatch.io import scratch, spool
+    from wavebatch.files.disk import spool, temp_folders
 
     spool.made, spool.kept, spool.KEPT = [], spool.KEPT, 0
 
     def make_folder():
-        spool.made.append(str(scratch.make_folder()))
-        return scratch.Path(spool.made[-1])
+        spool.made.append(str(temp_folders.make_folder()))
+        return temp_folders.Path(spool.made[-1])
 
     spool.make_folder = make_folder
 
 
 def _spool_as_ever():
     """Takes that back; the folders that were made."""
-    from wavebatch.io import scratch, spool
+    from wavebatch.files.disk import spool, temp_folders
 
-    spool.KEPT, spool.make_folder = spool.kept, scratch.make_folder
+    spool.KEPT, spool.make_folder = spool.kept, temp_folders.make_folder
     return spool.made
 
 

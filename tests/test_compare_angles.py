@@ -14,7 +14,7 @@ from wavebatch.cli import main
 from wavebatch.compare.angles import compare_angles
 from wavebatch.config import parse_chain
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io import buckets
+from wavebatch.files.disk import buckets
 from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 

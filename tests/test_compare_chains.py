@@ -14,7 +14,7 @@ from wavebatch.compare.chains import ChainRun, Contender, find_contender, match_
 from wavebatch.compare.clouds import compare_clouds
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 
 
 def make_chain(detector, decomposer, **parameters):

@@ -11,8 +11,8 @@ from wavebatch.compare.clouds import compare_clouds, compare_truth
 from wavebatch.compare.differences import SPEED, Differences, measure_lag
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io import buckets
-from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
+from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.disk import buckets
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.simulate import StripOptions, TruthReader, simulate_strip
 

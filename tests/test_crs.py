@@ -14,8 +14,8 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.io.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate.strip import WKT
 from wavebatch.stages.attributes import position
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from wavebatch.batch.inputs import find_files, find_strips
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.inputs import find_files, find_strips
 
 
 @pytest.fixture

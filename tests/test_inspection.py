@@ -158,7 +158,7 @@ def test_check_notices_packets_that_cannot_be_read(tmp_path, monkeypatch):
     def fail(*arguments):
         raise InputError(f"{path}: packets cannot be read: Input/output error; check the disk")
 
-    monkeypatch.setattr("wavebatch.io.packets.PacketFile.read", fail)
+    monkeypatch.setattr("wavebatch.files.strip.packets.PacketFile.read", fail)
     assert any("Input/output error" in line for line in check_file(path).problems)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.io.buckets import MOST_BUCKETS, Buckets, count_buckets, sort_by_time, spread_keys, time_keys
+from wavebatch.files.disk.buckets import MOST_BUCKETS, Buckets, count_buckets, sort_by_time, spread_keys, time_keys
 
 ROW = np.dtype([("gps_time", "<f8"), ("number", "<i4")])
 
@@ -47,6 +47,6 @@ def test_no_room_for_buckets_is_one_line(monkeypatch):
     def full(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("wavebatch.io.buckets.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("wavebatch.files.disk.buckets.tempfile.TemporaryFile", full)
     with pytest.raises(InputError, match="No space left on device.*TMPDIR"):
         Buckets(ROW, 2)

@@ -10,9 +10,9 @@ from strips import make_raw
 from writer_tools import data_file
 
 from wavebatch.core.errors import InputError
-from wavebatch.io.cloud import CloudReader
-from wavebatch.io.header import STANDARD_DTYPES
-from wavebatch.io.returnfile import ReturnReader
+from wavebatch.files.cloud.echo_reader import CloudReader
+from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.las.header import STANDARD_DTYPES
 
 
 def write_cloud(path, point_format, n=300, extra=()):
@@ -62,7 +62,7 @@ def test_clouds_of_every_format_without_waveforms_are_read(tmp_path, point_forma
 
 
 def test_the_piece_is_small_where_records_are_long(tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.io.cloud._PIECE_BYTES", 1000)
+    monkeypatch.setattr("wavebatch.files.cloud.echo_reader._PIECE_BYTES", 1000)
     path = tmp_path / "a.las"
     write_cloud(path, 1)
     with CloudReader(path) as reader:

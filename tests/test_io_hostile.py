@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from strips import make_raw
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.inspection import check_file
-from wavebatch.io.strip import StripReader
 
 KINDS = [(4, True, ".las"), (9, False, ".las"), (5, False, ".laz"), (10, True, ".laz")]
 

@@ -7,8 +7,8 @@ import pytest
 from strips import make_raw, read_all, vlr
 
 from wavebatch.core.errors import InputError
-from wavebatch.io import las
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las import checked_header
+from wavebatch.files.strip.reader import StripReader
 
 
 def refused(path, pattern):
@@ -116,7 +116,7 @@ def test_offsets_that_give_no_coordinates(tmp_path):
 
 
 def test_a_front_that_does_not_fit_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(las, "MAX_FRONT", 200)
+    monkeypatch.setattr(checked_header, "MAX_FRONT", 200)
     refused(make_raw().write(tmp_path / "a.las"), "beyond all reason")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.io.npz import NpzWriter
+from wavebatch.files.disk.npz import NpzWriter
 
 
 def write(target, parts, **options):

@@ -8,9 +8,9 @@ from strips import descriptor, make_raw, read_all, read_plainly, record_head, vl
 from writer_tools import data_file
 
 from wavebatch.core.errors import InputError
-from wavebatch.io import packets
-from wavebatch.io.packets import PacketFile, PacketPlace
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip import packets
+from wavebatch.files.strip.packets import PacketFile, PacketPlace
+from wavebatch.files.strip.reader import StripReader
 
 
 def refused(path, pattern, **options):

@@ -12,11 +12,11 @@ from strips import make_raw, vlr
 from writer_tools import data_file, read_raw
 
 from wavebatch.core.errors import InputError
-from wavebatch.io import laszippoints, lazpoints
-from wavebatch.io.las import read_checked_header
-from wavebatch.io.laszippoints import LaszipPoints
-from wavebatch.io.points import open_points
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las import laszip_decode, laz_decode
+from wavebatch.files.las.checked_header import read_checked_header
+from wavebatch.files.las.laszip_decode import LaszipPoints
+from wavebatch.files.las.read_points import open_points
+from wavebatch.files.strip.reader import StripReader
 
 
 def read(path, *ranges):
@@ -83,7 +83,7 @@ def test_las_1_5_coding_goes_to_laszip():
 
 def test_without_laszip_the_line_says_what_to_install(monkeypatch):
     path = data_file("no-packets/pdrf9-1.5.laz")
-    monkeypatch.setattr(laszippoints.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(laszip_decode.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install laszip.*laszip -i"):
         StripReader(path)
 
@@ -97,8 +97,8 @@ def test_without_laszip_the_line_says_what_to_install(monkeypatch):
 def test_whatever_becomes_of_laszip_is_one_line(tmp_path, monkeypatch, code, pattern):
     child = tmp_path / "child.py"
     child.write_text(code)
-    monkeypatch.setattr(laszippoints, "_CHILD", child)
-    monkeypatch.setattr(laszippoints, "PATIENCE", 2.0 if "sleep" in code else 60.0)
+    monkeypatch.setattr(laszip_decode, "_CHILD", child)
+    monkeypatch.setattr(laszip_decode, "PATIENCE", 2.0 if "sleep" in code else 60.0)
     source = LaszipPoints(read_checked_header(make_raw(point_format=9).write(tmp_path / "a.las")))
     with pytest.raises(InputError, match=rf"a\.las: points 0 to 5: .*{pattern}") as caught:
         source.read(0, 5)
@@ -108,7 +108,7 @@ def test_whatever_becomes_of_laszip_is_one_line(tmp_path, monkeypatch, code, pat
 
 
 def test_the_laszip_process_needs_nothing_of_wavebatch():
-    text = Path(laszippoints._CHILD).read_text()
+    text = Path(laszip_decode._CHILD).read_text()
     assert "wavebatch" not in text.split('"""', 2)[2]
     assert sys.version_info >= (3, 11)
 
@@ -202,7 +202,7 @@ def test_cut_laz_files(tmp_path, cut, point_format):
 
 
 def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(lazpoints, "MAX_CHUNK_BYTES", 100)
+    monkeypatch.setattr(laz_decode, "MAX_CHUNK_BYTES", 100)
     refused(laz_of(tmp_path)[1], "chunks are too large|table of LAZ chunks")
 
 

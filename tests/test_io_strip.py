@@ -10,8 +10,10 @@ from writer_tools import data_file, read_raw
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
-from wavebatch.io import sharing, spool, strip
-from wavebatch.io.strip import StripReader
+from wavebatch.files.disk import spool
+from wavebatch.files.strip import reader as reader_module
+from wavebatch.files.strip import shared_packets
+from wavebatch.files.strip.reader import StripReader
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -71,7 +73,7 @@ def test_geometry_is_that_of_the_simulated_pulses(tmp_path):
 @pytest.mark.parametrize("unit_points", [50_000, 100])
 def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_points):
     path = data_file(name)
-    monkeypatch.setattr(strip, "UNIT_POINTS", unit_points)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", unit_points)
     points = read_raw(path)
     with StripReader(path) as reader:
         facts = reader.facts
@@ -110,10 +112,10 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
     path = _shuffled(tmp_path, points, orders[order])
     kinds = {1: (16, 60), 2: (16, 120)}
     plain = read_plainly(points[orders[order]], path.with_suffix(".wdp").read_bytes(), kinds)
-    monkeypatch.setattr(strip, "UNIT_POINTS", 128)
-    monkeypatch.setattr(sharing, "WINDOW", window)
-    monkeypatch.setattr(sharing, "BINS", 64)
-    monkeypatch.setattr(sharing, "_PER_BUCKET", 500)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 128)
+    monkeypatch.setattr(shared_packets, "WINDOW", window)
+    monkeypatch.setattr(shared_packets, "BINS", 64)
+    monkeypatch.setattr(shared_packets, "_PER_BUCKET", 500)
     monkeypatch.setattr(spool, "MEMORY", 3000)
     monkeypatch.setattr(spool, "KEPT", 100)
     assert_same(read_all(path, size=50), plain)
@@ -131,7 +133,7 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
 def test_block_and_unit_sizes_change_nothing(monkeypatch):
     path = data_file(RIEGL)
     whole = read_all(path, size=4096)
-    monkeypatch.setattr(strip, "UNIT_POINTS", 77)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 77)
     for size in (1, 13):
         parts = read_all(path, size=size)
         assert list(parts.keys() - whole.keys()) == []
@@ -143,7 +145,7 @@ def test_block_and_unit_sizes_change_nothing(monkeypatch):
 
 
 def test_units_take_every_point_once_and_cut_no_pulse(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     raw = make_raw(400)
     with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
         units = [reader.read_unit(number, scan) for number in range(reader.unit_count())]
@@ -156,7 +158,7 @@ def test_units_take_every_point_once_and_cut_no_pulse(tmp_path, monkeypatch):
 
 
 def test_a_border_cuts_runs_that_are_not_pulses(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     raw = make_raw(100)
     raw.points["gps_time"] = 0
     with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
@@ -165,7 +167,7 @@ def test_a_border_cuts_runs_that_are_not_pulses(tmp_path, monkeypatch):
 
 
 def test_context_gives_returns_of_other_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     raw = make_raw(64, most_returns=1)
     points = np.concatenate([raw.points, raw.points])
     points["gps_time"] = np.arange(128)
@@ -264,9 +266,9 @@ def test_equal_offsets_of_two_descriptors_are_two_packets(tmp_path):
 
 
 def test_too_many_points_on_one_packet_are_broken_wherever_they_are(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     for window in (16_384, 64):
-        monkeypatch.setattr(sharing, "WINDOW", window)
+        monkeypatch.setattr(shared_packets, "WINDOW", window)
         raw = make_raw(1000, most_returns=1)
         bad = np.arange(0, 1000, 25)
         raw.points["wavepacket_offset"][bad] = 60
@@ -312,7 +314,7 @@ def test_samples_are_read_only_and_blocks_hold_at_most_their_size(tmp_path):
 
 
 def test_sample_blocks_spread_over_the_strip_and_repeat(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     with StripReader(make_raw(1000).write(tmp_path / "a.las")) as reader, reader.scan() as scan:
         points = [block.point for block in reader.sample_blocks(scan, 100)]
         again = [block.point for block in reader.sample_blocks(scan, 100)]
@@ -339,7 +341,7 @@ def test_a_strip_without_points_and_one_without_waveforms(tmp_path):
 
 
 def test_facts_scans_and_units_travel_between_processes(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_POINTS", 64)
+    monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     monkeypatch.setattr(spool, "KEPT", 0)
     raw = make_raw(64, most_returns=1)
     raw.points = np.concatenate([raw.points, raw.points])
@@ -368,7 +370,7 @@ def test_extra_bytes_and_crs_are_told(tmp_path):
 
 
 def test_long_records_make_smaller_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(strip, "UNIT_BYTES", 57 * 100)
+    monkeypatch.setattr(reader_module, "UNIT_BYTES", 57 * 100)
     with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader:
         assert reader.unit_count() == -(-reader.facts.point_count // 100)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.io import sums as module
-from wavebatch.io.sums import KeyedSums
+from wavebatch.files.disk import key_sums as module
+from wavebatch.files.disk.key_sums import KeyedSums
 
 
 def slow_sums(parts):

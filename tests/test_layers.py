@@ -26,7 +26,7 @@ RANK = {name: rank for rank, names in enumerate(RANKS) for name in names}
 
 INSIDE = {
     "batch": [
-        {"inputs", "report", "assemble"}, {"work"}, {"remarks", "secondpass"}, {"record"},
+        {"report", "assemble"}, {"work"}, {"remarks", "secondpass"}, {"record"},
         {"task", "workers", "cluster"}, {"plan"}, {"run"},
     ],
     "survey": [{"measuring"}, {"learning", "levels"}, {"scene"}],
@@ -115,7 +115,7 @@ def test_kernels_know_arrays_only(path):
 def test_only_io_knows_laspy():
     for path in MODULES:
         if _outside(path) & {"laspy", "lazrs", "laszip"}:
-            assert _part(path) == "io", path
+            assert _part(path) == "files", path
 
 
 def test_only_batch_knows_executors():
@@ -124,7 +124,7 @@ def test_only_batch_knows_executors():
             assert _part(path) == "batch", path
 
 
-SCRIPTS = {ROOT / "io" / "laszip_child.py"}
+SCRIPTS = {ROOT / "files" / "las" / "laszip_child.py"}
 """Run as processes of their own, so that they have an exit code."""
 
 
@@ -145,8 +145,8 @@ def test_no_other_dependency_at_run_time():
     import sys
 
     for path in MODULES:
-        peers = {"bench": {"gdecomp", "matplotlib"}, "pictures": {"matplotlib"}, "plots": {"matplotlib"}}
+        peers = {"bench": {"gdecomp", "matplotlib"}, "files": {"matplotlib"}, "plots": {"matplotlib"}}
         peers = peers.get(_part(path), set())
-        peers |= {"pyproj"} if path.name == "trajectoryfile.py" else set()
+        peers |= {"pyproj"} if path.name == "trajectory_file.py" else set()
         peers |= {"dask", "distributed"} if path.name == "cluster.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

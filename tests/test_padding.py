@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.signal.signal import LEAST_LEVEL, LEAST_PADDING, LEAST_RECORDED, recorded_lengths
 from wavebatch.simulate import StripOptions, simulate_strip
 

@@ -15,7 +15,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.io.names import describe
+from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.simulate.blocks import simulate_pulses

@@ -15,8 +15,8 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.io import cloud as io_cloud
-from wavebatch.io.columns import ColumnReader
+from wavebatch.files.cloud import echo_reader as io_cloud
+from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.plots import raster, values
 from wavebatch.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.plots.raster import grid_values

@@ -17,10 +17,10 @@ from wavebatch.config import load_profile, parse_chain
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io import strip as io_strip
-from wavebatch.io.strip import StripReader
+from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.files.strip import reader as io_strip
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
-from wavebatch.pictures import open_picture, plain_text
 from wavebatch.plots.packets import MOST, Wanted, find_places
 from wavebatch.plots.waveform import build_views, read_views
 from wavebatch.stages.models import MODELS

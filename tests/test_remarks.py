@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from batch_tools import run_one
 
-from wavebatch.io.header import read_header
+from wavebatch.files.las.header import read_header
 
 
 def remarks(strip, folder):

@@ -11,11 +11,11 @@ from wavebatch import returns
 from wavebatch.cli.stats import stats
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
-from wavebatch.io import buckets
-from wavebatch.io.extra import ExtraRecord, build_dtype
-from wavebatch.io.header import LasHeader
-from wavebatch.io.pointfile import PointFile
-from wavebatch.io.publish import publish_together
+from wavebatch.files.disk import buckets
+from wavebatch.files.disk.publish import publish_together
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
+from wavebatch.files.las.header import LasHeader
+from wavebatch.files.las.write_points import PointFile
 from wavebatch.returns import count_returns
 from wavebatch.simulate import DiscreteReceiver, simulate_returns
 

@@ -23,8 +23,8 @@ from wavebatch.cli import main
 from wavebatch.config import parse_chain
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError
-from wavebatch.io import spool
-from wavebatch.io.layout import plan_output
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.disk import spool
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
 
@@ -251,7 +251,7 @@ def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, mon
     monkeypatch.setattr(secondpass, "SAMPLE", 1000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 16)
     monkeypatch.setattr(spool, "KEPT", 1 << 12)
-    monkeypatch.setattr("wavebatch.io.rowstore.RowStore.pieces.__defaults__", (2000,))
+    monkeypatch.setattr("wavebatch.files.disk.row_file.RowStore.pieces.__defaults__", (2000,))
     rng, peaks = np.random.default_rng(3), []
     for n in (8000, 40_000):
         parts = [make_rows(layout, rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]

@@ -9,9 +9,9 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import ADJUSTED
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import ReturnTable, WaveformBlock
-from wavebatch.io.crs import CrsUnits
-from wavebatch.io.rays import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las.crs import CrsUnits
+from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
 

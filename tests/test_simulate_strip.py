@@ -246,7 +246,7 @@ def test_truth_is_an_ordinary_npz_and_read_in_pieces(tmp_path):
 
 
 def test_truth_goes_when_the_strip_cannot_be_published(tmp_path, monkeypatch):
-    from wavebatch.io.fullwave import FullwaveWriter
+    from wavebatch.files.strip.writer import FullwaveWriter
 
     def fail(self):
         raise InputError("disk full")

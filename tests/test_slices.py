@@ -9,7 +9,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli.slice import slice_
 from wavebatch.core.errors import ConfigError
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import EAST, GROUND, NORTH, Flight
 from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments, lines, read_scan_lines
@@ -44,7 +44,7 @@ def test_scan_lines_are_those_of_the_flight(strip):
 
 def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip, monkeypatch):
     whole = read_all(strip)
-    monkeypatch.setattr("wavebatch.io.strip.UNIT_POINTS", 700)
+    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 700)
     parts = read_all(strip)
     assert len(parts) == len(whole)
     for one, other in zip(whole, parts, strict=True):

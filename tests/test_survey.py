@@ -9,7 +9,7 @@ from helpers_scenes import make_block, make_scene
 from wavebatch.auto import choose_chain
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import PulseModel, find_pulse
 from wavebatch.survey import join_digitizers, survey_block, survey_blocks
 from wavebatch.survey.measuring import FIRST_LOOK

@@ -12,8 +12,8 @@ from wavebatch.calibration import format_calibration, load_calibration, parse_ca
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import MAD_TO_STD
-from wavebatch.io.fullwave import FullwaveWriter
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.simulate import find_scene, simulate_strip, strip
 from wavebatch.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS

@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import ADJUSTED, WEEK, Trajectory, apply_lever_arm, solve_offset
-from wavebatch.io.trajectoryfile import SBET_RECORD, read_trajectory
+from wavebatch.files.trajectory_file import SBET_RECORD, read_trajectory
 
 
 def flight(rate=20.0, seconds=20.0, start=300_000_000.0):

@@ -15,9 +15,9 @@ from wavebatch.calibration import Calibration
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer, SystemPulse
-from wavebatch.io.fullwave import FullwaveWriter
-from wavebatch.io.header import read_header
-from wavebatch.io.strip import StripReader
+from wavebatch.files.las.header import read_header
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.physics.radiometry import backscatter, cross_section
 from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip

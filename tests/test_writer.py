@@ -14,11 +14,11 @@ from writer_tools import BACKENDS, data_file, read_raw, write_source, write_stri
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io import laz
-from wavebatch.io.extra import ExtraRecord
-from wavebatch.io.header import Vlr, find_evlrs, read_header
-from wavebatch.io.layout import plan_output
-from wavebatch.io.writer import CloudWriter, read_provenance, remove_stale
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.cloud.writer import CloudWriter, read_provenance, remove_stale
+from wavebatch.files.las import laz_encode
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import Vlr, find_evlrs, read_header
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -384,7 +384,7 @@ def test_several_scanner_channels_go_through_laszip(tmp_path):
 
 
 def test_several_scanner_channels_are_refused_without_laszip(tmp_path, monkeypatch):
-    monkeypatch.setattr(laz, "laszip", None)
+    monkeypatch.setattr(laz_encode, "laszip", None)
     points = multi_channel(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", [], keep_packets=True)
     rows = layout.rows(points)
@@ -485,12 +485,12 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from wavebatch.core.errors import InputError
-from wavebatch.io.layout import plan_output
-from wavebatch.io.writer import CloudWriter
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.cloud.writer import CloudWriter
 source, target = map(Path, sys.argv[1:3])
 layout = plan_output(source, ["amplitude"], keep_packets=target.stem == "keep")
 rows = layout.rows(np.frombuffer(np.random.default_rng(0).bytes(60000 * 59), dtype="V59").view(
-    np.dtype([("a", "V59")])).view(__import__("wavebatch.io.header", fromlist="x").STANDARD_DTYPES[9]))
+    np.dtype([("a", "V59")])).view(__import__("wavebatch.files.las.header", fromlist="x").STANDARD_DTYPES[9]))
 rows["classification_flags"] &= 0b11001111
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 try:
@@ -549,7 +549,10 @@ def test_more_points_than_an_old_header_counts(tmp_path):
 
 
 def test_laszip_is_optional():
-    code = "import sys; sys.modules['laszip'] = None; import wavebatch.io.laz as laz; assert laz.laszip is None"
+    code = (
+        "import sys; sys.modules['laszip'] = None; import wavebatch.files.las.laz_encode as module; "
+        "assert module.laszip is None"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from writer_tools import data_file, write_source, write_strip
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io.header import HEADER_SIZES, LasHeader, Vlr, encode_evlr_header, find_evlrs, read_header
-from wavebatch.io.layout import plan_output
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.las.header import HEADER_SIZES, LasHeader, Vlr, encode_evlr_header, find_evlrs, read_header
 
 REAL = [
     "riegl-q680i/100429_152240_2535pt_UTM.las",

@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
-from wavebatch.io.names import STYLES, describe, name_columns, normalise
+from wavebatch.files.cloud.column_names import STYLES, describe, name_columns, normalise
 
 ALL = tuple(COLUMNS)
 WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from wavebatch.core.errors import InputError
-from wavebatch.io import publish
-from wavebatch.io.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
+from wavebatch.files.disk import publish
+from wavebatch.files.disk.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
 from wavebatch.systemfile import write_text
 
 
@@ -162,7 +162,7 @@ def test_of_many_writers_exactly_one_wins(tmp_path):
 def test_stale_files_go_and_those_being_written_stay(tmp_path):
     alive = write(tmp_path / "a", b"alive")
     code = (
-        "import sys, time; from pathlib import Path; from wavebatch.io.publish import Draft\n"
+        "import sys, time; from pathlib import Path; from wavebatch.files.disk.publish import Draft\n"
         "draft = Draft(Path(sys.argv[1]), overwrite=False); print('ready', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "b")], stdout=subprocess.PIPE) as other:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.io.extra import build_dtype
-from wavebatch.io.fullwave import FullwaveWriter
-from wavebatch.io.header import LasHeader, Vlr, encode_evlr_header
-from wavebatch.io.pointfile import PointFile
-from wavebatch.io.publish import publish_together
+from wavebatch.files.disk.publish import publish_together
+from wavebatch.files.las.extra_bytes import build_dtype
+from wavebatch.files.las.header import LasHeader, Vlr, encode_evlr_header
+from wavebatch.files.las.write_points import PointFile
+from wavebatch.files.strip.writer import FullwaveWriter
 
 BACKENDS = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
 

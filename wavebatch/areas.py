@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.polygons import Polygon, find_inside
+from wavebatch.files.geojson import Polygon, find_inside
 
 MOST_AREAS = 50_000
 """Areas of all clouds together that are counted, so that memory is bounded."""

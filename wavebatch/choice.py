@@ -15,7 +15,7 @@ from wavebatch.chain import Chain
 from wavebatch.config import load_profile
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.strip import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.survey import Decision, Survey
 from wavebatch.systemfile import SavedSurvey, describe_system
 from wavebatch.trial import WAVEFORMS, Prediction, predict_errors

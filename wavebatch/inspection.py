@@ -12,8 +12,8 @@ import numpy as np
 
 from wavebatch.config import load_chain
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io.audit import audit_header
-from wavebatch.io.strip import StripFacts, StripReader, StripScan
+from wavebatch.files.strip.header_check import audit_header
+from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
 
 _SAMPLED = 4096
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from wavebatch.angles import predict_angles
 from wavebatch.auto import ANGLE
 from wavebatch.choice import sample_size
-from wavebatch.io.strip import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.sensor import SensorRequest, find_sensor
 from wavebatch.survey import Decision, Survey
 from wavebatch.survey.levels import measure_level

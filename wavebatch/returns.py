@@ -13,8 +13,8 @@ from wavebatch.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Divisi
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
-from wavebatch.io.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
-from wavebatch.io.returnfile import ReturnReader
+from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 
 _BIN = 0.01
 _BINS = 10_000

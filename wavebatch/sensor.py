@@ -11,9 +11,9 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.io.rays import Rays, sample_rays
-from wavebatch.io.strip import StripReader, StripScan
-from wavebatch.io.trajectoryfile import read_trajectory
+from wavebatch.files.strip.ray_sample import Rays, sample_rays
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
 
 NODE_SECONDS = 0.5

@@ -11,9 +11,9 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.io.fullwave import FullwaveWriter
-from wavebatch.io.header import is_projection, read_header
-from wavebatch.io.returnfile import ReturnReader
+from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.las.header import is_projection, read_header
+from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.simulate.pulses import PulseModel

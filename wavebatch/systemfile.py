@@ -14,7 +14,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.io.publish import Draft, is_stream, open_stream, reporting
+from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
 from wavebatch.survey import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"

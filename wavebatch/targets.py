@@ -19,11 +19,11 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.fingerprint import take_fingerprint
-from wavebatch.io.strip import StripReader
+from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.geojson import find_inside, read_features
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
-from wavebatch.polygons import find_inside, read_features
 from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
 
 LEAST_ECHOES = 10

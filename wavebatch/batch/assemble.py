@@ -14,12 +14,12 @@ from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import count_reasons
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.io.rawbytes import widen
+from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
 if TYPE_CHECKING:
-    from wavebatch.io.layout import OutputLayout
-    from wavebatch.io.strip import Unit
+    from wavebatch.files.cloud.layout import OutputLayout
+    from wavebatch.files.strip.reader import Unit
 
 NEEDED = ("x", "y", "z", "point")
 """Attribute columns without which echoes cannot become points."""

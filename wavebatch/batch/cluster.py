@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io.publish import reporting
-from wavebatch.io.scratch import owning_scratch, use_scratch
+from wavebatch.files.disk.publish import reporting
+from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 PATIENCE = 60.0
 """Seconds without a worker, or without a word of the scheduler, after which a cluster counts as lost."""

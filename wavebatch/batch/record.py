@@ -17,7 +17,7 @@ from wavebatch.batch.work import Prepared, StripJob
 from wavebatch.choice import describe_choice, describe_survey
 from wavebatch.config import effective
 from wavebatch.core.no_data import without_nan
-from wavebatch.io.fingerprint import take_fingerprint
+from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.systemfile import format_survey, write_text
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"

@@ -21,7 +21,7 @@ from wavebatch.batch.task import BatchOptions, StripTask
 from wavebatch.batch.work import StripJob
 from wavebatch.batch.workers import Workers
 from wavebatch.core.errors import InputError
-from wavebatch.io.publish import remove_stale, reporting
+from wavebatch.files.disk.publish import remove_stale, reporting
 
 
 @dataclass(frozen=True, slots=True)

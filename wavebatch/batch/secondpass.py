@@ -24,9 +24,9 @@ from wavebatch.batch.work import unpack
 from wavebatch.chain import Step
 from wavebatch.core.echoes import COLUMNS, RAY
 from wavebatch.core.no_data import NoData
-from wavebatch.io.layout import OutputLayout
-from wavebatch.io.rowstore import RowStore
-from wavebatch.io.spool import Spool
+from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.disk.row_file import RowStore
+from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
 

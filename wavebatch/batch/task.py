@@ -29,9 +29,9 @@ from wavebatch.batch.secondpass import SecondPass, process_tile
 from wavebatch.batch.work import Prepared, StripJob, prepare_strip, process_packed_unit
 from wavebatch.batch.workers import Workers
 from wavebatch.core.errors import InputError
-from wavebatch.io.fingerprint import take_fingerprint
-from wavebatch.io.publish import refuse_existing
-from wavebatch.io.writer import CloudWriter
+from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.publish import refuse_existing
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,8 +23,8 @@ from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.layout import OutputLayout, plan_output
-from wavebatch.io.strip import StripFacts, StripReader, StripScan, Unit
+from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.survey.levels import measure_level
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.memory import keep_freed_memory
-from wavebatch.io.scratch import owning_scratch, use_scratch
+from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 

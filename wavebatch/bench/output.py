@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.bench.plot import can_plot, plot_scene
-from wavebatch.io.publish import reporting
+from wavebatch.files.disk.publish import reporting
 
 
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.bench.pareto import find_front
-from wavebatch.pictures import open_picture, plain_text
+from wavebatch.files.figure_file import open_picture, plain_text
 
 PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),

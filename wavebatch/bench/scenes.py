@@ -12,7 +12,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.strip import StripReader
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.simulate.draws import Drawn
 from wavebatch.survey import SAMPLE, survey_blocks

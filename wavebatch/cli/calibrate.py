@@ -53,7 +53,7 @@ def calibrate(
     its targets give no constant, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.calibration import format_calibration
-    from wavebatch.io.publish import refuse_existing
+    from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.systemfile import load_survey, write_text
     from wavebatch.targets import calibrate_strip, load_targets
 

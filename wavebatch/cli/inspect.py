@@ -8,9 +8,9 @@ from typing import Any
 
 import click
 
-from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors
 from wavebatch.cli.options import direction_option, headerless_option, json_option
+from wavebatch.files.inputs import find_files
 from wavebatch.inspection import check_file, describe_strip
 
 EXIT_PROBLEMS = 1

@@ -95,7 +95,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     run` does it. Exit code: 0, 1 where the strip cannot be read or the picture not be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.core.errors import ConfigError
-    from wavebatch.pictures import check_picture
+    from wavebatch.files.figure_file import check_picture
     from wavebatch.plots.packets import Wanted
     from wavebatch.plots.values import read_flags
 
@@ -119,7 +119,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     """The waveforms that are wanted, and the name of the chain that they were run through."""
     from wavebatch.choice import make_choice
     from wavebatch.cli.run import choose_chain
-    from wavebatch.io.strip import StripReader
+    from wavebatch.files.strip.reader import StripReader
     from wavebatch.plots.packets import find_places
     from wavebatch.plots.waveform import read_views
 
@@ -154,8 +154,8 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     column of whole steps hold the same number of steps each. Exit code: 0, 1 where a cloud cannot be read or the
     picture not be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.batch.inputs import find_files
-    from wavebatch.pictures import check_picture
+    from wavebatch.files.figure_file import check_picture
+    from wavebatch.files.inputs import find_files
     from wavebatch.plots.histogram import count_flags, count_values, is_flags
 
     check_picture(output, overwrite=options["overwrite"])
@@ -216,9 +216,9 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt. Colours lie between the 2nd and the 98th percentile of
     the cells. Exit code: 0, 1 where a cloud cannot be read or the picture not be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.batch.inputs import find_files
     from wavebatch.core.errors import ConfigError
-    from wavebatch.pictures import check_picture
+    from wavebatch.files.figure_file import check_picture
+    from wavebatch.files.inputs import find_files
     from wavebatch.plots.raster import grid_values
 
     check_picture(output, overwrite=options["overwrite"])

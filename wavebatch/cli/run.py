@@ -134,11 +134,11 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
-    from wavebatch.batch.inputs import find_strips
     from wavebatch.batch.plan import check_outputs, plan_memory
     from wavebatch.batch.task import BatchOptions
     from wavebatch.batch.work import RunOptions, StripJob, choose_columns
     from wavebatch.calibration import load_calibration
+    from wavebatch.files.inputs import find_strips
 
     chain, request = choose_chain(options)
     calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None

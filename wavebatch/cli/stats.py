@@ -14,12 +14,12 @@ from typing import Any
 import click
 
 from wavebatch.areas import AreaStats, Grid, PolygonSet
-from wavebatch.batch.inputs import find_files
 from wavebatch.cli.common import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option, overwrite_option
 from wavebatch.core.errors import InputError
-from wavebatch.io.publish import refuse_existing
-from wavebatch.polygons import load_polygons
+from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.geojson import load_polygons
+from wavebatch.files.inputs import find_files
 from wavebatch.returns import ReturnStats, count_returns
 from wavebatch.systemfile import write_text
 

@@ -14,7 +14,7 @@ from wavebatch.cli.options import direction_option, headerless_option, json_opti
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
-    from wavebatch.io.strip import StripReader, StripScan
+    from wavebatch.files.strip.reader import StripReader, StripScan
     from wavebatch.systemfile import SavedSurvey
 
 
@@ -42,7 +42,7 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     or a file not be written.
     """  # fmt: skip
     from wavebatch.auto import chain_text
-    from wavebatch.io.publish import refuse_existing
+    from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.systemfile import write_survey, write_text
 
     overwrite = options["overwrite"]
@@ -68,8 +68,8 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     """The survey, and what else is told about the strip."""
     from wavebatch.choice import read_sample, survey_sample
     from wavebatch.core.errors import InputError
-    from wavebatch.io.fingerprint import take_fingerprint
-    from wavebatch.io.strip import StripReader
+    from wavebatch.files.disk.fingerprint import take_fingerprint
+    from wavebatch.files.strip.reader import StripReader
     from wavebatch.outlook import survey_angles
     from wavebatch.systemfile import SavedSurvey
 

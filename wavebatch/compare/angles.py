@@ -10,8 +10,8 @@ import numpy as np
 from wavebatch.compare.differences import SPEED
 from wavebatch.compare.pairing import check_tolerance, pair_echoes
 from wavebatch.core.errors import InputError
-from wavebatch.io.anglefile import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
-from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.files.cloud.angle_reader import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
 
 BIN, DIFFERENCE_BIN = 5.0, 2.0
 """Widths of the histograms' bins [deg]: of angles, of their differences."""

@@ -19,8 +19,8 @@ from wavebatch.config import list_profiles, load_chain, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
-from wavebatch.io.strip import StripReader, StripScan
+from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.survey import Survey
 
 AUTO = "auto"

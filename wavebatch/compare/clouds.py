@@ -10,8 +10,8 @@ import numpy as np
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.io.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
-from wavebatch.io.cloud import CLOUD_DTYPE, CloudReader
+from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
 from wavebatch.simulate.truth import TruthReader
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.pictures import open_picture, plain_text
+from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.plots.histogram import PERCENTILES, FlagCounts, Histogram
 from wavebatch.plots.raster import Raster
 from wavebatch.plots.values import Tally

@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.pictures import open_picture, plain_text
+from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.plots.waveform import WaveformView
 
 if TYPE_CHECKING:

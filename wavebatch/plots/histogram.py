@@ -12,7 +12,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.io.columns import ColumnFacts
+from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits
 
 MOST_BINS = 10_000

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.io.strip import StripReader, StripScan, Unit
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 
 FARTHEST = 1e-3
 """A pulse further from the time asked for is not meant [s]."""

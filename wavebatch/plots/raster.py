@@ -11,8 +11,8 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.io.buckets import Buckets, count_buckets
-from wavebatch.io.columns import ColumnFacts
+from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.disk.buckets import Buckets, count_buckets
 from wavebatch.plots.values import Clouds, Selection, Tally, robust_limits
 
 STATISTICS = ("mean", "median", "min", "max", "count", "density")

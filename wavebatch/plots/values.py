@@ -11,7 +11,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
-from wavebatch.io.columns import ColumnFacts, ColumnReader, check_alike
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; what lies far beyond them is damage or a rarity."""

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.chain import Chain
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.strip import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.plots.packets import Place
 from wavebatch.stages.models import MODELS

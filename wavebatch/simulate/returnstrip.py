@@ -10,7 +10,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
-from wavebatch.io.returnfile import FORMATS, ReturnWriter
+from wavebatch.files.cloud.return_io import FORMATS, ReturnWriter
 from wavebatch.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
 from wavebatch.simulate.discrete import DiscreteReceiver
 from wavebatch.simulate.geometry import EAST, NORTH, Flight

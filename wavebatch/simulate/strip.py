@@ -13,7 +13,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.evaluate import find_isolated
-from wavebatch.io.fullwave import FullwaveWriter
+from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.simulate.blocks import SEED_BLOCK, Simulated, cut_block, simulate_seed_block
 from wavebatch.simulate.geometry import EAST, NORTH, Flight, Rays
 from wavebatch.simulate.returns import Returns, list_returns

@@ -11,7 +11,7 @@ from typing import IO, Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.io.npz import NpzWriter
+from wavebatch.files.disk.npz import NpzWriter
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.io.sharing import expand
-from wavebatch.io.strip import StripReader, StripScan, Unit
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.files.strip.shared_packets import expand
 from wavebatch.kernels.geometry.scan_lines import find_sweeps
 
 LEAST_PULSES = 8

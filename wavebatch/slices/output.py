@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.io.publish import Draft, refuse_existing, reporting
-from wavebatch.pictures import open_picture
+from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.figure_file import open_picture
 from wavebatch.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")

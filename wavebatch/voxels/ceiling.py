@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.io.scanner import locate
-from wavebatch.io.strip import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.scanner import locate
 
 LEAST_CELL = 4.0
 """Of the map of highest returns [m]."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.io.sums import HELD, KeyedSums
+from wavebatch.files.disk.key_sums import HELD, KeyedSums
 from wavebatch.kernels.geometry.voxels import (
     Crossings,
     cross_voxels,

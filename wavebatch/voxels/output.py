@@ -12,9 +12,10 @@ import numpy as np
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.io.extra import ExtraRecord, build_dtype
-from wavebatch.io.facts import StripFacts
-from wavebatch.io.header import (
+from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.disk.publish import Draft
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
+from wavebatch.files.las.header import (
     PROJECTION,
     WKT_BIT,
     WKT_ID,
@@ -25,9 +26,8 @@ from wavebatch.io.header import (
     is_projection,
     read_header,
 )
-from wavebatch.io.npz import NpzWriter
-from wavebatch.io.pointfile import PointFile
-from wavebatch.io.publish import Draft
+from wavebatch.files.las.write_points import PointFile
+from wavebatch.files.strip.facts import StripFacts
 from wavebatch.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")

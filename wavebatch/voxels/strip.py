@@ -15,9 +15,9 @@ from wavebatch.choice import read_sample, survey_sample
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.io.publish import refuse_existing
-from wavebatch.io.strip import StripReader, StripScan
-from wavebatch.io.sums import HELD
+from wavebatch.files.disk.key_sums import HELD
+from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
 from wavebatch.systemfile import SavedSurvey, describe_system

@@ -1,0 +1,78 @@
+"""Columns of unknown length as one .npz: spooled to disk while they come, then written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+
+_PIECE = 1 << 18
+
+
+class NpzWriter:
+    """Takes columns piece by piece: `add`, then `publish`; memory does not grow with their length.
+
+    columns: type of every column; rows of one with a shape (k,) make an array (n, k). The same values give the same
+    bytes. Raises InputError where the target exists (without overwrite) or cannot be written.
+    """
+
+    def __init__(self, target: Path, columns: Mapping[str, np.dtype | str], *, overwrite: bool = False) -> None:
+        self.target = Path(target)
+        if not overwrite:
+            refuse_existing(self.target)
+        self._dtypes = {name: np.dtype(dtype) for name, dtype in columns.items()}
+        self._lengths = dict.fromkeys(self._dtypes, 0)
+        with contextlib.ExitStack() as stack, reporting(self.target):
+            self._draft = Draft(self.target, overwrite=overwrite)
+            stack.callback(self._draft.discard)
+            folder = self.target.parent
+            self._spools: dict[str, IO[bytes]] = {
+                name: stack.enter_context(tempfile.TemporaryFile(dir=folder)) for name in self._dtypes
+            }
+            self._opened = stack.pop_all()
+
+    def add(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Appends values to the columns named."""
+        for name, values in columns.items():
+            with reporting(self.target):
+                self._spools[name].write(np.ascontiguousarray(values, self._dtypes[name].base).tobytes())
+            self._lengths[name] += len(values)
+
+    def publish(self, single: Mapping[str, np.ndarray | str | float]) -> None:
+        """Writes the .npz, with further values that are no columns behind them, and gives it its name."""
+        with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
+            for name, spool in self._spools.items():
+                dtype = self._dtypes[name]
+                shape = (self._lengths[name], *dtype.shape)
+                with _open_member(archive, name) as member:
+                    header = {"descr": dtype.base.str, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(member, header)
+                    spool.seek(0)
+                    shutil.copyfileobj(spool, member, _PIECE)
+            for name, value in single.items():
+                with _open_member(archive, name) as member:
+                    np.lib.format.write_array(member, np.array(value), allow_pickle=False)
+        self._draft.publish()
+        self.discard()
+
+    def withdraw(self) -> None:
+        """Takes the published file back."""
+        self._draft.withdraw()
+
+    def discard(self) -> None:
+        """Closes and removes everything temporary; harmless after `publish`."""
+        with contextlib.suppress(OSError):  # a full disk has been told when it was written to
+            self._opened.close()
+
+
+def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
+    """A member with a fixed date."""
+    return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)

@@ -1,0 +1,109 @@
+"""Entries sorted into numbered buckets: in memory while they are few, on disk beyond that."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.files.disk.raw_bytes import read_exactly
+from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
+
+MEMORY = 1 << 24
+"""Bytes of entries that are held before they go to disk."""
+KEPT = 1 << 20
+"""Bytes of entries that stay in memory after all: a sealed spool travels to other processes."""
+
+
+class Spool:
+    """Takes entries of one dtype for buckets 0..n-1; after `seal` it is read-only and can be pickled.
+
+    What does not fit memory lies in one temporary file as segments, each sorted by bucket and led by a table of where
+    its buckets begin. `close` removes the file; copies in other processes only read it.
+    """
+
+    def __init__(self, buckets: int, dtype: np.dtype) -> None:
+        self.buckets = buckets
+        self.dtype = np.dtype(dtype)
+        self.folder: Path | None = None
+        self.count = 0
+        self._pending: list[tuple[np.ndarray, np.ndarray]] = []
+        self._held = 0
+        self._segments: list[int] = []
+        self._memory: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def path(self) -> Path | None:
+        """The temporary file, or None while everything fits memory."""
+        return None if self.folder is None else self.folder / "spool"
+
+    def append(self, bucket: np.ndarray, entries: np.ndarray) -> None:
+        """Adds entries (k,) to buckets (k,)."""
+        if not len(entries):
+            return
+        self._pending.append((bucket.astype(np.int64), entries))
+        self._held += entries.nbytes + 8 * len(bucket)
+        self.count += len(entries)
+        if self._held >= MEMORY:
+            self._flush()
+
+    def seal(self) -> Spool:
+        """Ends the writing."""
+        if self._segments or self._held > KEPT:
+            self._flush()
+        else:
+            self._memory = self._take_pending()
+        return self
+
+    def read(self, bucket: int) -> np.ndarray:
+        """Entries of a bucket in the order in which they were added."""
+        parts = list(self.pieces(bucket))
+        if not parts:
+            return np.empty(0, self.dtype)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def pieces(self, bucket: int) -> Iterator[np.ndarray]:
+        """The same entries part by part, each as large as a segment held."""
+        if self._memory is not None:
+            starts, entries = self._memory
+            if starts[bucket + 1] > starts[bucket]:
+                yield entries[starts[bucket] : starts[bucket + 1]]
+            return
+        with reporting_scratch(), open(self.path, "rb", buffering=0) as file:
+            for at in self._segments:
+                edges = np.empty(2, np.int64)
+                read_exactly(file.fileno(), edges.view(np.uint8), at + 8 * bucket)
+                part = np.empty(int(edges[1] - edges[0]), self.dtype)
+                begin = at + 8 * (self.buckets + 1) + int(edges[0]) * self.dtype.itemsize
+                read_exactly(file.fileno(), part.view(np.uint8).reshape(-1), begin)
+                if len(part):
+                    yield part
+
+    def close(self) -> None:
+        """Removes the temporary file; harmless twice."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        self._pending, self._memory = [], None
+
+    def _take_pending(self) -> tuple[np.ndarray, np.ndarray]:
+        """Start of every bucket, i8 (buckets + 1,), and the entries sorted by bucket."""
+        pending, self._pending, self._held = self._pending, [], 0
+        if not pending:
+            return np.zeros(self.buckets + 1, np.int64), np.empty(0, self.dtype)
+        bucket = np.concatenate([part for part, _ in pending])
+        entries = np.concatenate([part for _, part in pending])
+        order = np.argsort(bucket, kind="stable")
+        starts = np.searchsorted(bucket[order], np.arange(self.buckets + 1))
+        return starts.astype(np.int64), entries[order]
+
+    def _flush(self) -> None:
+        starts, entries = self._take_pending()
+        with reporting_scratch():
+            if self.folder is None:
+                self.folder = make_folder()
+            with open(self.path, "ab") as file:
+                self._segments.append(file.tell())
+                file.write(starts.data)
+                file.write(entries.view(np.uint8).data)

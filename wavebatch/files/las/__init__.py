@@ -1,0 +1,1 @@
+"""LAS and LAZ point files: headers, CRS, extra bytes, points in and out."""

@@ -1,0 +1,201 @@
+"""Extra bytes: the 192-byte records that describe them, and what the values of a record can be."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.files.las.header import STANDARD_DTYPES
+
+RECORD_SIZE = 192
+EXTRA_BYTES_RECORD_ID = 4
+_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+_NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
+_AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_OFFSET, _AT_DESCRIPTION = 40, 64, 88, 112, 136, 160
+
+
+@dataclass(frozen=True, slots=True)
+class ExtraRecord:
+    """One described extra dimension; `data` are the 192 bytes as they stand in the file."""
+
+    data: bytes
+
+    @classmethod
+    def build(
+        cls,
+        name: str,
+        dtype: str,
+        description: str,
+        *,
+        no_data: float | None = None,
+        scale: float | None = None,
+    ) -> ExtraRecord:
+        """A record for one new dimension; no_data is the stored value, name and description fit 32 bytes."""
+        texts = name.encode("utf-8"), description.encode("utf-8")
+        if any(len(text) > 32 for text in texts):
+            raise ValueError(f"extra bytes {name!r}: name and description hold 32 bytes at most")
+        code = _TYPES.index(np.dtype(dtype).str[1:]) + 1
+        options = 0 if scale is None else _SCALE | _OFFSET
+        scales = (scale or 0.0, 0.0, 0.0)
+        front = struct.pack("<HBB32s4x", 0, code, options, texts[0])
+        record = cls(front + bytes(72) + struct.pack("<6d32s", *scales, 0.0, 0.0, 0.0, texts[1]))
+        return record if no_data is None else record.with_no_data([no_data])
+
+    @classmethod
+    def undocumented(cls, name: str, size: int) -> ExtraRecord:
+        """A record of type 0 over `size` (1 to 255) bytes of which nothing is known."""
+        return cls(struct.pack("<HBB32s", 0, 0, size, name.encode()) + bytes(RECORD_SIZE - 36))
+
+    @property
+    def name(self) -> str:
+        """The name up to its first NUL."""
+        return self.data[4:36].split(b"\0")[0].decode("utf-8", "replace")
+
+    @property
+    def description(self) -> str:
+        """The description up to its first NUL."""
+        return self.data[_AT_DESCRIPTION:].split(b"\0")[0].decode("utf-8", "replace")
+
+    @property
+    def code(self) -> int:
+        """Data type of the LAS specification: 0 undocumented, 1-10 scalars, 11-30 the deprecated vectors."""
+        return self.data[2]
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the size of the dimension can be told."""
+        return self.code <= 30 and self.dtype.itemsize > 0
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Stored type, with the shape (k,) of the deprecated vectors and of undocumented bytes."""
+        if self.code == 0:
+            return np.dtype(("u1", (self.data[3],))) if self.data[3] != 1 else np.dtype("u1")
+        kind, length = _TYPES[(self.code - 1) % 10], (self.code - 1) // 10 + 1
+        return np.dtype(f"<{kind}") if length == 1 else np.dtype((f"<{kind}", (length,)))
+
+    @property
+    def _container(self) -> np.dtype:
+        """Type of the 8-byte numbers in which no-data, least and largest value are declared."""
+        return np.dtype(f"<{self.dtype.base.kind}8")
+
+    def _numbers(self, at: int, option: int) -> np.ndarray | None:
+        if self.code == 0 or not self.data[3] & option:
+            return None
+        dtype = self.dtype
+        numbers = np.frombuffer(self.data, self._container, max(1, dtype.itemsize // dtype.base.itemsize), at)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return numbers.astype(dtype.base)
+
+    @property
+    def scaling(self) -> tuple[float, float] | None:
+        """Scale and offset of a scalar's stored value, or None where it is the value itself."""
+        if not self.data[3] & _SCALE or not 1 <= self.code <= 10:
+            return None
+        (scale,) = struct.unpack_from("<d", self.data, _AT_SCALE)
+        (offset,) = struct.unpack_from("<d", self.data, _AT_OFFSET)
+        return scale, offset if self.data[3] & _OFFSET else 0.0
+
+    @property
+    def no_data(self) -> np.ndarray | None:
+        """Stored value per element that means "none", or None where the record declares none."""
+        return self._numbers(_AT_NO_DATA, _NO_DATA)
+
+    @property
+    def declared_range(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Least and largest stored value per element as declared; what files declare is often not true."""
+        least, largest = self._numbers(_AT_MIN, _MIN), self._numbers(_AT_MAX, _MAX)
+        return None if least is None or largest is None else (least, largest)
+
+    def _with(self, at: int, option: int, numbers: np.ndarray | list | None) -> ExtraRecord:
+        data = bytearray(self.data)
+        data[at : at + 24] = bytes(24)
+        data[3] &= ~option
+        if numbers is not None:
+            packed = np.asarray(numbers).astype(self._container).tobytes()
+            data[at : at + len(packed)] = packed
+            data[3] |= option
+        return ExtraRecord(bytes(data))
+
+    def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:
+        """The record with this stored no-data value per element."""
+        return self._with(_AT_NO_DATA, _NO_DATA, numbers)
+
+    def with_range(self, least: np.ndarray | None, largest: np.ndarray | None) -> ExtraRecord:
+        """The record with these stored extremes; None takes the declaration away. Type 0 has none."""
+        if self.code == 0:
+            return self
+        return self._with(_AT_MIN, _MIN, least)._with(_AT_MAX, _MAX, largest)
+
+
+def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
+    """Records of all `size` extra bytes of a point; bytes that `payload` does not describe get records of type 0.
+
+    A record whose type nobody knows, or that reaches beyond the extra bytes, ends the description.
+    """
+    records: list[ExtraRecord] = []
+    left = size
+    for at in range(0, len(payload) - RECORD_SIZE + 1, RECORD_SIZE):
+        record = ExtraRecord(payload[at : at + RECORD_SIZE])
+        if not record.is_known or record.dtype.itemsize > left:
+            break
+        records.append(record)
+        left -= record.dtype.itemsize
+    taken = {record.name for record in records}
+    number = 1
+    while left:
+        name = "ExtraBytes" if number == 1 else f"ExtraBytes {number}"
+        number += 1
+        if name not in taken:
+            records.append(ExtraRecord.undocumented(name, min(left, 255)))
+            left -= min(left, 255)
+    return records
+
+
+def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
+    """One point record: the standard fields as laspy names them, then the extra dimensions.
+
+    A field has its record's name; where that is empty or taken, " 2", " 3" ... follows.
+    """
+    standard = STANDARD_DTYPES[point_format]
+    fields = {name: standard[name] for name in standard.names}
+    for record in records:
+        name, number = record.name, 1
+        while not name or name in fields:
+            number += 1
+            name = f"{record.name} {number}"
+        fields[name] = record.dtype
+    return np.dtype(list(fields.items()))
+
+
+def choose_no_data(record: ExtraRecord, extremes: tuple[float, float] | None = None) -> np.ndarray | None:
+    """A stored value per element that no real value has, or None where none is safe.
+
+    A declared value stays. Floating-point numbers take NaN. Integers take the value half way between the largest and
+    the least one, counted round the end of the type, so that a value that has wrapped round does not meet it either:
+    extremes are the true least and largest; without them those that the record declares, unless they are equal (then
+    nobody ever filled them in). Undocumented bytes have none.
+    """
+    if record.no_data is not None or record.code == 0:
+        return record.no_data
+    base = record.dtype.base
+    length = max(1, record.dtype.itemsize // base.itemsize)
+    if base.kind == "f":
+        return np.full(length, np.nan, base)
+    if extremes is not None:
+        ranges = [(int(extremes[0]), int(extremes[1]))] * length
+    elif record.declared_range is not None:
+        ranges = [(int(least), int(largest)) for least, largest in zip(*record.declared_range, strict=True)]
+        if any(least >= largest for least, largest in ranges):
+            return None
+    else:
+        return None
+    count = 1 << (8 * base.itemsize)
+    gaps = [count - (largest - least) for least, largest in ranges]
+    if min(gaps) < 3:
+        return None
+    middles = [(largest + gap // 2) % count for (_, largest), gap in zip(ranges, gaps, strict=True)]
+    return np.array(middles, f"<u{base.itemsize}").view(base)

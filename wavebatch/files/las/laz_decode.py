@@ -1,0 +1,208 @@
+"""Points of LAZ files, chunk by chunk: what the compression's records claim is checked before a decoder sees it."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import lazrs
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk.raw_bytes import guarded, read_exactly
+from wavebatch.files.las.checked_header import CheckedHeader
+from wavebatch.files.las.header import LasHeader, has_record
+from wavebatch.files.las.laszip_decode import LaszipPoints
+
+LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
+MAX_CHUNKS = 2_000_000
+MAX_CHUNK_POINTS = 5_000_000
+MAX_CHUNK_BYTES = 1 << 28
+MAX_POINTS_PER_BYTE = 1000
+_PIECE = 50_000
+_LASZIP = struct.Struct("<HHBBHIIqqH")
+_ITEM = struct.Struct("<HHH")
+_VARIABLE = 2**32 - 1
+_ITEM_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, 10: 30, 11: 6, 12: 8, 13: 29}
+_FORMAT_ITEMS = {
+    0: (6,), 1: (6, 7), 2: (6, 8), 3: (6, 7, 8), 4: (6, 7, 9), 5: (6, 7, 8, 9),
+    6: (10,), 7: (10, 11), 8: (10, 12), 9: (10, 13), 10: (10, 12, 13),
+}  # fmt: skip
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers per item of the layered coding; extra bytes have one per byte."""
+_BYTES = {0, 14}
+
+
+def open_laz(checked: CheckedHeader) -> LazPoints | LaszipPoints:
+    """A reader of the points: lazrs, or the optional laszip backend where lazrs does not know the coding.
+
+    Raises InputError where the compression's own records are damaged or nobody here can decode them.
+    """
+    coding = _read_coding(checked.path, checked.header)
+    _check_total(checked)
+    return LaszipPoints(checked) if coding.newest > 3 else LazPoints(checked, coding)
+
+
+class _Coding:
+    """What the "laszip encoded" record says, checked."""
+
+    def __init__(self, payload: bytes, chunk_points: int, items: list[tuple[int, int, int]]) -> None:
+        self.payload = payload
+        self.chunk_points = chunk_points
+        self.items = items
+        self.newest = max(version for _, _, version in items)
+        self.layers = 0
+        if items[0][0] == 10:
+            self.layers = sum(size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items)
+
+
+def _read_coding(path: Path, header: LasHeader) -> _Coding:
+    payload = next((vlr.payload for vlr in header.vlrs if has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
+    damaged = InputError(f"{path}: its \"laszip encoded\" record is missing or damaged; get the file again")
+    if len(payload) < _LASZIP.size:
+        raise damaged
+    compressor, coder, *_, chunk_points, _, _, n_items = _LASZIP.unpack_from(payload)
+    if len(payload) < _LASZIP.size + n_items * _ITEM.size or not n_items:
+        raise damaged
+    items = [_ITEM.unpack_from(payload, _LASZIP.size + number * _ITEM.size) for number in range(n_items)]
+    kinds = tuple(kind for kind, _, _ in items if kind not in _BYTES)
+    good = all(size == _ITEM_SIZES[kind] if kind in _ITEM_SIZES else kind in _BYTES for kind, size, _ in items)
+    length = sum(size for _, size, _ in items)
+    if not good or kinds != _FORMAT_ITEMS[header.point_format] or length != header.point_length or coder != 0:
+        raise damaged
+    if [kind for kind, _, _ in items if kind in _BYTES] not in ([], [14 if header.point_format > 5 else 0]):
+        raise damaged
+    if compressor != (3 if header.point_format > 5 else 2) or not 0 < chunk_points <= _VARIABLE:
+        raise InputError(f"{path}: compressed in a way that is not chunked; run laszip -i IN.laz -o OUT.las first")
+    if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
+        raise InputError(
+            f"{path}: LAZ chunks of {chunk_points} points do not fit memory; run laszip -i IN.laz -o OUT.las first"
+        )
+    return _Coding(payload[: _LASZIP.size + n_items * _ITEM.size], chunk_points, items)
+
+
+class LazPoints:
+    """One LAZ chunk at a time is in memory; points before the wanted ones are decoded and dropped."""
+
+    def __init__(self, checked: CheckedHeader, coding: _Coding) -> None:
+        self._checked, self._coding = checked, coding
+        self._file = open(checked.path, "rb", buffering=0)  # noqa: SIM115 - closed by close()
+        try:
+            self._first, self._place = _read_chunk_table(self._file.fileno(), checked, coding)
+        except BaseException:
+            self._file.close()
+            raise
+        self._chunk, self._next, self._decoder = -1, 0, None
+
+    def read(self, start: int, stop: int) -> np.ndarray:
+        rows = np.empty(stop - start, self._checked.dtype)
+        done = 0
+        with guarded(self._checked.path, start, stop):
+            while done < len(rows):
+                chunk = int(np.searchsorted(self._first, start + done, "right")) - 1
+                count = min(len(rows) - done, int(self._first[chunk + 1]) - start - done)
+                self._seek(chunk, start + done)
+                self._decode(rows[done : done + count])
+                done += count
+        return rows
+
+    def _seek(self, chunk: int, point: int) -> None:
+        if chunk != self._chunk or point < self._next:
+            self._open_chunk(chunk)
+        while self._next < point:
+            self._decode(np.empty(min(_PIECE, point - self._next), self._checked.dtype))
+
+    def _decode(self, rows: np.ndarray) -> None:
+        self._decoder.decompress_many(rows.view(np.uint8).reshape(-1))
+        self._next += len(rows)
+
+    def _open_chunk(self, chunk: int) -> None:
+        """Hands lazrs this chunk as a small file of its own, so that it can believe nothing beyond it."""
+        start, end = int(self._place[chunk]), int(self._place[chunk + 1])
+        data = np.empty(end - start + 8, np.uint8)
+        data[:8] = np.frombuffer(struct.pack("<q", len(data)), np.uint8)
+        read_exactly(self._file.fileno(), data[8:], start)
+        self._check_layers(data[8:])
+        count = int(self._first[chunk + 1] - self._first[chunk])
+        small = io.BytesIO(data)
+        small.seek(0, 2)
+        lazrs.write_chunk_table(small, [(count, end - start)], lazrs.LazVlr(self._coding.payload))
+        small.seek(0)
+        self._decoder = lazrs.LasZipDecompressor(small, self._coding.payload)
+        self._chunk, self._next = chunk, int(self._first[chunk])
+
+    def _check_layers(self, chunk: np.ndarray) -> None:
+        if not self._coding.layers:
+            return
+        at = self._checked.dtype.itemsize + 4
+        sizes = chunk[at : at + 4 * self._coding.layers]
+        total = at + 4 * self._coding.layers
+        if len(sizes) == 4 * self._coding.layers:
+            total += int(sizes.view("<u4").sum(dtype=np.uint64))
+        if total > len(chunk):
+            raise InputError(
+                f"{self._checked.path}: a LAZ chunk holds {len(chunk)} bytes and claims {total}; the file is damaged: "
+                "get it again"
+            )
+
+    def close(self) -> None:
+        self._file.close()
+        self._decoder = None
+
+
+def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple[np.ndarray, np.ndarray]:
+    """First point and first byte of every chunk, i8, each with one more entry for the end."""
+    start, total = checked.header.offset_to_points, checked.header.point_count
+    if not total:
+        return np.zeros(1, np.int64), np.zeros(1, np.int64)
+    broken = InputError(
+        f"{checked.path}: the table of LAZ chunks is missing or damaged; the file is cut, or was never closed: get it "
+        "again"
+    )
+    if start + 8 > checked.size:
+        raise broken
+    table = _read_i8(fd, start)
+    if table == -1:  # written as a stream: the table's place stands at the very end
+        table = _read_i8(fd, checked.size - 8)
+    if not start + 8 <= table <= checked.size - 8:
+        raise broken
+    head = np.empty(8, np.uint8)
+    read_exactly(fd, head, table)
+    version, count = head.view("<u4").tolist()
+    if version != 0 or not 0 < count <= min(MAX_CHUNKS, table - start - 8):
+        raise broken
+    with open(checked.path, "rb") as file, guarded(checked.path, 0, total):
+        file.seek(table)
+        chunks = np.array(lazrs.read_chunk_table_only(file, lazrs.LazVlr(coding.payload)), np.uint64)
+    if len(chunks) != count or (chunks > np.uint64(max(MAX_CHUNK_BYTES, MAX_CHUNK_POINTS))).any():
+        raise broken
+    counts, sizes = chunks.astype(np.int64).T
+    if coding.chunk_points != _VARIABLE:
+        counts = np.full(count, coding.chunk_points)
+    counts[-1] = min(counts[-1], total - counts[:-1].sum())
+    if counts.min() < 0 or counts.max() > MAX_CHUNK_POINTS or counts.sum() != total or sizes.max() > MAX_CHUNK_BYTES:
+        raise InputError(
+            f"{checked.path}: {count} LAZ chunks hold {counts.clip(0).sum()} points, the header claims {total}; the "
+            "file is damaged, or its chunks are too large: run laszip -i IN.laz -o OUT.las, which says more"
+        )
+    first = np.concatenate([[0], np.cumsum(counts)])
+    place = start + 8 + np.concatenate([[0], np.cumsum(sizes)])
+    if place[-1] > table or (sizes < checked.dtype.itemsize)[counts > 0].any():
+        raise broken
+    return first, place
+
+
+def _check_total(checked: CheckedHeader) -> None:
+    """Refuses counts that no compression could hold: they would make a scan of nothing last for ever."""
+    total = checked.header.point_count
+    if total > checked.size * MAX_POINTS_PER_BYTE:
+        raise InputError(
+            f"{checked.path}: the header claims {total} points in {checked.size} bytes; damaged: get the file again"
+        )
+
+
+def _read_i8(fd: int, at: int) -> int:
+    data = np.empty(8, np.uint8)
+    read_exactly(fd, data, at)
+    return int(data.view("<i8")[0])

@@ -1,0 +1,161 @@
+"""Point records into a file: as they are, or compressed by lazrs or LASzip, whichever writes the format rightly."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, BinaryIO, Protocol
+
+import lazrs
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
+
+try:
+    import laszip
+except ImportError:  # optional: only waveform formats 9 and 10 with several scanner channels need it
+    laszip = None
+
+_ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError] if laszip else []))
+
+_WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
+_ITEMS_AT = 34
+"""Offset of the list of items in the "laszip encoded" record."""
+
+
+class PointEncoder(Protocol):
+    """Takes records and leaves them in the file; `finish` ends the points and must be called once."""
+
+    def write(self, rows: np.ndarray) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
+    """Writes header and VLRs at the start of `file` and returns what takes the points behind them.
+
+    The "laszip encoded" record of a compressed file is added to `header.vlrs`.
+    """
+    if not header.compressed:
+        return _PlainEncoder(file, header)
+    if header.point_format in (9, 10) and laszip is not None:
+        return _LaszipEncoder(file, header)
+    return _LazrsEncoder(file, header)
+
+
+class _WatchedFile:
+    """What the compressors write to: keeps the reason of a failure, of which they only tell that there was one."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._error: OSError | None = None
+        self.tell, self.read = file.tell, file.read
+
+    def write(self, data: bytes) -> int:
+        return self._watch(self._file.write, data)
+
+    def seek(self, *place: int) -> int:
+        return self._watch(self._file.seek, *place)
+
+    def flush(self) -> None:
+        self._watch(self._file.flush)
+
+    def _watch(self, function: Callable, *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except OSError as error:
+            self._error = self._error or error
+            raise
+
+    @contextlib.contextmanager
+    def explaining(self) -> Iterator[None]:
+        try:
+            yield
+        except _ERRORS as error:
+            raise self._error or InputError(f"the points cannot be compressed: {error}") from error
+
+
+class _PlainEncoder:
+    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+        self._file = file
+        file.write(header.encode())
+
+    def write(self, rows: np.ndarray) -> None:
+        self._file.write(rows.view(np.uint8).data)
+
+    def finish(self) -> None:
+        pass
+
+
+class _LazrsEncoder:
+    """lazrs 0.8 garbles the packet fields of formats 9 and 10 as soon as the scanner channel changes: refused here."""
+
+    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+        extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
+        vlr = lazrs.LazVlr.new_for_compression(header.point_format, extra)
+        payload = _patch_wave_item(bytes(vlr.record_data()))
+        header.vlrs.append(Vlr(b"laszip encoded", 22204, payload, b"http://laszip.org"))
+        file.write(header.encode())
+        self._guarded = header.point_format in (9, 10)
+        self._channel: int | None = None
+        self._watched = _WatchedFile(file)
+        self._compressor = lazrs.LasZipCompressor(self._watched, lazrs.LazVlr(payload))
+
+    def write(self, rows: np.ndarray) -> None:
+        if self._guarded:
+            self._check_channel(rows)
+        with self._watched.explaining():
+            self._compressor.compress_many(rows.view(np.uint8))
+
+    def _check_channel(self, rows: np.ndarray) -> None:
+        channels = (rows["classification_flags"] >> 4) & 0b11
+        if self._channel is None and len(rows):
+            self._channel = int(channels[0])
+        if np.any(channels != self._channel):
+            raise InputError(
+                "points of several scanner channels with packets cannot be written as LAZ by lazrs; "
+                "pip install laszip, write LAS, or leave --keep-packets out"
+            )
+
+    def finish(self) -> None:
+        with self._watched.explaining():
+            self._compressor.done()
+
+
+class _LaszipEncoder:
+    """LASzip 3.5 codes LAS 1.5 in a way that lazrs cannot read: it is shown a header of LAS 1.4 of the same size."""
+
+    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+        version = min(header.version, (1, 4))
+        longer = HEADER_SIZES[header.version] - HEADER_SIZES[version]
+        shown = replace(header, compressed=False, version=version, user_bytes=bytes(longer) + header.user_bytes)
+        self._file, self._header = file, header
+        self._watched = _WatchedFile(file)
+        with self._watched.explaining():
+            self._zipper = laszip.LasZipper(self._watched, shown.encode())
+
+    def write(self, rows: np.ndarray) -> None:
+        with self._watched.explaining():
+            self._zipper.compress(rows.view(np.uint8))
+
+    def finish(self) -> None:
+        with self._watched.explaining():
+            self._zipper.done()
+        self._file.flush()
+        written = read_header_of(self._file)
+        self._header.vlrs.append(written.vlrs[-1])
+        self._header.encode()
+        if self._header.offset_to_points != written.offset_to_points:
+            raise InputError("LASzip did not keep the header's records; write LAS, or leave --keep-packets out")
+
+
+def _patch_wave_item(payload: bytes) -> bytes:
+    """The record with item WAVEPACKET13 called version 1: LASzip refuses lazrs' version 2, which is coded the same."""
+    patched = bytearray(payload)
+    for at in range(_ITEMS_AT, len(payload) - 5, 6):
+        kind, _, version = np.frombuffer(payload, "<u2", 3, at)
+        if (kind, version) == (_WAVE_ITEM, _BROKEN_VERSION):
+            patched[at + 4 : at + 6] = _READABLE_VERSION.to_bytes(2, "little")
+    return bytes(patched)

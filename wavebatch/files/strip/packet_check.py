@@ -1,0 +1,137 @@
+"""Which points have a usable packet, and what is wrong with the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packet_vectors import RANGE_RATIO, measure_ratio
+from wavebatch.files.strip.packets import MAX_SAMPLES, refuse_compressed
+
+INDEX_BITS = np.uint64(8)
+WHOLE_BITS = (8, 16, 32)
+MOST_BITS = 32
+MAX_SPACING = 1000.0
+"""Samples farther apart than this are damage [ns]."""
+MAX_LOCATION = 1e9
+"""Return locations beyond this are damage [ps]."""
+
+
+class Reason(IntEnum):
+    """Why a point's packet cannot be used."""
+
+    USABLE = 0
+    NO_WAVEFORM = 1
+    NO_DESCRIPTOR = 2
+    BAD_DESCRIPTOR = 3
+    EMPTY = 4
+    OUTSIDE = 5
+    NO_GEOMETRY = 6
+    OVERFULL = 7
+    PACKED = 8
+
+
+REASON_TEXTS = {
+    Reason.NO_DESCRIPTOR: "refer to a descriptor that the header does not have",
+    Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or of more than 32 bits",
+    Reason.EMPTY: "have a packet without a whole sample",
+    Reason.OUTSIDE: "have a packet outside the waveform data",
+    Reason.NO_GEOMETRY: "have a return location or a packet vector that cannot be (no number, 0, or absurdly long)",
+    Reason.OVERFULL: "share one packet with more points than a pulse can have",
+    Reason.PACKED: "have samples of other than 8, 16 or 32 bits with no gaps between, in an order that LAS leaves open",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """What can be made of the packets of some points."""
+
+    reason: np.ndarray
+    """u1 (n,): a Reason."""
+    n_samples: np.ndarray
+    """Samples of the packet, i4 (n,); 0 where it cannot be used."""
+    keys: np.ndarray
+    """u8 (n,): byte offset and descriptor in one number, the same for all returns of a packet."""
+    short: np.ndarray
+    """bool (n,): usable, but its packet is shorter than the descriptor says."""
+
+    @property
+    def usable(self) -> np.ndarray:
+        """bool (n,)."""
+        return self.reason == Reason.USABLE
+
+    @property
+    def flags(self) -> np.ndarray:
+        """u2 (n,): NO_WAVEFORM, BROKEN_PACKET or 0."""
+        table = np.full(len(Reason), int(EchoFlag.BROKEN_PACKET), np.uint16)
+        table[Reason.USABLE], table[Reason.NO_WAVEFORM] = 0, int(EchoFlag.NO_WAVEFORM)
+        return table[self.reason]
+
+
+class Judge:
+    """Tells usable packets from missing and broken ones, many points at a time."""
+
+    def __init__(self, facts: StripFacts) -> None:
+        self._facts = facts
+        self._known, self._good, self._compressed = (np.zeros(256, bool) for _ in range(3))
+        self._width, self._samples = np.ones(256, np.int64), np.zeros(256, np.int64)
+        self._odd = np.zeros(256, bool)
+        for index, digitizer in facts.digitizers.items():
+            self._known[index] = True
+            self._good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
+            self._good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
+            self._compressed[index] = facts.compression.get(index, 0) != 0 and digitizer.n_samples > 0
+            if self._good[index]:
+                self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
+                self._odd[index] = digitizer.bits not in WHOLE_BITS
+        self._least = facts.packet_start - facts.packet_base
+        self._end = facts.packet_end - facts.packet_base
+
+    def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
+        """What the packets of points (n,) are.
+
+        form: how vectors are stored. overfull: keys that too many points refer to, sorted.
+
+        Raises InputError where a point refers to compressed packets.
+        """
+        index = np.ascontiguousarray(points["wavepacket_index"])
+        size = points["wavepacket_size"].astype(np.int64)
+        offset = points["wavepacket_offset"].astype(np.uint64)
+        has = (index > 0) & (size > 0)
+        self._refuse_compressed(index[has])
+        n_samples = np.minimum(self._samples[index], size // self._width[index])
+        room = self._end - n_samples * self._width[index]
+        inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64)) & (offset >= np.uint64(self._least))
+        keys = (offset << INDEX_BITS) | index
+        reason = np.zeros(len(points), np.uint8)
+        if overfull is not None and len(overfull):
+            place = np.minimum(np.searchsorted(overfull, keys), len(overfull) - 1)
+            reason[overfull[place] == keys] = Reason.OVERFULL
+        reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
+        reason[~inside] = Reason.OUTSIDE
+        reason[n_samples == 0] = Reason.EMPTY
+        # Whether samples of 12 bits have two bytes each, only the packet's size says.
+        reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
+        reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
+        reason[~self._known[index]] = Reason.NO_DESCRIPTOR
+        reason[~has] = Reason.NO_WAVEFORM
+        good = reason == Reason.USABLE
+        short = good & (n_samples < self._samples[index])
+        return Judged(reason, np.where(good, n_samples, 0).astype(np.int32), keys, short)
+
+    def _refuse_compressed(self, index: np.ndarray) -> None:
+        bad = self._compressed[index]
+        if bad.any():
+            raise refuse_compressed(self._facts.path, self._facts.compression[int(index[np.argmax(bad)])])
+
+
+def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:
+    """Points whose packet has a place in space: location and vector are numbers that can be."""
+    ratio = measure_ratio(points, form)
+    location = np.abs(widen(points["return_point_wave_location"]))
+    return (ratio > 0) & (ratio <= RANGE_RATIO) & (location <= MAX_LOCATION)

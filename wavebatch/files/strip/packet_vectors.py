@@ -1,0 +1,163 @@
+"""Which way a strip's packet vectors point and how long they are: decided from the points, never assumed.
+
+The LAS text has been read both ways. Returns that share a packet settle it: P + L v, the position of sample 0, must be
+the same for all of them where v points toward the sensor, P - L v where it points away. Heights are the second witness:
+an airborne sensor is above its returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C, PS_PER_NS
+from wavebatch.files.disk.raw_bytes import widen
+
+OPTIONS = ("auto", "toward", "away")
+VECTORS = ("x_t", "y_t", "z_t")
+LEAST_RATIO, LARGEST_RATIO = 0.7, 1.02
+RANGE_RATIO = 100.0
+"""Vectors longer than this many times c/2 are not speeds: Optech wrote the vector from sample 0 to the return."""
+_APART = 2.0 * PS_PER_NS
+_PER_CALL = 256
+_CLEAR, _MOSTLY = 0.95, 0.8
+_ENOUGH = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the vectors of a strip mean."""
+
+    direction: str
+    """`toward` or `away`: where the vectors point (those as long as the range: once divided by minus the location)."""
+    form: str
+    """`stored`: metres per picosecond as they stand; `range`: as long as the path they cover (divide by -location)."""
+    ratio: float
+    """Median length over c/2; NaN without waveforms."""
+    evidence: str
+    warnings: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class DirectionTally:
+    """Votes for either direction, collected part by part; each part counts with at most a few hundred points."""
+
+    form: str
+    """See `Decision`."""
+    pairs: list[int] = field(default_factory=lambda: [0, 0])
+    """Pairs of returns that say toward, away."""
+    heights: list[int] = field(default_factory=lambda: [0, 0])
+    """Vectors that point up, down."""
+    ratios: list[np.ndarray] = field(default_factory=list)
+    """Lengths over c/2."""
+
+    def add_points(self, points: np.ndarray) -> None:
+        """Takes usable points into account: length and height of their vectors."""
+        some = _spread(points)
+        height = read_toward(some, "toward", self.form)[:, 2]
+        self.heights[0] += int((height > 0).sum())
+        self.heights[1] += int((height < 0).sum())
+        self.ratios.append(measure_ratio(some, self.form))
+
+    def add_pairs(self, xyz: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+        """Takes pairs of usable points that share a packet into account: xyz f8 (2, n, 3) [m], records (n,) each."""
+        a, b = widen(first["return_point_wave_location"]), widen(second["return_point_wave_location"])
+        use = np.flatnonzero(np.abs(a - b) > _APART)
+        use = use[:: max(1, len(use) // _PER_CALL)]
+        if not len(use):
+            return
+        step = xyz[0, use] - xyz[1, use]
+        paths = read_toward(first[use], "toward", self.form) * a[use, None]
+        paths -= read_toward(second[use], "toward", self.form) * b[use, None]
+        toward = np.sqrt(((step + paths) ** 2).sum(axis=1))
+        away = np.sqrt(((step - paths) ** 2).sum(axis=1))
+        large, small = np.maximum(toward, away), np.minimum(toward, away)
+        clear = (large > 0.1) & (small < 0.5 * large)
+        self.pairs[0] += int((clear & (toward < away)).sum())
+        self.pairs[1] += int((clear & (away < toward)).sum())
+
+
+def find_form(points: np.ndarray) -> str:
+    """How the vectors of these points, the strip's first ones, are to be read: `stored` or `range`."""
+    ratio = measure_ratio(points, "stored")
+    ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
+    return "range" if len(ratio) and np.median(ratio) > RANGE_RATIO else "stored"
+
+
+def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
+    """Length of the vectors over c/2, f8 (n,); not finite where there is none."""
+    vectors = stack_vectors(points)
+    length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
+    if form == "range":
+        with np.errstate(divide="ignore", invalid="ignore"):
+            length = length / np.abs(widen(points["return_point_wave_location"]))
+    return length
+
+
+def check_option(option: str) -> str:
+    """The option itself; raises ConfigError where it is none."""
+    if option not in OPTIONS:
+        raise ConfigError(f"direction {option!r}: must be {', '.join(OPTIONS)}")
+    return option
+
+
+def stack_vectors(points: np.ndarray) -> np.ndarray:
+    """The vectors of the records as they stand, f8 (n, 3)."""
+    return np.stack([widen(points[name]) for name in VECTORS], axis=1)
+
+
+def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
+    """Vectors toward the sensor, metres per picosecond, f8 (n, 3), length as the file has it."""
+    vectors = stack_vectors(points)
+    if form == "range":
+        vectors /= -widen(points["return_point_wave_location"])[:, None]
+    return vectors if direction == "toward" else -vectors
+
+
+def decide(tally: DirectionTally, option: str) -> Decision:
+    """What the votes say. Where they contradict each other or say nothing, `auto` leaves a problem."""
+    if not any(len(part) for part in tally.ratios):
+        chosen = "toward" if option == "auto" else option
+        return Decision(chosen, tally.form, float("nan"), "no waveform to judge by", (), ())
+    ratio = float(np.median(np.concatenate(tally.ratios)))
+    warnings, problems = list(_judge_length(ratio, tally.form)), []
+    (toward, away), (up, down) = tally.pairs, tally.heights
+    pairs, heights = _verdict(toward, away, _MOSTLY), _verdict(up, down, _CLEAR)
+    evidence = f"{toward} of {toward + away} pairs that share a packet and {up} of {up + down} heights say toward"
+    if toward + away < _ENOUGH and heights:
+        pairs = ""
+    chosen = pairs or heights or "toward"
+    if pairs and heights and pairs != heights:
+        problems.append(f"packet vectors contradict each other: {evidence}; pass --direction toward or away")
+    elif not (pairs or heights):
+        problems.append(f"where packet vectors point cannot be told: {evidence}; pass --direction toward or away")
+    if option != "auto":
+        if chosen != option or problems:
+            warnings.append(f"--direction {option} overrides what the file says: {evidence}")
+        chosen, problems, evidence = option, [], f"given; {evidence}"
+    return Decision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
+
+
+def _judge_length(ratio: float, form: str) -> Iterator[str]:
+    if form == "range":
+        yield (
+            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long, so they are taken for whole paths (as "
+            "Optech wrote them) and divided by minus the return location"
+        )
+    if not LEAST_RATIO <= ratio <= LARGEST_RATIO:
+        yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"
+
+
+def _verdict(toward: int, away: int, share: float) -> str:
+    total = toward + away
+    if total and toward >= share * total:
+        return "toward"
+    return "away" if total and away >= share * total else ""
+
+
+def _spread(points: np.ndarray) -> np.ndarray:
+    return points[:: max(1, len(points) // _PER_CALL)]

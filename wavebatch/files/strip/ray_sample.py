@@ -1,0 +1,105 @@
+"""Rays sampled along a strip: a few points of every unit, with their times and where they came from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.core.units import HALF_C, PS_PER_NS
+from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.strip.packet_vectors import read_toward
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.scanner import locate
+
+MOST_SLICES = 4096
+"""Places of a strip at which rays are taken."""
+
+SLICE_POINTS, RAYS_PER_SLICE = 2048, 256
+"""Points read at a place, and rays kept of them."""
+
+SLICE_SECONDS = 0.5
+"""Time after which another place of the same unit is looked at."""
+
+_SLICES_PER_UNIT = 4
+_LEAST_RATIO, _LARGEST_RATIO = 0.3, 3.0
+_LEAST_PAIR = 2.0
+
+
+class Rays(NamedTuple):
+    """n rays, ordered by time."""
+
+    time: np.ndarray
+    """f8 (n,) [s]."""
+    point: np.ndarray
+    """Where they struck, f8 (n, 3) [m]."""
+    direction: np.ndarray
+    """Away from the sensor, any length, f8 (n, 3)."""
+    weight: np.ndarray
+    """Inverse variance of the direction, relative, f8 (n,)."""
+
+
+def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
+    """Rays of a strip from its packets' vectors, and from pulses with two returns; the same ones every time.
+
+    No more than a few hundred rays at no more than about MOST_SLICES places: bounded memory whatever the strip's size.
+    """
+    kept, pairs = [], []
+
+    def take(start: int, stop: int) -> float:
+        points = reader.read_points(start, stop)
+        xyz, time = locate(points, reader.facts), widen(points["gps_time"])
+        pairs.append(_pair_returns(xyz, time))
+        rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
+        kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
+        return float(time[0])
+
+    units = _choose_units(scan)
+    starts = [take(start, min(start + SLICE_POINTS, stop)) for start, stop in units]
+    if units:
+        end = units[-1][1]
+        starts.append(take(max(units[-1][0], end - SLICE_POINTS), end))
+    share = min(_SLICES_PER_UNIT, MOST_SLICES // max(len(units), 1))
+    for (start, stop), begin, until in zip(units, starts, starts[1:], strict=False):
+        seconds = abs(until - begin)
+        number = int(np.clip(np.ceil(seconds / SLICE_SECONDS), 1, share)) if np.isfinite(seconds) else share
+        for edge in (start + np.arange(1, number) * ((stop - start) // number)).tolist():
+            take(edge, min(edge + SLICE_POINTS, stop))
+    return _join(kept), _join(pairs)
+
+
+def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
+    """Stretches of points [start, stop) all over the strip: its units, or as many of them as may be looked at."""
+    borders = scan.borders
+    if not scan.points:
+        return []
+    chosen = np.unique(np.linspace(0, len(borders) - 2, min(len(borders) - 1, MOST_SLICES)).round().astype(int))
+    return [(int(borders[i]), int(borders[i + 1])) for i in chosen.tolist() if borders[i + 1] > borders[i]]
+
+
+def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> Rays:
+    with np.errstate(all="ignore"):
+        away = -read_toward(points, scan.direction, scan.vector_form)
+        ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
+        good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
+    good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)
+    rows = np.flatnonzero(good)
+    return Rays(time[rows], xyz[rows], away[rows], np.ones(len(rows)))
+
+
+def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> Rays:
+    """Returns of one pulse that follow each other in the file: the farther apart, the better."""
+    place = np.flatnonzero(time[1:] == time[:-1])
+    apart = xyz[place + 1] - xyz[place]
+    square = (apart * apart).sum(axis=1)
+    far = np.flatnonzero(np.isfinite(square) & (square > _LEAST_PAIR**2))[:RAYS_PER_SLICE]
+    middle = 0.5 * (xyz[place[far]] + xyz[place[far] + 1])
+    return Rays(time[place[far]], middle, apart[far], square[far])
+
+
+def _join(parts: list[Rays]) -> Rays:
+    if not parts:
+        return Rays(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    joined = [np.concatenate(values) for values in zip(*parts, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return Rays(*(values[order] for values in joined))

@@ -1,0 +1,299 @@
+"""A full-waveform strip, read unit by unit: points, the packets they refer to, and blocks of their samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.units import PS_PER_NS
+from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
+from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.las.checked_header import read_checked_header
+from wavebatch.files.las.read_points import open_points
+from wavebatch.files.strip.facts import StripFacts, collect_facts
+from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
+from wavebatch.files.strip.packet_vectors import check_option, read_toward
+from wavebatch.files.strip.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
+from wavebatch.files.strip.scan_result import StripScan, raise_problem
+from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
+from wavebatch.files.strip.shared_packets import expand, group_keys
+from wavebatch.kernels.signal.signal import recorded_lengths
+
+__all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
+
+UNIT_POINTS = 50_000
+"""Points per unit of work, one LAZ chunk: fixed by the file, so that results depend on nothing else."""
+UNIT_BYTES = 1 << 26
+"""Points with very long records make smaller units."""
+_SAMPLED_UNITS = 16
+_FIRST_POINTS = 10_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PacketTable:
+    """m packets, each once, in the order of their owners."""
+
+    digitizer: np.ndarray
+    """Descriptor index, u1 (m,)."""
+    offset: np.ndarray
+    """Byte offset as points have it, u8 (m,)."""
+    size: np.ndarray
+    """Bytes of the packet as its owner has it, u4 (m,)."""
+    n_samples: np.ndarray
+    """i4 (m,): as many as descriptor and size allow."""
+    owner: np.ndarray
+    """First point in the file that refers to the packet, i8 (m,)."""
+    owned: np.ndarray
+    """Whether the owner lies in this unit, bool (m,)."""
+
+    def __len__(self) -> int:
+        return len(self.offset)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unit:
+    """Some consecutive points of a strip and everything needed to process their packets."""
+
+    number: int
+    start: int
+    """File index of points[0]."""
+    points: np.ndarray
+    """The unit's own records (n,), as they are in the file, under laspy's field names."""
+    context: np.ndarray
+    """Records (k,) of points of other units that share packets with own points."""
+    context_index: np.ndarray
+    """Their file indices, i8 (k,), ascending."""
+    packets: PacketTable
+    packet_of_point: np.ndarray
+    """Row of packets, i4 (n,); -1 where there is none."""
+    packet_of_context: np.ndarray
+    """Row of packets, i4 (k,)."""
+    point_flags: np.ndarray
+    """u2 (n,): EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0."""
+    direction: str
+    vector_form: str
+
+
+class StripReader:
+    """Reads one strip; opening costs no more than the header. A context manager.
+
+    path: LAS or LAZ file of point format 4, 5, 9 or 10. direction: where packet vectors point, `auto` lets the file
+    decide. headerless: take a .wdp that lacks its 60-byte header.
+    Raises InputError, in one line, where the strip cannot be read as what it claims to be.
+    """
+
+    facts: StripFacts
+
+    def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
+        check_option(direction)
+        checked = read_checked_header(Path(path))
+        found = read_descriptors(checked.header)
+        place = locate_packets(checked, found.compression, headerless)
+        self._points = open_points(checked)
+        try:
+            if place.base < 0:
+                some = self._points.read(0, min(checked.header.point_count, _FIRST_POINTS))
+                place = settle_headerless(place, some)
+            self.facts = collect_facts(checked, found, place, direction)
+            self._judge = Judge(self.facts)
+            self._packets = PacketFile(place)
+        except BaseException:
+            self._points.close()
+            raise
+
+    def __enter__(self) -> StripReader:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the files; scans stay valid."""
+        self._points.close()
+        self._packets.close()
+
+    def scan(self, *, tolerant: bool = False) -> StripScan:
+        """One pass over the point records, never over the samples.
+
+        tolerant: leave what keeps the strip from being processed in `problems` instead of raising InputError.
+        """
+        scan = scan_strip(self.facts, self._points, self._unit_points())
+        if not tolerant:
+            raise_problem(self.facts, scan)
+        return scan
+
+    def unit_count(self) -> int:
+        """Units of the strip."""
+        return -(-self.facts.point_count // self._unit_points())
+
+    def _unit_points(self) -> int:
+        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.point_length))
+
+    def read_points(self, start: int, stop: int) -> np.ndarray:
+        """Records [start, stop) of the file."""
+        return self._points.read(start, stop)
+
+    def read_unit(self, number: int, scan: StripScan) -> Unit:
+        """Unit `number` (0 to unit_count() - 1): its points and their packets; samples are read by `read_blocks`."""
+        start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
+        points = self._points.read(start, stop)
+        judged = self._judge.judge(points, scan.vector_form, scan.overfull)
+        entries = unique_entries(scan.context.read(number))
+        near = self._judge.judge(entries["record"], scan.vector_form, scan.overfull)
+        entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
+        own = np.flatnonzero(judged.usable)
+        index = np.concatenate([start + own, entries["index"]])
+        keys = np.concatenate([judged.keys[own], keys])
+        sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
+        n_samples = np.concatenate([judged.n_samples[own], n_samples])
+        packets, packet_of = _collect_packets(keys, index, sizes, n_samples)
+        packets = replace(packets, owned=(packets.owner >= start) & (packets.owner < stop))
+        packet_of_point = np.full(len(points), -1, np.int32)
+        packet_of_point[own] = packet_of[: len(own)]
+        return Unit(
+            number=number,
+            start=start,
+            points=points,
+            context=np.ascontiguousarray(entries["record"]),
+            context_index=index[len(own) :],
+            packets=packets,
+            packet_of_point=packet_of_point,
+            packet_of_context=packet_of[len(own) :],
+            point_flags=judged.flags,
+            direction=scan.direction,
+            vector_form=scan.vector_form,
+        )
+
+    def read_blocks(
+        self, unit: Unit, size: int, owned_only: bool
+    ) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+        """Blocks of at most `size` waveforms of one digitizer and one length, each with their rows of unit.packets.
+
+        owned_only: leave out packets whose first point lies in another unit.
+        """
+        rows = np.flatnonzero(unit.packets.owned) if owned_only else np.arange(len(unit.packets))
+        yield from self.read_rows(unit, rows, size)
+
+    def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
+        """About `n_waveforms` waveforms spread evenly over the strip, the same ones every time."""
+        units = self.unit_count()
+        if not units or n_waveforms <= 0:
+            return
+        chosen = np.unique(np.linspace(0, units - 1, min(units, _SAMPLED_UNITS)).round().astype(int)).tolist()
+        left = n_waveforms
+        for position, number in enumerate(chosen):
+            unit = self.read_unit(number, scan)
+            rows = np.flatnonzero(unit.packets.owned)
+            share = -(-left // (len(chosen) - position))
+            if len(rows) > share:
+                rows = rows[np.linspace(0, len(rows) - 1, share).round().astype(int)]
+            left -= len(rows)
+            for block, _ in self.read_rows(unit, rows, size):
+                yield block
+            if left <= 0:
+                return
+
+    def read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+        """As `read_blocks`, of the packets `rows` (k,) of the unit only; zeros that only fill packets are left out."""
+        geometry = _Geometry(unit, self.facts)
+        table = unit.packets
+        kinds = (table.digitizer[rows].astype(np.int64) << 32) | table.n_samples[rows]
+        groups = group_keys(kinds)
+        for group in np.argsort(groups.order[groups.starts]).tolist():
+            start = groups.starts[group]
+            same = rows[groups.order[start : start + groups.counts[group]]]
+            digitizer = self.facts.digitizers[int(table.digitizer[same[0]])]
+            digitizer = replace(digitizer, bits=8 * digitizer.width)
+            n_samples = int(table.n_samples[same[0]])
+            step = block_rows(size, n_samples, digitizer.bits)
+            for begin in range(0, len(same), step):
+                chosen = same[begin : begin + step]
+                samples = self._packets.read(table.offset[chosen], n_samples, digitizer.bits)
+                length = recorded_lengths(samples)
+                for recorded in np.unique(length).tolist():
+                    part = np.flatnonzero(length == recorded)
+                    kept = samples if len(part) == len(chosen) else samples[part]
+                    kept = np.ascontiguousarray(kept[:, :recorded])
+                    kept.flags.writeable = False
+                    yield geometry.build_block(chosen[part], digitizer, kept), chosen[part]
+
+
+class _Geometry:
+    """Where the waveforms of a unit lie, and which returns they have."""
+
+    def __init__(self, unit: Unit, facts: StripFacts) -> None:
+        self._unit, self._facts = unit, facts
+        self._all: np.ndarray | None = None
+        packet_of = np.concatenate([unit.packet_of_point, unit.packet_of_context])
+        index = np.concatenate([np.arange(unit.start, unit.start + len(unit.points)), unit.context_index])
+        used = np.flatnonzero(packet_of >= 0)
+        self._entry = used[np.lexsort((index[used], packet_of[used]))]
+        self._index = index[self._entry]
+        edges = np.searchsorted(packet_of[self._entry], np.arange(len(unit.packets) + 1))
+        self._starts, self._counts = edges[:-1], np.diff(edges)
+
+    def build_block(self, rows: np.ndarray, digitizer: Digitizer, samples: np.ndarray) -> WaveformBlock:
+        """The block of packets `rows`; the first return of each is its owner."""
+        counts = self._counts[rows]
+        place = expand(self._starts[rows], counts)
+        records = self._take(self._entry[place])
+        xyz = locate(records, self._facts)
+        location = widen(records["return_point_wave_location"])
+        owner = np.cumsum(counts) - counts
+        toward = read_toward(records[owner], self._unit.direction, self._unit.vector_form)
+        owners = self._unit.packets.owner[rows]
+        return WaveformBlock(
+            digitizer=digitizer,
+            samples=samples,
+            first=int(owners[0]),
+            point=owners,
+            gps_time=widen(records["gps_time"][owner]),
+            origin=xyz[owner] + location[owner, None] * toward,
+            direction=-PS_PER_NS * toward,
+            returns=ReturnTable(
+                np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
+            ),
+            scanner=_read_scanner(records[owner]),
+        )
+
+    def _take(self, entries: np.ndarray) -> np.ndarray:
+        unit = self._unit
+        if not len(unit.context):
+            return take_records(unit.points, entries)
+        if self._all is None:
+            self._all = np.concatenate([unit.points, unit.context])
+        return take_records(self._all, entries)
+
+
+def _read_scanner(records: np.ndarray) -> np.ndarray | None:
+    """Scanner channels of records (n,), u1 (n,); None in point formats without."""
+    if "classification_flags" not in records.dtype.names:
+        return None
+    return (records["classification_flags"] >> 4) & 3
+
+
+def _collect_packets(
+    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray
+) -> tuple[PacketTable, np.ndarray]:
+    """The packets of points (n,) in order of their owners, all of them called owned, and the row of each, i4 (n,)."""
+    by_index = np.argsort(index, kind="stable")
+    groups = group_keys(keys[by_index])
+    lead = by_index[groups.order[groups.starts]]
+    order = np.argsort(index[lead], kind="stable")
+    rank = np.empty(len(lead), np.int32)
+    rank[order] = np.arange(len(lead), dtype=np.int32)
+    packet_of = np.empty(len(keys), np.int32)
+    packet_of[by_index[groups.order]] = np.repeat(rank, groups.counts)
+    lead = lead[order]
+    table = PacketTable(
+        digitizer=(keys[lead] & np.uint64(255)).astype(np.uint8),
+        offset=keys[lead] >> INDEX_BITS,
+        size=sizes[lead],
+        n_samples=n_samples[lead],
+        owner=index[lead],
+        owned=np.ones(len(lead), bool),
+    )
+    return table, packet_of

@@ -1,0 +1,284 @@
+"""One pass over the points of a strip: what its packets are, where units begin, which packets cross their borders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wavebatch.files.disk.raw_bytes import take_records
+from wavebatch.files.disk.spool import Spool
+from wavebatch.files.las.read_points import PointSource
+from wavebatch.files.strip import shared_packets
+from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packet_check import REASON_TEXTS, Judge, Judged, Reason
+from wavebatch.files.strip.packet_vectors import DirectionTally, decide, find_form
+from wavebatch.files.strip.scan_result import StripScan, describe_hopeless, describe_oddities
+from wavebatch.files.strip.shared_packets import Groups, NearSharing, find_far, group_keys
+
+LONGEST_RUN = 64
+"""Runs of points with one gps time that are shorter than this are not cut by a border."""
+_PAIRS, _VOTERS = 4096, 256
+_FAR_SAMPLES = 32
+_FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
+
+
+def scan_strip(facts: StripFacts, source: PointSource, unit_points: int) -> StripScan:
+    """Scans all points of the strip, `unit_points` per unit before borders are moved; never looks at samples.
+
+    Raises InputError where points cannot be read; what keeps the strip from being processed is in `problems`.
+    """
+    return _Scanner(facts, source, unit_points).run()
+
+
+@dataclass(slots=True)
+class _Tally:
+    reasons: np.ndarray = field(default_factory=lambda: np.zeros(len(Reason), np.int64))
+    first: np.ndarray = field(default_factory=lambda: np.full(len(Reason), -1, np.int64))
+    by_descriptor: np.ndarray = field(default_factory=lambda: np.zeros(256, np.int64))
+    short: int = 0
+
+    def add(self, points: np.ndarray, start: int, judged: Judged) -> None:
+        self.reasons += np.bincount(judged.reason, minlength=len(Reason))
+        for reason in np.flatnonzero((self.reasons > 0) & (self.first < 0)).tolist():
+            self.first[reason] = start + int(np.argmax(judged.reason == reason))
+        has = judged.reason != Reason.NO_WAVEFORM
+        self.by_descriptor += np.bincount(points["wavepacket_index"][has], minlength=256)
+        self.short += int(judged.short.sum())
+
+    def describe(self) -> dict[Reason, tuple[int, int]]:
+        return {r: (int(self.reasons[r]), int(self.first[r])) for r in Reason if r in REASON_TEXTS and self.reasons[r]}
+
+
+class _Scanner:
+    def __init__(self, facts: StripFacts, source: PointSource, unit_points: int) -> None:
+        self._facts, self._source, self._unit_points = facts, source, unit_points
+        self._judge = Judge(facts)
+        self._form = find_form(self._take_first())
+        self._tally, self._votes = _Tally(), DirectionTally(self._form)
+        self._borders = [0]
+        units = -(-facts.point_count // unit_points)
+        self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
+        low = facts.packet_start - facts.packet_base
+        self._near = NearSharing(low, max(low, facts.packet_end - facts.packet_base), self._context)
+        self._window: list[_Part] = []
+
+    def _take_first(self) -> np.ndarray:
+        """The first points that have packets."""
+        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.point_length)
+        points = self._source.read(0, min(self._facts.point_count, most))
+        return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
+
+    def run(self) -> StripScan:
+        try:
+            for start, points in self._cut_units():
+                self._add_unit(start, points)
+            suspects = self._near.suspects()
+            packets, reach = self._near.count_packets(suspects), self._near.reach
+            overfull = [np.empty(0, np.uint64), *self._near.overfull]
+            if suspects.any():
+                more, far_reach, far_overfull = self._go_far(suspects)
+                packets, reach = packets + more, max(reach, far_reach)
+                overfull.append(far_overfull)
+            self._context.seal()
+            overfull = np.unique(np.concatenate(overfull))
+            if suspects.any():
+                self._vote_far()
+            if len(overfull):
+                self._count_overfull(overfull)
+        except BaseException:
+            self._context.close()
+            raise
+        return self._finish(packets - len(overfull), reach, overfull)
+
+    def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Every unit's first index and points; borders are noted on the way."""
+        step, count = self._unit_points, self._facts.point_count
+        held = np.empty(0, self._facts.dtype)
+        for begin in range(0, count, step):
+            part = self._source.read(begin, min(begin + step, count))
+            if begin:
+                cut = _find_cut(held["gps_time"][-LONGEST_RUN:], part["gps_time"][:LONGEST_RUN])
+                start = self._borders[-1]
+                self._borders.append(begin + cut)
+                yield start, np.concatenate([held, part[:cut]]) if cut else held
+                held = part[cut:]
+            else:
+                held = part
+        if count:
+            self._borders.append(count)
+            yield self._borders[-2], held
+
+    def _add_unit(self, start: int, points: np.ndarray) -> None:
+        judged = self._judge.judge(points, self._form)
+        self._tally.add(points, start, judged)
+        rows = np.flatnonzero(judged.usable)
+        part = _Part(judged.keys[rows], start + rows, len(self._borders) - 2, points, start)
+        tails = (old.tail(start - shared_packets.WINDOW) for old in self._window)
+        self._window = [tail for tail in tails if len(tail.keys)]
+        parts = _Parts([*self._window, part])
+        own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
+        groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
+        if len(rows):
+            self._votes.add_points(take_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
+            self._vote(groups, parts, own)
+        self._window.append(part)
+
+    def _entries(self, parts: _Parts, rows: np.ndarray) -> np.ndarray:
+        entries = np.empty(len(rows), self._context.dtype)
+        entries["index"], entries["record"] = parts.index[rows], parts.take(rows)
+        return entries
+
+    def _vote(self, groups: Groups, parts: _Parts, own: np.ndarray) -> None:
+        follows = np.ones(len(groups.order), bool)
+        follows[groups.starts] = False
+        place = np.flatnonzero(follows)
+        place = place[own[groups.order[place]]]
+        place = place[:: max(1, len(place) // _PAIRS)]
+        first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
+        self._votes.add_pairs(np.stack([locate(first, self._facts), locate(second, self._facts)]), first, second)
+
+    def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
+        """Finds sharing among the packets of suspect parts wherever their points are, and adds it to the context."""
+        borders = np.array(self._borders)
+        count = int(self._tally.reasons[Reason.USABLE])
+        far = find_far(self._suspect_keys(suspects), count, borders)
+        try:
+            for unit in range(len(borders) - 1):
+                wants = far.wants.read(unit)
+                if len(wants):
+                    self._give(int(borders[unit]), int(borders[unit + 1]), wants)
+        finally:
+            far.wants.close()
+        return far.packets, far.reach, far.overfull
+
+    def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
+            judged = self._judge.judge(self._source.read(start, stop), self._form)
+            rows = np.flatnonzero(judged.usable)
+            rows = rows[self._near.is_suspect(judged.keys[rows], suspects)]
+            yield judged.keys[rows], start + rows
+
+    def _give(self, start: int, stop: int, wants: np.ndarray) -> None:
+        points = self._source.read(start, stop)
+        entries = np.empty(len(wants), self._context.dtype)
+        entries["index"], entries["record"] = wants["index"], take_records(points, wants["index"] - start)
+        self._context.append(wants["unit"], entries)
+
+    def _vote_far(self) -> None:
+        """In a shuffled strip the returns of a packet meet only through the context: some units are asked again."""
+        units = len(self._borders) - 1
+        for unit in range(0, units, max(1, units // _FAR_SAMPLES)):
+            start, stop = self._borders[unit], self._borders[unit + 1]
+            context = unique_entries(self._context.read(unit))
+            points = np.concatenate([self._source.read(start, stop), context["record"]])
+            index = np.concatenate([np.arange(start, stop), context["index"]])
+            judged = self._judge.judge(points, self._form)
+            rows = np.flatnonzero(judged.usable)
+            rows = rows[np.argsort(index[rows], kind="stable")]
+            parts = _Parts([_Part(judged.keys[rows], np.arange(len(rows)), unit, take_records(points, rows), 0)])
+            self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
+
+    def _count_overfull(self, overfull: np.ndarray) -> None:
+        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
+            reason = self._judge.judge(self._source.read(start, stop), self._form, overfull).reason
+            many = int((reason == Reason.OVERFULL).sum())
+            if many and self._tally.first[Reason.OVERFULL] < 0:
+                self._tally.first[Reason.OVERFULL] = start + int(np.argmax(reason == Reason.OVERFULL))
+            self._tally.reasons[Reason.OVERFULL] += many
+            self._tally.reasons[Reason.USABLE] -= many
+
+    def _finish(self, packets: int, reach: int, overfull: np.ndarray) -> StripScan:
+        tally, facts = self._tally, self._facts
+        usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
+        decision = decide(self._votes, facts.direction_option)
+        reasons = tally.describe()
+        problems = list(decision.problems)
+        if not usable and missing < facts.point_count:
+            problems.insert(0, describe_hopeless(facts, reasons))
+        return StripScan(
+            points=facts.point_count,
+            with_waveform=usable,
+            without_waveform=missing,
+            broken=facts.point_count - usable - missing,
+            packets=packets,
+            short=tally.short,
+            reasons=reasons,
+            by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
+            reach=reach,
+            direction=decision.direction,
+            direction_evidence=decision.evidence,
+            vector_form=decision.form,
+            vector_ratio=decision.ratio,
+            borders=np.array(self._borders),
+            overfull=overfull,
+            context=self._context,
+            warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
+            problems=tuple(problems),
+        )
+
+
+class _Part:
+    """Usable points of one unit, as far as they matter to the next ones."""
+
+    def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray, start: int) -> None:
+        self.keys, self.index, self.unit = keys, index, unit
+        self._points, self._start = points, start
+
+    def take(self, rows: np.ndarray) -> np.ndarray:
+        """Records of the usable points `rows`."""
+        return take_records(self._points, self.index[rows] - self._start)
+
+    def tail(self, least: int) -> _Part:
+        """The part from file index `least` on; copied where that frees memory."""
+        at = int(np.searchsorted(self.index, least))
+        if not at:
+            return self
+        first = max(self._start, least)
+        points = self._points[first - self._start :].copy()
+        return _Part(self.keys[at:].copy(), self.index[at:].copy(), self.unit, points, first)
+
+
+class _Parts:
+    """Several parts one after the other."""
+
+    def __init__(self, parts: list[_Part]) -> None:
+        self.keys = np.concatenate([part.keys for part in parts])
+        self.index = np.concatenate([part.index for part in parts])
+        self.unit = np.concatenate([np.full(len(part.keys), part.unit) for part in parts])
+        self._starts = np.cumsum([0, *(len(part.keys) for part in parts)])
+        self._parts = parts
+
+    def take(self, rows: np.ndarray) -> np.ndarray:
+        """Records at `rows` of all parts."""
+        taken, places = [], []
+        for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
+            here = np.flatnonzero((rows >= start) & (rows < stop))
+            taken.append(part.take(rows[here] - start))
+            places.append(here)
+        back = np.empty(len(rows), np.int64)
+        back[np.concatenate(places)] = np.arange(len(rows))
+        return take_records(np.concatenate(taken), back)
+
+
+def _find_cut(before: np.ndarray, after: np.ndarray) -> int:
+    """How many points behind a border belong to the unit before it, because they are of the pulse that it would cut."""
+    time = before[-1]
+    head = np.flatnonzero(after != time)
+    tail = np.flatnonzero(before[::-1] != time)
+    behind = int(head[0]) if len(head) else len(after)
+    ahead = int(tail[0]) if len(tail) else len(before)
+    return behind if behind + ahead < LONGEST_RUN else 0
+
+
+def locate(points: np.ndarray, facts: StripFacts) -> np.ndarray:
+    """Coordinates of records (n,), f8 (n, 3) [m]."""
+    axes = zip("XYZ", facts.scales, facts.offsets, strict=True)
+    return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
+
+
+def unique_entries(entries: np.ndarray) -> np.ndarray:
+    """Context entries by file index, each once: what crosses a border nearby may be found twice."""
+    _, first = np.unique(entries["index"], return_index=True)
+    return entries[first]
