@@ -8,7 +8,7 @@ import numpy as np
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
-from wavebatch.config import load_profile
+from wavebatch.stages.chain_file import load_profile
 
 
 def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:

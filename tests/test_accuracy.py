@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.chain import STAGES
-from wavebatch.config import load_profile
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.evaluate import score
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.simulate import Recording, find_scene, simulate_block
-from wavebatch.stages.merge import merge_unresolved
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.decompose.merge import merge_unresolved
+from wavebatch.stages.score import score
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))
 """Noise of a recorded sample: standard deviation 1, rounded to whole counts."""

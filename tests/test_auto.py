@@ -7,10 +7,10 @@ import pytest
 from helpers_scenes import make_block, make_scene
 
 from wavebatch.auto import LOST, chain_text, choose_chain, decide, left_out, widest_chain, without_columns
-from wavebatch.config import load_profile, parse_chain
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.evaluate import score
 from wavebatch.simulate import find_pulse
+from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.score import score
 from wavebatch.survey import Decision, Survey, survey_block
 
 OPEN_FIGURES = {"empty_share": 0.2, "overlapped_share": 0.0005}

@@ -19,11 +19,11 @@ from wavebatch.bench.stability import FAILURES, count_changes, count_failures, l
 from wavebatch.bench.table import format_document
 from wavebatch.bench.worker import Worker, WorkerDied, peak_memory
 from wavebatch.cli import main
-from wavebatch.config import load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
+from wavebatch.stages.chain_file import load_profile
 from wavebatch.survey import Survey
 
 SMALL = BenchOptions(

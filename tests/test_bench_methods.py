@@ -7,9 +7,9 @@ from click.testing import CliRunner
 from wavebatch.bench.methods import list_methods
 from wavebatch.bench.stability import FAILURES, list_cases, measure_stability
 from wavebatch.bench.table import format_document
-from wavebatch.chain import STAGES
 from wavebatch.cli import main
-from wavebatch.config import load_profile
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import load_profile
 
 
 def test_every_method_has_a_chain():

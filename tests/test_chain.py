@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from wavebatch import chain as chain_module
-from wavebatch.chain import KINDS, STAGES, Chain, Step, stage
-from wavebatch.config import list_profiles, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.stages import chain as chain_module
+from wavebatch.stages.chain import KINDS, STAGES, Chain, Step, stage
+from wavebatch.stages.chain_file import list_profiles, load_profile
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, noise_std=1.0)
 

@@ -8,9 +8,9 @@ from click.testing import CliRunner
 
 from wavebatch.choice import Request, make_choice, widest
 from wavebatch.cli import main
-from wavebatch.config import parse_chain
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import simulate_strip
+from wavebatch.stages.chain_file import parse_chain
 
 
 def _run(*arguments):

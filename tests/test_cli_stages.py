@@ -5,10 +5,9 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.cli import main
-from wavebatch.config import effective, parse_chain
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import effective, parse_chain
 
 
 def _invoke(*arguments):

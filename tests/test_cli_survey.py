@@ -7,9 +7,9 @@ from click.testing import CliRunner
 
 from wavebatch.auto import chain_text, decide
 from wavebatch.cli import main
-from wavebatch.config import load_chain
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.simulate import simulate_strip
+from wavebatch.stages.chain_file import load_chain
 from wavebatch.systemfile import load_survey
 
 

@@ -12,11 +12,11 @@ from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.compare.angles import compare_angles
-from wavebatch.config import parse_chain
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import buckets
 from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
+from wavebatch.stages.chain_file import parse_chain
 
 NAMES = ("incidence_angle", "incidence_angle_normals")
 CHAIN = "".join(

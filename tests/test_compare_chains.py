@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
 from wavebatch.compare import chains
 from wavebatch.compare.chains import ChainRun, Contender, find_contender, match_chains, match_sides
@@ -15,6 +14,7 @@ from wavebatch.compare.clouds import compare_clouds
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.stages.chain import STAGES, Chain, Step
 
 
 def make_chain(detector, decomposer, **parameters):

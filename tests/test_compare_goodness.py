@@ -4,11 +4,11 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.chain import STAGES, Step
 from wavebatch.compare.goodness import FitQuality, measure_fit
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.stages.models import MODELS, rebuild_waveforms
+from wavebatch.stages.chain import STAGES, Step
+from wavebatch.stages.decompose.rebuild import MODELS, rebuild_waveforms
 
 FINE = 100.0
 LEARNED = ((1.0, 0.0, 2.0), (0.12, 7.0, 2.0))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from wavebatch.chain import STAGES, Chain
-from wavebatch.config import effective, list_profiles, load_chain, load_profile, parse_chain
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.chain import STAGES, Chain
+from wavebatch.stages.chain_file import effective, list_profiles, load_chain, load_profile, parse_chain
 
 GOOD = """
 [[chain]]
@@ -129,7 +129,7 @@ def test_unknown_profile_names_the_nearest():
 def test_choices_are_checked(monkeypatch):
     from typing import Literal
 
-    import wavebatch.chain as chain_module
+    import wavebatch.stages.chain as chain_module
     from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
     monkeypatch.setattr(chain_module, "STAGES", STAGES.copy())
@@ -141,6 +141,6 @@ def test_choices_are_checked(monkeypatch):
         """
 
     chain_module.stage("noise")(pick)
-    monkeypatch.setattr("wavebatch.config.STAGES", chain_module.STAGES)
+    monkeypatch.setattr("wavebatch.stages.chain_file.STAGES", chain_module.STAGES)
     with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
         parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")

@@ -17,7 +17,7 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.las.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate.strip import WKT
-from wavebatch.stages.attributes import position
+from wavebatch.stages.attribute.basic import position
 
 US = 1200 / 3937
 GEOG = 'GEOGCS["NAD83",DATUM["D",SPHEROID["GRS 1980",6378137,298.257222101]],UNIT["degree",0.0174532925199433]]'

@@ -5,14 +5,13 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.simulate import Recording, known_noise, known_system, simulate_echoes
+from wavebatch.stages.chain import STAGES
 
 RECORDING = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)
 SYSTEM = known_system(RECORDING)

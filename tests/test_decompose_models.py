@@ -4,8 +4,6 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -14,6 +12,7 @@ from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.least_squares import Windows
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.simulate.papers import PULSE_SIGMA
+from wavebatch.stages.chain import STAGES
 
 FINE = 100.0
 """Counts per unit of amplitude."""

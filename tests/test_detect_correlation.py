@@ -4,11 +4,8 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.evaluate import match_echoes
 from wavebatch.kernels.signal.square_differences import (
     find_minima,
     keep_prominent,
@@ -19,8 +16,10 @@ from wavebatch.kernels.signal.square_differences import (
 )
 from wavebatch.simulate import known_noise, known_system, simulate_block
 from wavebatch.simulate.papers import WAGNER
-from wavebatch.stages.detect_correlation import parabola_shift
-from wavebatch.stages.reference import reference_pulse
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.detect.correlation import parabola_shift
+from wavebatch.stages.reference_pulse import reference_pulse
+from wavebatch.stages.score import match_echoes
 
 SYSTEM = SystemPulse(2.0, baseline=500.0, noise_std=100.0)
 UNIT = 100.0

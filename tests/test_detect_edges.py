@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import PULSE_SIGMA as SIGMA
+from wavebatch.stages.chain import STAGES
 
 SYSTEM = known_system(fine_recording(1.0, SIGMA))
 

@@ -4,8 +4,6 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401
-from wavebatch.chain import STAGES
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.signal.deconvolve import (
     convolve_pulse,
@@ -17,6 +15,7 @@ from wavebatch.kernels.signal.deconvolve import (
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import WANG_CASES, simulate_wang
+from wavebatch.stages.chain import STAGES
 
 GAUSS = np.exp(-0.5 * (np.arange(-6, 7) / 2) ** 2)
 SKEWED = np.exp(-0.5 * (np.log1p(0.12 * np.arange(-6, 7)) / 0.24) ** 2)

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.evaluate import ErrorStats, Scorer, find_isolated, list_pairs, match_echoes, score
 from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.stages.score import ErrorStats, Scorer, find_isolated, list_pairs, match_echoes, score
 
 
 def match_naively(found, truth, tolerance):

@@ -7,7 +7,7 @@ import pytest
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
-from wavebatch.stages.decompose import closed_form
+from wavebatch.stages.decompose.fit import closed_form
 
 VECTOR = 37.5 * np.exp(-0.5 * ((np.arange(31) - 14.3) / 1.8) ** 2)
 PEAK = 14

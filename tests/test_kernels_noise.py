@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.chain import STAGES
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
 from wavebatch.simulate import Recording, simulate_block
+from wavebatch.stages.chain import STAGES
 
 
 def record(std, n=2000, s=80, level=12.0, spread=0.5, seed=0, amplitude=60.0):

@@ -5,9 +5,9 @@ import pytest
 from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
 from wavebatch import survey
-from wavebatch.chain import STAGES
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.stages.chain import STAGES
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
 VARIANTS = [
@@ -57,14 +57,14 @@ def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
 
 def test_parts_of_a_block_do_not_show(monkeypatch):
     """More waveforms than are worked on at a time."""
-    from wavebatch.stages import detect_correlation, detect_wavelet
+    from wavebatch.stages.detect import correlation, wavelet
 
     block = scene_blocks()["mixed"].rows(slice(0, 60))
     system = survey.survey_block(block).system
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
-    monkeypatch.setattr(detect_correlation, "COLUMNS_AT_A_TIME", 7)
-    monkeypatch.setattr(detect_wavelet, "AT_A_TIME", 7)
+    monkeypatch.setattr(correlation, "COLUMNS_AT_A_TIME", 7)
+    monkeypatch.setattr(wavelet, "AT_A_TIME", 7)
     for name, table in zip(names, whole, strict=True):
         assert_same(call(name, {}, block, system), table)
         assert np.unique(table.waveform).size > 40

@@ -5,11 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch import stages  # noqa: F401 - registers them
 from wavebatch.angles import SLOPE, predict_angles
 from wavebatch.calibration import with_physics
-from wavebatch.chain import STAGES
-from wavebatch.config import load_profile
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
@@ -21,6 +18,8 @@ from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.simulate.blocks import simulate_pulses
 from wavebatch.simulate.geometry import AIR_SPEED
 from wavebatch.simulate.scenes import find_scene
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import load_profile
 from wavebatch.survey import survey_block
 
 SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
@@ -200,7 +199,7 @@ def test_modes_agree_where_they_should():
 
 def test_a_learned_pulse_has_its_own_width():
     components = ((1.0, 0.0, 1.2), (0.2, 2.5, 1.8))
-    from wavebatch.stages.shapes import describe_echoes, pulse_shape, shape_limits
+    from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
 
     system = replace(SYSTEM, components=components)
     shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)

@@ -11,9 +11,7 @@ from click.testing import CliRunner
 from strips import make_raw
 
 from wavebatch.bench.plot import _draw_panel, _place_labels
-from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.cli import main
-from wavebatch.config import load_profile, parse_chain
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -23,7 +21,9 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.plots.packets import MOST, Wanted, find_places
 from wavebatch.plots.waveform import build_views, read_views
-from wavebatch.stages.models import MODELS
+from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.decompose.rebuild import MODELS
 
 PULSE = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0)
 KAPPA = 0.15

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block
 
-from wavebatch.chain import STAGES
 from wavebatch.core.waveforms import Noise, SystemPulse
-from wavebatch.stages import shapes
+from wavebatch.stages import pulse_tables
+from wavebatch.stages.chain import STAGES
 
 SYSTEMS = {
     "gaussian": SystemPulse(2.0),
@@ -18,14 +18,14 @@ def deviate_slowly(block, noise, system, echoes):
     """Every echo on its own, in double precision: residual of the whole waveform, two projections."""
     s = block.samples.shape[1]
     x = np.arange(s, dtype=float)
-    shape, limits = shapes.pulse_shape(system, 1.0), shapes.shape_limits(system, 1.0)
+    shape, limits = pulse_tables.pulse_shape(system, 1.0), pulse_tables.shape_limits(system, 1.0)
     whole = np.stack([echoes.amplitude, echoes.time, echoes.sigma], axis=1).astype(float)
     lobes = [(1.0, 0.0, 0.0), *shape.components]
     values = []
     for row in range(len(echoes)):
         waveform = echoes.waveform[row]
         residual = block.samples[waveform] - float(noise.baseline[waveform])
-        for amplitude, time, width in shapes.model_parameters(shape, limits, whole)[echoes.waveform == waveform]:
+        for amplitude, time, width in pulse_tables.model_parameters(shape, limits, whole)[echoes.waveform == waveform]:
             for weight, delay, extra in lobes:
                 wide = np.sqrt(width**2 + extra)
                 height = amplitude * weight * width / wide

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from wavebatch.cli import COMMANDS
-from wavebatch.config import list_profiles, parse_chain
 from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
+from wavebatch.stages.chain_file import list_profiles, parse_chain
 
 TEXT = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
 

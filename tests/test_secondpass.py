@@ -18,15 +18,15 @@ from wavebatch.batch.run import run_batch
 from wavebatch.batch.secondpass import SecondPass, process_tile
 from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
-from wavebatch.chain import STAGES, Step
 from wavebatch.cli import main
-from wavebatch.config import parse_chain
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.layout import plan_output
 from wavebatch.files.disk import spool
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
+from wavebatch.stages.chain import STAGES, Step
+from wavebatch.stages.chain_file import parse_chain
 
 STAGE = "attribute.incidence_angle_normals"
 COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from wavebatch.auto import choose_chain
-from wavebatch.chain import STAGES
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.stages.chain import STAGES
 from wavebatch.survey import Survey, survey_block, survey_blocks
 from wavebatch.systemfile import SavedSurvey, load_survey, parse_survey, write_survey
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from wavebatch import survey
-from wavebatch.chain import STAGES
-from wavebatch.config import list_profiles, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.simulate import simulate_block
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import list_profiles, load_profile
 
 PROFILES = list_profiles()
 CORE = [field.name for field in fields(EchoTable) if field.name != "attributes"]

@@ -7,12 +7,12 @@ import pytest
 from helpers_scenes import make_block, make_scene
 
 from wavebatch.choice import COSTS
-from wavebatch.config import list_profiles, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.evaluate import score
 from wavebatch.simulate import find_pulse, known_system
+from wavebatch.stages.chain_file import list_profiles, load_profile
+from wavebatch.stages.score import score
 from wavebatch.survey import survey_block
 from wavebatch.trial import Prediction, predict_errors, simulate_again
 

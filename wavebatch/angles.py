@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.chain import Chain
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
-from wavebatch.stages.angle import LEAST_WIDTH
+from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
+from wavebatch.stages.chain import Chain
 
 SLOPE = 30.0
 """Angle at which the error is predicted [deg]: where widths tell most (ALGORITHMS 1.4)."""

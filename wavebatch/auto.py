@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from wavebatch.chain import Chain
-from wavebatch.config import format_step, parse_chain
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import format_step, parse_chain
 from wavebatch.survey import Decision, Survey
 
 LOST = 0.005

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.chain import STAGES, Chain, Step
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from wavebatch import survey
 from wavebatch.auto import choose_chain, decide, widest_chain
-from wavebatch.chain import Chain
-from wavebatch.config import load_profile
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import load_profile
 from wavebatch.survey import Decision, Survey
 from wavebatch.systemfile import SavedSurvey, describe_system
 from wavebatch.trial import WAVEFORMS, Prediction, predict_errors

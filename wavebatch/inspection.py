@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.config import load_chain
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
+from wavebatch.stages.chain_file import load_chain
 
 _SAMPLED = 4096
 

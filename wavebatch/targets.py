@@ -14,7 +14,6 @@ import numpy as np
 
 from wavebatch.calibration import Calibration
 from wavebatch.choice import read_sample, survey_sample
-from wavebatch.config import load_profile
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import MAD_TO_STD
@@ -25,6 +24,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.stages.chain_file import load_profile
 
 LEAST_ECHOES = 10
 """Echoes on a target below which it is left out."""

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.chain import Chain
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.evaluate import match_echoes
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.stages.decompose import adaptive
-from wavebatch.stages.detect import maximum
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.score import match_echoes
 
 WAVEFORMS = 2048
 """Waveforms of a trial."""

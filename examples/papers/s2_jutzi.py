@@ -22,9 +22,9 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.simulate.papers import PULSE_SIGMA, paint_slice
 from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments
-from wavebatch.stages.decompose_models import gauss_newton
-from wavebatch.stages.detect import matched_filter
-from wavebatch.stages.detect_edges import sustained_threshold
+from wavebatch.stages.decompose.models import gauss_newton
+from wavebatch.stages.detect.classic import sustained_threshold
+from wavebatch.stages.detect.maximum import matched_filter
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

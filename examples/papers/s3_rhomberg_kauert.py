@@ -24,8 +24,8 @@ from wavebatch.kernels.physics.incidence import (
     spread_variance,
 )
 from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.stages.decompose import gaussian
-from wavebatch.stages.detect import maximum
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.detect.maximum import maximum
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""

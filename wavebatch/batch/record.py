@@ -15,9 +15,9 @@ from wavebatch.batch.remarks import explain_absence
 from wavebatch.batch.report import RunReport
 from wavebatch.batch.work import Prepared, StripJob
 from wavebatch.choice import describe_choice, describe_survey
-from wavebatch.config import effective
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.stages.chain_file import effective
 from wavebatch.systemfile import format_survey, write_text
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"

@@ -21,7 +21,6 @@ import numpy as np
 
 from wavebatch.batch.report import RunReport
 from wavebatch.batch.work import unpack
-from wavebatch.chain import Step
 from wavebatch.core.echoes import COLUMNS, RAY
 from wavebatch.core.no_data import NoData
 from wavebatch.files.cloud.layout import OutputLayout
@@ -29,6 +28,7 @@ from wavebatch.files.disk.row_file import RowStore
 from wavebatch.files.disk.spool import Spool
 from wavebatch.kernels.geometry.normals import FINENESS, Gap, Surroundings, thin_out
 from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_into_tiles
+from wavebatch.stages.chain import Step
 
 TILE_POINTS = 150_000
 """Points of a tile, about, without its buffer."""

@@ -17,7 +17,6 @@ from wavebatch.auto import without_columns
 from wavebatch.batch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.report import RunReport
 from wavebatch.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import Choice, Request, make_choice, sample_size
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.core.errors import ConfigError
@@ -26,6 +25,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.survey.levels import measure_level
 
 BLOCK_SAMPLES = 1 << 22

@@ -12,8 +12,8 @@ from wavebatch.bench.truth import describe_truth, find_bounds
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.evaluate import QUANTITIES, find_isolated, match_echoes
 from wavebatch.simulate import Scene, simulate_blocks
+from wavebatch.stages.score import QUANTITIES, find_isolated, match_echoes
 from wavebatch.survey import Survey, survey_block
 
 CLEAR = 10.0

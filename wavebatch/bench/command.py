@@ -22,12 +22,12 @@ from wavebatch.bench.promises import judge, measure_system
 from wavebatch.bench.scenes import find_bench_scene, shape_scene
 from wavebatch.bench.speed import Laps, make_strip, time_chains
 from wavebatch.bench.stability import AUTO, FAILURES, find_twin, list_cases, measure_stability
-from wavebatch.chain import Chain
-from wavebatch.config import load_chain, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate import Scene, simulate_blocks
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import load_chain, load_profile
 from wavebatch.survey import Survey
 
 SCHEMA = "wavebatch.bench/1"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from wavebatch import stages  # noqa: F401  (fills STAGES)
-from wavebatch.chain import STAGES, Chain, Step
+from wavebatch.stages.chain import STAGES, Chain, Step
 
 ATTRIBUTES = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
 """What the shipped chains add to echoes too."""

@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.bench.worker import Worker, WorkerDied
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.stages.detect import maximum
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
 
 MOST = 12

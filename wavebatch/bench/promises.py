@@ -10,7 +10,7 @@ from typing import Any
 from wavebatch.bench.scenes import find_bench_scene
 from wavebatch.bench.speed import make_strip, measure_memory, time_jobs, time_start
 from wavebatch.bench.table import align
-from wavebatch.config import load_profile
+from wavebatch.stages.chain_file import load_profile
 
 Document = Mapping[str, Any]
 

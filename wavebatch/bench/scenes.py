@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.chain import Chain
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import QUANTISATION_STD
@@ -15,6 +14,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.simulate.draws import Drawn
+from wavebatch.stages.chain import Chain
 from wavebatch.survey import SAMPLE, survey_blocks
 
 BENCH_SCENES: dict[str, str] = {

@@ -15,9 +15,9 @@ from wavebatch.batch.task import BatchOptions
 from wavebatch.batch.work import RunOptions, StripJob, choose_columns
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.worker import Worker, peak_memory
-from wavebatch.chain import Chain
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.simulate import Scene, simulate_strip
+from wavebatch.stages.chain import Chain
 
 PREPARATION = ("scan", "survey")
 """Parts of a run that a strip pays once, whatever its length."""

@@ -11,14 +11,14 @@ import numpy as np
 
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
 from wavebatch.bench.hazards import CASES, Case, make_scene
-from wavebatch.chain import Chain
-from wavebatch.config import effective
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.simulate.draws import LogUniform, Mixture
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import effective
 from wavebatch.survey import Survey, survey_block
 
 AUTO = "auto"

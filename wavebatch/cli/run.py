@@ -178,8 +178,8 @@ def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
     options: chain_file, profile, tolerance and system_file, each None where it was not given.
     """
     from wavebatch.choice import Request, widest
-    from wavebatch.config import list_profiles, load_chain, load_profile
     from wavebatch.core.suggest import nearest
+    from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
     from wavebatch.systemfile import load_survey
 
     profile = options["profile"] or "auto"
@@ -249,7 +249,7 @@ def exit_code(failed: int, strips: int) -> int:
 
 def _dry_run(jobs: list[Any], batch_options: Any) -> int:
     from wavebatch.batch.plan import plan_strip
-    from wavebatch.config import effective
+    from wavebatch.stages.chain_file import effective
 
     failed = 0
     for job in jobs:

@@ -13,7 +13,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 
 if TYPE_CHECKING:
-    from wavebatch.chain import Parameter, Stage
+    from wavebatch.stages.chain import Parameter, Stage
 
 
 @click.command()
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 @report_errors()
 def stages(name: str | None, as_json: bool, debug: bool) -> None:
     """The algorithms that a chain is made of: all of them, or one with its parameters, source and a TOML example."""
-    from wavebatch import stages as _  # noqa: F401  (fills STAGES)
-    from wavebatch.chain import KINDS, STAGES
+    from wavebatch.stages.chain import KINDS, STAGES
 
     if name is not None and name not in STAGES:
         told = nearest(name, STAGES)
@@ -49,7 +48,7 @@ def _types(parameter: Parameter) -> str:
 
 
 def _describe(stage: Stage) -> dict[str, Any]:
-    from wavebatch.config import format_step
+    from wavebatch.stages.chain_file import format_step
 
     defaults = {name: parameter.default for name, parameter in stage.parameters.items()}
     return {

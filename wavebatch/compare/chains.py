@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.auto import choose_chain
-from wavebatch.chain import STAGES, Chain, Step
 from wavebatch.choice import read_sample, survey_sample
 from wavebatch.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.compare.differences import SPEED
 from wavebatch.compare.goodness import FitQuality, Goodness, measure_fit
 from wavebatch.compare.pairing import Comparison, Pairing, check_tolerance
-from wavebatch.config import list_profiles, load_chain, load_profile
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
 from wavebatch.survey import Survey
 
 AUTO = "auto"

@@ -9,8 +9,8 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, MAD_TO_STD
-from wavebatch.evaluate import ErrorStats
 from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.stages.score import ErrorStats
 
 SPEED = 0.9997 * HALF_C
 """Metres along the ray per ns."""

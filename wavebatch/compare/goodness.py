@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.chain import Step
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.stages.models import rebuild_waveforms
-from wavebatch.stages.shapes import clip_level
+from wavebatch.stages.chain import Step
+from wavebatch.stages.decompose.rebuild import rebuild_waveforms
+from wavebatch.stages.pulse_tables import clip_level
 
 
 @dataclass(frozen=True, slots=True)

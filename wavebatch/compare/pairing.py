@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from wavebatch.compare.breakdown import Breakdown, Table
 from wavebatch.compare.differences import SPEED, Differences, Spread
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.evaluate import ErrorStats, list_pairs, pair_nearest
+from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
 
 MOST_PER_PULSE = 64
 """Echoes of one GPS time beyond which it is no pulse's."""

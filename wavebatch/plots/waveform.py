@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.chain import Chain
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.plots.packets import Place
-from wavebatch.stages.models import MODELS
-from wavebatch.stages.shapes import clip_level, model_parameters, shape_limits
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, shape_limits
 
 FINE = 8
 """Points of a curve per sample ..."""

@@ -12,13 +12,13 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.evaluate import find_isolated
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.simulate.blocks import SEED_BLOCK, Simulated, cut_block, simulate_seed_block
 from wavebatch.simulate.geometry import EAST, NORTH, Flight, Rays
 from wavebatch.simulate.returns import Returns, list_returns
 from wavebatch.simulate.scenes import Scene, find_scene
 from wavebatch.simulate.truth import TruthWriter
+from wavebatch.stages.score import find_isolated
 
 WKT = (
     'PROJCS["ETRS89 / UTM zone 32N",GEOGCS["ETRS89",DATUM["European_Terrestrial_Reference_System_1989",'

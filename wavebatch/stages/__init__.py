@@ -1,31 +1,21 @@
-"""The algorithms, each a plain function; importing this package fills `wavebatch.chain.STAGES`."""
+"""The algorithms: every stage is a plain function, registered in `wavebatch.stages.chain.STAGES` by this import."""
 
-from wavebatch.stages import (
-    angle,
-    attributes,
-    decompose,
-    decompose_loops,
-    decompose_models,
-    detect,
-    detect_correlation,
-    detect_edges,
-    detect_wavelet,
-    noise,
-    normals,
-    physics,
-)
+from wavebatch.stages import noise
+from wavebatch.stages.attribute import basic, normal_angle, radiometry, width_angle
+from wavebatch.stages.decompose import fit, loops, models
+from wavebatch.stages.detect import classic, correlation, maximum, wavelet
 
 __all__ = [
-    "angle",
-    "attributes",
-    "decompose",
-    "decompose_loops",
-    "decompose_models",
-    "detect",
-    "detect_correlation",
-    "detect_edges",
-    "detect_wavelet",
+    "basic",
+    "classic",
+    "correlation",
+    "fit",
+    "loops",
+    "maximum",
+    "models",
     "noise",
-    "normals",
-    "physics",
+    "normal_angle",
+    "radiometry",
+    "wavelet",
+    "width_angle",
 ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.stages.shapes import clip_level
+from wavebatch.stages.pulse_tables import clip_level
 
 NEIGHBOURS = 5
 """Echoes before and behind that one is compared with."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
+from wavebatch.stages.chain import stage
 
 
 @stage("noise")

@@ -10,10 +10,10 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
-from wavebatch.stages.decompose import adaptive, closed_form
-from wavebatch.stages.detect import maximum
+from wavebatch.stages.decompose.fit import adaptive, closed_form
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.shapes import pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 from wavebatch.survey.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
 
 MOST_STACKED = 3000

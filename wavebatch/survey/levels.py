@@ -15,8 +15,8 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import spread_of_angle
-from wavebatch.stages.angle import added_variance
-from wavebatch.stages.physics import is_alone, level_angle
+from wavebatch.stages.attribute.radiometry import is_alone, level_angle
+from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.survey.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 
 ROUNDS = 10

@@ -12,10 +12,10 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.noise import estimate_noise
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, transpose_samples
-from wavebatch.stages.decompose import adaptive, closed_form
-from wavebatch.stages.detect import matched_filter, maximum
+from wavebatch.stages.decompose.fit import adaptive, closed_form
+from wavebatch.stages.detect.maximum import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""

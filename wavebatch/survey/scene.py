@@ -9,7 +9,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.shapes import clip_level
+from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.survey.learning import find_isolated, find_strong, learn_pulse
 from wavebatch.survey.measuring import (
     ENOUGH_TO_LEARN,

@@ -17,10 +17,10 @@ from wavebatch.kernels.signal.deconvolve import (
 )
 from wavebatch.kernels.signal.profiles import fit_height, keep_signal, measure_offsets, window_signal
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121, widen
-from wavebatch.stages.candidates import signal_above
+from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.noise import pooled
-from wavebatch.stages.reference import reference_pulse
-from wavebatch.stages.shapes import clip_level
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.reference_pulse import reference_pulse
 from wavebatch.survey.learning import AFTER, BEFORE
 
 METHODS = ("richardson_lucy", "gold", "wiener")

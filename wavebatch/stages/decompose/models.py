@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -17,9 +16,10 @@ from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model, gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
-from wavebatch.stages.decompose import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
-from wavebatch.stages.reference import reference_pulse
-from wavebatch.stages.shapes import pulse_shape, shape_limits
+from wavebatch.stages.chain import stage
+from wavebatch.stages.decompose.fit import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.stages.reference_pulse import reference_pulse
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
 """Exponents of the generalized Gaussian that are tried for every cluster of echoes."""

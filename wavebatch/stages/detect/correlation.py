@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.filters import refine_peaks
@@ -21,8 +20,9 @@ from wavebatch.kernels.signal.square_differences import (
     slide_taps,
     square_differences,
 )
-from wavebatch.stages.candidates import candidate_table, signal_above
-from wavebatch.stages.reference import reference_pulse
+from wavebatch.stages.chain import stage
+from wavebatch.stages.detect.candidates import candidate_table, signal_above
+from wavebatch.stages.reference_pulse import reference_pulse
 
 Candidates = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Waveform, time [samples], amplitude."""

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.chain import Step
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.stages.decompose_models import reference_shape, skewed_shape
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.chain import Step
+from wavebatch.stages.decompose.models import reference_shape, skewed_shape
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 ShapeOf = Callable[..., PulseShape]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import RAY, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.geometry.normals import measure_normals
+from wavebatch.stages.chain import stage
 
 
 @stage(

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
@@ -15,9 +14,10 @@ from wavebatch.kernels.fit.cluster import estimate_starts, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.signal import smooth_121
-from wavebatch.stages.candidates import candidate_table, find_varying, signal_above
-from wavebatch.stages.decompose import gaussian
-from wavebatch.stages.detect_correlation import asdf
+from wavebatch.stages.chain import stage
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
+from wavebatch.stages.detect.correlation import asdf
 from wavebatch.stages.flags import flag_echoes
 
 

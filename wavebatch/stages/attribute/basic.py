@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -14,7 +13,8 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.chain import stage
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 
 @stage("attribute", makes=("amplitude", "amplitude_err"))

@@ -13,11 +13,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.physics import radiometry
+from wavebatch.stages.chain import stage
 
 _POSITION = ("x", "y", "z")
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
@@ -21,7 +20,8 @@ from wavebatch.kernels.signal.filters import (
 )
 from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.candidates import candidate_table, signal_above
+from wavebatch.stages.chain import stage
+from wavebatch.stages.detect.candidates import candidate_table, signal_above
 
 
 def _smoothed_width(ref: float) -> float:

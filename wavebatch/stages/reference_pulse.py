@@ -11,7 +11,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.signal.filters import refine_peaks
-from wavebatch.stages.shapes import pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
 
 ReferenceKind = Literal["gaussian", "system", "given"]
 

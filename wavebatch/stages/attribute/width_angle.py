@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -17,8 +16,9 @@ from wavebatch.kernels.physics.incidence import (
     pulse_table,
     spread_variance,
 )
-from wavebatch.stages.physics import is_alone, sensor_distance
-from wavebatch.stages.shapes import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
+from wavebatch.stages.chain import stage
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 LEAST_WIDTH = 0.85
 """Width of the system pulse [samples] below which fitted widths depend on where the samples lie (1.4)."""

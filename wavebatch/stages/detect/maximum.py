@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import estimate_starts
@@ -16,7 +15,8 @@ from wavebatch.kernels.signal.filters import (
     refine_peaks,
 )
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.candidates import make_table, signal_above
+from wavebatch.stages.chain import stage
+from wavebatch.stages.detect.candidates import make_table, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -16,9 +15,10 @@ from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import WidthPrior
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal.signal import smooth_121, transpose_samples
+from wavebatch.stages.chain import stage
+from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
-from wavebatch.stages.merge import drop_twins, merge_unresolved
-from wavebatch.stages.shapes import (
+from wavebatch.stages.pulse_tables import (
     ShapeLimits,
     clip_level,
     describe_echoes,

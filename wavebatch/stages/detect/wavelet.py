@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from wavebatch.chain import stage
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
@@ -15,8 +14,9 @@ from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filt
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
-from wavebatch.stages.candidates import candidate_table, signal_above
-from wavebatch.stages.reference import reference_pulse
+from wavebatch.stages.chain import stage
+from wavebatch.stages.detect.candidates import candidate_table, signal_above
+from wavebatch.stages.reference_pulse import reference_pulse
 
 HAT_WIDTH = 0.75
 """Width of the Mexican hat that counts like the B3 wavelet, in system widths (ALGORITHMS 1.2)."""

@@ -10,10 +10,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from wavebatch import stages  # noqa: F401  (fills STAGES)
-from wavebatch.chain import STAGES, Chain, Parameter, Stage, Step
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
+from wavebatch.stages.chain import STAGES, Chain, Parameter, Stage, Step
 
 _TYPE_WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", type(None): "nothing"}
 
@@ -70,7 +69,7 @@ def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
 
 
 def _shipped() -> Any:
-    return resources.files("wavebatch") / "chains"
+    return resources.files("wavebatch") / "stages" / "profiles"
 
 
 def _format_value(value: Any) -> str:

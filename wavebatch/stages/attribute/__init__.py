@@ -1,0 +1,1 @@
+"""Stages that compute columns from fitted echoes."""

@@ -1,0 +1,1 @@
+"""Stages that find echoes in waveforms."""
