@@ -6,8 +6,8 @@ import laspy
 import numpy as np
 
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.task import BatchOptions
-from wavebatch.batch.work import RunOptions, StripJob, choose_columns
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.stages.chain_file import load_profile
 
 

@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch import survey
+from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import crlb
@@ -63,7 +63,7 @@ def test_isolated_echoes_reach_the_bound(snr, name, knowledge):
     block = record(n, (snr, time, SIGMA), seed=snr)
     system, noise = KNOWN, None
     if knowledge == "file to file":
-        system = survey.survey_block(block).system
+        system = surveying.survey_block(block).system
         noise = STAGES["noise.pooled"].function(block, system)
         assert system.sigma_ref == pytest.approx(SIGMA, rel=0.05)
         assert system.noise_std == pytest.approx(STD, rel=0.03)
@@ -134,7 +134,7 @@ def test_single_echoes_are_rarely_split(knowledge):
         block = record(n, (snr, phases(n, snr), SIGMA), seed=snr + 1)
         system, noise = KNOWN, None
         if knowledge == "file to file":
-            system = survey.survey_block(block).system
+            system = surveying.survey_block(block).system
             noise = STAGES["noise.pooled"].function(block, system)
         count = decompose("adaptive", block, system, noise).count(n)
         assert (count > 1).mean() <= 0.01, snr
@@ -145,7 +145,7 @@ def test_single_echoes_are_rarely_split(knowledge):
 def test_noise_makes_no_echoes(profile, most):
     n = 10_000
     block = record(n, seed=3, n_samples=80)
-    for system in (KNOWN, survey.survey_block(block).system):
+    for system in (KNOWN, surveying.survey_block(block).system):
         assert (load_profile(profile).run(block, system).count(n) > 0).mean() <= most
 
 
@@ -155,7 +155,7 @@ def test_coloured_noise_neither_splits_nor_invents(rho):
     recording = Recording(rho=rho, noise_std=1.0)
     block, truth = simulate_block("flat", 6000, np.random.default_rng(6), recording=recording)
     empty, in_it = simulate_block("empty", 6000, np.random.default_rng(7), recording=recording)
-    system = survey.survey_block(block).system
+    system = surveying.survey_block(block).system
     chain = load_profile("accurate")
     found = chain.run(block, system)
     assert score(found, truth, 6000, noise_std=1.0).false_splits <= 0.005
@@ -199,7 +199,7 @@ def test_edges_cost_what_the_bound_says():
 
 def run_scene(scene, profile, n=8192):
     block, truth = simulate_block(scene, n, np.random.default_rng(11))
-    found = load_profile(profile).run(block, survey.survey_block(block).system)
+    found = load_profile(profile).run(block, surveying.survey_block(block).system)
     return score(found, truth, n, noise_std=find_scene(scene).recording.recorded_noise)
 
 
@@ -226,7 +226,7 @@ def test_scenes_are_decomposed_as_well_as_measured(scene, profile, exact, comple
 def test_forest_at_the_default_threshold():
     """Without the survey's raised threshold for real pulses: the exact count of ALGORITHMS.md 4.3, .610 and more."""
     block, truth = simulate_block("forest", 8192, np.random.default_rng(11))
-    found = load_profile("accurate").run(block, survey.survey_block(block, learn=False).system)
+    found = load_profile("accurate").run(block, surveying.survey_block(block, learn=False).system)
     result = score(found, truth, 8192, noise_std=find_scene("forest").recording.recorded_noise)
     assert result.exact_count >= 0.605
     assert result.completeness >= 0.76

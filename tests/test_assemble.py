@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
-from wavebatch.batch.assemble import assemble_returns, gather_echoes
-from wavebatch.batch.work import prepare_strip
+from wavebatch.batch.output_rows import assemble_returns, gather_echoes
+from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError
 from wavebatch.files.strip.reader import StripReader

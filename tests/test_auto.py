@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.auto import LOST, chain_text, choose_chain, decide, left_out, widest_chain, without_columns
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import find_pulse
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.score import score
-from wavebatch.survey import Decision, Survey, survey_block
+from wavebatch.surveying import Decision, Survey, survey_block
+from wavebatch.surveying.auto_chain import (
+    LOST,
+    chain_text,
+    choose_chain,
+    decide,
+    left_out,
+    widest_chain,
+    without_columns,
+)
 
 OPEN_FIGURES = {"empty_share": 0.2, "overlapped_share": 0.0005}
 DECISIONS = (

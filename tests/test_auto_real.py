@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from wavebatch.auto import choose_chain
-from wavebatch.choice import read_sample, survey_sample
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
 
 AFTER_PULSE = (9.0, 12.0)
 """Where the RIEGL's after-pulse lies behind an echo [ns]; it has 4 % of its amplitude."""

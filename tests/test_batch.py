@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
-from wavebatch.batch.plan import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
+from wavebatch.batch.preflight import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.task import BatchOptions, StripTask
-from wavebatch.batch.work import RunOptions, choose_columns, prepare_strip
+from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.unit import RunOptions, choose_columns, prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.writer import read_provenance
 
@@ -74,11 +74,11 @@ def test_a_shuffled_strip_has_the_same_accounts_as_the_ordered_one(wide_strip, r
 
 def test_all_real_returns_are_accounted_for(riegl, leica, tmp_path):
     for strip, points, packets in ((riegl, 2535, 2375), (leica, 999, 999)):
-        report = run_one(strip, tmp_path).report
-        assert report.count("points_in") == points
-        assert report.count("waveforms") == packets
+        counts = run_one(strip, tmp_path).report
+        assert counts.count("points_in") == points
+        assert counts.count("waveforms") == packets
         cloud, _ = read_cloud(tmp_path / f"{strip.stem}.laz")
-        assert len(cloud) == report.count("points_out")
+        assert len(cloud) == counts.count("points_out")
 
 
 def test_report_and_provenance_say_how_the_cloud_was_made(riegl, tmp_path):
@@ -145,7 +145,7 @@ def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, monkeypatc
     shutil.copyfile(tiny_strip, strip)
     folder = tmp_path / "out"
     assert run_one(strip, folder).status == "written"
-    report, cloud, options = folder / "tiny.report.json", folder / "tiny.laz", {}
+    counts, cloud, options = folder / "tiny.report.json", folder / "tiny.laz", {}
     if change == "input":
         content = bytearray(strip.read_bytes())
         content[-1] ^= 1
@@ -157,11 +157,11 @@ def test_resume_does_again_what_is_not_the_same(tiny_strip, tmp_path, monkeypatc
     elif change == "cloud":
         cloud.write_bytes(cloud.read_bytes()[:-1])
     elif change == "report":
-        report.write_text("{}")
+        counts.write_text("{}")
     elif change == "no report":
-        report.unlink()
+        counts.unlink()
     else:
-        monkeypatch.setattr("wavebatch.batch.record.__version__", "9.9")
+        monkeypatch.setattr("wavebatch.batch.report_file.__version__", "9.9")
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "written"
     assert run_one(strip, folder, batch={"resume": True}, **options).status == "skipped"
     assert _files(folder) == ["tiny.laz", "tiny.report.json"]
@@ -178,14 +178,14 @@ def test_a_failure_while_writing_leaves_nothing(tiny_strip, tmp_path, monkeypatc
 
 
 def test_an_account_that_does_not_add_up_is_a_failure_not_a_cloud(tiny_strip, tmp_path, monkeypatch):
-    from wavebatch.batch import report
+    from wavebatch.batch import counts
 
-    real = report.RunReport.of_echoes.__func__
+    real = counts.RunReport.of_echoes.__func__
 
     def lose_one(cls, per_waveform, amplitude, sigma):
         return real(cls, per_waveform[1:], amplitude, sigma)
 
-    monkeypatch.setattr(report.RunReport, "of_echoes", classmethod(lose_one))
+    monkeypatch.setattr(counts.RunReport, "of_echoes", classmethod(lose_one))
     outcome = run_one(tiny_strip, tmp_path)
     assert outcome.status == "failed" and "waveforms is" in str(outcome.error)
     assert _files(tmp_path) == []
@@ -196,7 +196,7 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
     shutil.copyfile(tiny_strip, strip)
     task = StripTask(make_job(strip), BatchOptions(tmp_path), alone=False)
     assert task.start() is None
-    from wavebatch.batch.workers import Workers
+    from wavebatch.batch.processes import Workers
 
     with Workers(1) as workers:
         while not task.is_complete:

@@ -111,18 +111,18 @@ _SHOT = """
 import os, sys
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-import wavebatch.batch.task, wavebatch.batch.work
+import wavebatch.batch.strip_task, wavebatch.batch.unit
 from batch_tools import make_job
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.task import BatchOptions
+from wavebatch.batch.strip_task import BatchOptions
 
 def prepare(job):
     if job.path.stem == "b":
         os.kill(os.getpid(), 9)
-    return wavebatch.batch.work.prepare_strip(job)
+    return wavebatch.batch.unit.prepare_strip(job)
 
 if __name__ == "__main__":
-    wavebatch.batch.task.prepare_strip = prepare
+    wavebatch.batch.strip_task.prepare_strip = prepare
     folder = Path({strips!r})
     jobs = [make_job(folder / name) for name in ("a.las", "b.las", "c.las")]
     result = run_batch(jobs, BatchOptions(Path({out!r}), jobs=2))

@@ -24,7 +24,7 @@ from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.survey import Survey
+from wavebatch.surveying import Survey
 
 SMALL = BenchOptions(
     scenes=("flat",),

@@ -6,11 +6,11 @@ import pytest
 from batch_tools import read_cloud
 from click.testing import CliRunner
 
-from wavebatch.choice import Request, make_choice, widest
 from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import simulate_strip
 from wavebatch.stages.chain_file import parse_chain
+from wavebatch.surveying.choose_chain import Request, make_choice, widest
 
 
 def _run(*arguments):
@@ -89,7 +89,7 @@ def test_a_saved_survey_is_used_as_it_is_and_the_report_says_whose_it_is(strips,
 
 
 def test_no_survey_is_made_where_one_is_given(strips, saved, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.survey.scene.survey_block", lambda *a, **k: pytest.fail("surveyed"))
+    monkeypatch.setattr("wavebatch.surveying.survey.survey_block", lambda *a, **k: pytest.fail("surveyed"))
     assert _run(strips / "flat.las", "-o", tmp_path, "-q", "--system", saved, "--debug").exit_code == 0
 
 

@@ -5,12 +5,12 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.auto import chain_text, decide
 from wavebatch.cli import main
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.simulate import simulate_strip
 from wavebatch.stages.chain_file import load_chain
-from wavebatch.systemfile import load_survey
+from wavebatch.surveying.auto_chain import chain_text, decide
+from wavebatch.surveying.system_file import load_survey
 
 
 def _survey(*arguments):

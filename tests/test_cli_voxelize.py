@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.calibration import Calibration, format_calibration
 from wavebatch.cli import main
 from wavebatch.simulate import simulate_strip
+from wavebatch.surveying.calibration import Calibration, format_calibration
 
 
 def voxelize(*arguments):

@@ -114,7 +114,7 @@ def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path
     from batch_tools import make_job
 
     from wavebatch.batch.run import run_batch
-    from wavebatch.batch.task import BatchOptions
+    from wavebatch.batch.strip_task import BatchOptions
 
     with distributed.Client(dask.address, set_as_default=False) as client:
         client.wait_for_workers(2)
@@ -151,7 +151,7 @@ def _spool_as_ever():
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://none.invalid:8786", "tcp://", "a:b"])
 def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
-    monkeypatch.setattr("wavebatch.batch.cluster._CONNECT", 0.5)
+    monkeypatch.setattr("wavebatch.batch.dask_cluster._CONNECT", 0.5)
     done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
     assert done.exit_code == 2
     assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached") and done.stderr.count("\n") == 1
@@ -159,7 +159,7 @@ def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatc
 
 
 def test_without_distributed_the_line_says_what_to_install(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.cluster.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("wavebatch.batch.dask_cluster.importlib.util.find_spec", lambda name: None)
     done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", "tcp://a:1"])
     assert done.exit_code == 2 and "pip install wavebatch[cluster]" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -8,15 +8,15 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.task import BatchOptions
-from wavebatch.batch.work import RunOptions, StripJob, choose_columns
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.compare.angles import compare_angles
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import buckets
-from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 from wavebatch.stages.chain_file import parse_chain
+from wavebatch.surveying.sensor import SensorRequest
 
 NAMES = ("incidence_angle", "incidence_angle_normals")
 CHAIN = "".join(

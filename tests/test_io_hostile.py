@@ -10,7 +10,7 @@ from strips import make_raw
 
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.inspection import check_file
+from wavebatch.surveying.inspect_strip import check_file
 
 KINDS = [(4, True, ".las"), (9, False, ".las"), (5, False, ".laz"), (10, True, ".laz")]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from wavebatch import survey
+from wavebatch import surveying
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import estimate_noise
@@ -73,7 +73,7 @@ def test_coloured_noise_shows_in_the_smoothed_std(rho, factor):
     block, _ = simulate_block("flat", 4000, np.random.default_rng(5), recording=recording)
     pooled = estimate_noise(block.samples.T.astype(np.float32), 6)
     assert pooled.smoothed_std / pooled.std == pytest.approx(factor, rel=0.03)
-    assert survey.survey_block(block).system.noise_std >= 0.99 * pooled.smoothed_std
+    assert surveying.survey_block(block).system.noise_std >= 0.99 * pooled.smoothed_std
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
@@ -85,7 +85,7 @@ def test_baselines_of_waveforms_are_recovered(spread):
     y = base + rng.standard_normal((n, 80))
     y += 90 * np.exp(-0.5 * ((np.arange(80) - rng.uniform(20, 60, (n, 1))) / 2.0) ** 2)
     block = WaveformBlock.from_samples(np.rint(y).astype(np.uint8))
-    noise = STAGES["noise.pooled"].function(block, survey.survey_block(block).system)
+    noise = STAGES["noise.pooled"].function(block, surveying.survey_block(block).system)
     error = np.abs(noise.baseline - base[:, 0])
     own = np.hypot(1, QUANTISATION_STD) / np.sqrt(60)
     lost = error > 1

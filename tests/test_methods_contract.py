@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_stages_contract import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
 
-from wavebatch import survey
+from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
@@ -46,7 +46,7 @@ def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
 def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
     block = scene_blocks()["mixed"].rows(slice(0, 29))
-    system = survey.survey_block(block).system
+    system = surveying.survey_block(block).system
     whole = call(name, parameters, block, system)
     assert len(whole) > 15
     for size in (1, 7):
@@ -60,7 +60,7 @@ def test_parts_of_a_block_do_not_show(monkeypatch):
     from wavebatch.stages.detect import correlation, wavelet
 
     block = scene_blocks()["mixed"].rows(slice(0, 60))
-    system = survey.survey_block(block).system
+    system = surveying.survey_block(block).system
     names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
     whole = [call(name, {}, block, system) for name in names]
     monkeypatch.setattr(correlation, "COLUMNS_AT_A_TIME", 7)

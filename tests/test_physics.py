@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.angles import SLOPE, predict_angles
-from wavebatch.calibration import with_physics
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
@@ -20,7 +18,9 @@ from wavebatch.simulate.geometry import AIR_SPEED
 from wavebatch.simulate.scenes import find_scene
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.survey import survey_block
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.angle_limits import SLOPE, predict_angles
+from wavebatch.surveying.calibration import with_physics
 
 SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
 NAMES = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")

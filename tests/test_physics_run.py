@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.calibration import Calibration, format_calibration, load_calibration, parse_calibration, with_physics
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
@@ -17,6 +16,13 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibration import (
+    Calibration,
+    format_calibration,
+    load_calibration,
+    parse_calibration,
+    with_physics,
+)
 
 FOUND = Calibration(2.6e-8, 0.02, 0.3, 1.1, "strip.laz", "2026-11-21", "said by a test")
 

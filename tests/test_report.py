@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from wavebatch.batch.report import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
+from wavebatch.batch.counts import AMPLITUDE_BINS, COUNTS, OVERFLOW, WIDTH_BINS, RunReport, count_flags
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import StageError
 from wavebatch.core.units import FWHM_PER_SIGMA

@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 from strips import descriptor, make_raw, vlr
 
-from wavebatch.batch import secondpass
+from wavebatch.batch import neighbour_pass
+from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.secondpass import SecondPass, process_tile
-from wavebatch.batch.task import BatchOptions
-from wavebatch.batch.work import RunOptions, StripJob, choose_columns
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError
@@ -98,9 +98,9 @@ def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch)
 
 
 def test_the_same_bytes_for_any_tiles(strips, clouds, tmp_path, monkeypatch):
-    monkeypatch.setattr(secondpass, "TILE_POINTS", 900)
-    monkeypatch.setattr(secondpass, "PART_POINTS", 400)
-    monkeypatch.setattr(secondpass, "SAMPLE", 5000)
+    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 900)
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 400)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 5000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 18)
     monkeypatch.setattr(spool, "KEPT", 1 << 16)
     run_strip(strips / "urban.las", tmp_path)
@@ -119,7 +119,7 @@ def test_returns_and_other_names(strips, clouds, tmp_path):
 
 
 def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.task.SecondPass", None)
+    monkeypatch.setattr("wavebatch.batch.strip_task.SecondPass", None)
     report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
     assert not report.no_data
     assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names
@@ -152,10 +152,10 @@ def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
 
 _DIE = """
 import os, sys
-from wavebatch.batch import secondpass
+from wavebatch.batch import neighbour_pass
 def die(*arguments):
     os.kill(os.getpid(), 9)
-secondpass.SecondPass.{method} = die
+neighbour_pass.SecondPass.{method} = die
 from wavebatch.cli import main
 main(sys.argv[1:])
 """
@@ -240,15 +240,15 @@ def test_any_tiles_give_the_same_bits_on_any_points(layout, tmp_path, monkeypatc
     rows = make_rows(layout, rng.permutation(xyz))
     whole, counts = fill(layout, [rows], tmp_path, tile_points=10**9)
     assert counts[COLUMNS[0]]["KNOWN"] > 4000
-    monkeypatch.setattr(secondpass, "PART_POINTS", 300)
-    monkeypatch.setattr(secondpass, "SAMPLE", 1000)
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 300)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
     again, counts_again = fill(layout, np.array_split(rows, 7), tmp_path, tile_points=200)
     assert counts_again == counts and again.tobytes() == whole.tobytes()
 
 
 def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, monkeypatch):
-    monkeypatch.setattr(secondpass, "PART_POINTS", 2000)
-    monkeypatch.setattr(secondpass, "SAMPLE", 1000)
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 16)
     monkeypatch.setattr(spool, "KEPT", 1 << 12)
     monkeypatch.setattr("wavebatch.files.disk.row_file.RowStore.pieces.__defaults__", (2000,))
@@ -273,7 +273,7 @@ def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, mon
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
-    monkeypatch.setattr(secondpass, "SAMPLE", 4000)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 4000)
     monkeypatch.setattr(spool, "MEMORY", 1 << 20)
     peaks = []
     for n in (60_000, 240_000):
@@ -295,7 +295,7 @@ def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
 
 
 def test_the_second_pass_is_not_told_as_units(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr(secondpass, "TILE_POINTS", 2000)
+    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 2000)
     chain = parse_chain(CHAIN, "test")
     job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
     events = []

@@ -12,8 +12,8 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
 from wavebatch.simulate.geometry import START_TIME, Flight, trace_rays
+from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
 
 
 def find(path, **request):

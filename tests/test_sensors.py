@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wavebatch.auto import choose_chain
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
-from wavebatch.survey import Survey, survey_block, survey_blocks
-from wavebatch.systemfile import SavedSurvey, load_survey, parse_survey, write_survey
+from wavebatch.surveying import Survey, survey_block, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.system_file import SavedSurvey, load_survey, parse_survey, write_survey
 
 
 def flat_top(x):

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from wavebatch import survey
+from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.simulate import simulate_block
@@ -182,7 +182,7 @@ def test_every_chain_keeps_the_contract_after_its_own_survey(s):
     chains = [load_profile(profile) for profile in PROFILES]
     for name, samples in waveforms(s).items():
         block = make_block(samples)
-        system = survey.survey_block(block).system
+        system = surveying.survey_block(block).system
         for chain in chains:
             try:
                 table = chain.run(block, system)
@@ -198,7 +198,7 @@ def test_every_chain_keeps_the_contract_after_its_own_survey(s):
 @pytest.mark.parametrize("system", ["of the file", "of another file"])
 def test_constant_waveforms_have_no_echo(profile, level, system):
     block = WaveformBlock.from_samples(np.full((20, 80), level, np.uint8))
-    measured = survey.survey_block(block).system
+    measured = surveying.survey_block(block).system
     assert np.isfinite(measured.sigma_ref)
     if system == "of another file":
         measured = replace(measured, baseline=float(level), noise_std=0.3, sigma_ref=3.0)
@@ -215,7 +215,7 @@ def scene_blocks():
 def scene(request):
     """A block with returns near its echoes, and its survey."""
     block = scene_blocks()[request.param]
-    system = survey.survey_block(block).system
+    system = surveying.survey_block(block).system
     echoes = load_profile("fast").run(block, system)
     returns = ReturnTable(echoes.waveform, echoes.time - 0.3, np.arange(len(echoes)), np.zeros((len(echoes), 3)))
     return replace(block, returns=returns), system

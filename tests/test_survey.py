@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.auto import choose_chain
-from wavebatch.choice import read_sample, survey_sample
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import PulseModel, find_pulse
-from wavebatch.survey import join_digitizers, survey_block, survey_blocks
-from wavebatch.survey.measuring import FIRST_LOOK
+from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.measure import FIRST_LOOK
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])

@@ -12,10 +12,10 @@ from wavebatch.cli.synthesize import synthesize
 from wavebatch.compare.clouds import compare_clouds
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.inspection import check_file
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
 from wavebatch.simulate import DiscreteReceiver, StripOptions, simulate_returns
+from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.synthesize import Radar, SynthesisOptions, synthesize_strip
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.survey import Decision, Survey, survey_block
-from wavebatch.systemfile import (
+from wavebatch.surveying import Decision, Survey, survey_block
+from wavebatch.surveying.system_file import (
     QUANTITIES,
     SYSTEM_SCHEMA,
     SavedSurvey,

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from wavebatch.calibration import format_calibration, load_calibration, parse_calibration
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import MAD_TO_STD
@@ -17,7 +16,8 @@ from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.simulate import find_scene, simulate_strip, strip
 from wavebatch.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS
-from wavebatch.targets import Target, fit_normal, load_targets
+from wavebatch.surveying.calibration import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.targets import Target, fit_normal, load_targets
 
 
 def call(*arguments):

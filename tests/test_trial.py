@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
 
-from wavebatch.choice import COSTS
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate import find_pulse, known_system
 from wavebatch.stages.chain_file import list_profiles, load_profile
 from wavebatch.stages.score import score
-from wavebatch.survey import survey_block
-from wavebatch.trial import Prediction, predict_errors, simulate_again
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.choose_chain import COSTS
+from wavebatch.surveying.predict_error import Prediction, predict_errors, simulate_again
 
 CHAINS = {name: load_profile(name) for name in COSTS}
 

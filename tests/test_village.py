@@ -15,8 +15,8 @@ from wavebatch.simulate import find_scene, simulate_strip
 from wavebatch.simulate.blocks import simulate_seed_block
 from wavebatch.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT
-from wavebatch.survey import survey_block
-from wavebatch.survey.levels import measure_level
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.flat_ground import measure_level
 
 SCENE = find_scene("village")
 

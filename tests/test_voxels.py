@@ -11,7 +11,6 @@ import laspy
 import numpy as np
 import pytest
 
-from wavebatch.calibration import Calibration
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer, SystemPulse
@@ -19,15 +18,16 @@ from wavebatch.files.las.header import read_header
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.physics.radiometry import backscatter, cross_section
-from wavebatch.sensor import SensorRequest
 from wavebatch.simulate import simulate_strip
 from wavebatch.simulate.blocks import simulate_block
 from wavebatch.simulate.geometry import Flight
 from wavebatch.simulate.pulses import find_pulse
 from wavebatch.simulate.render import Recording
 from wavebatch.simulate.strip import WKT, StripOptions
-from wavebatch.survey import Survey, survey_block
-from wavebatch.systemfile import SavedSurvey
+from wavebatch.surveying import Survey, survey_block
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.sensor import SensorRequest
+from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
 from wavebatch.voxels.ceiling import Ceiling
 from wavebatch.voxels.profile import _pulse_taps, deconvolve_block

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.batch.cluster import Cluster
-from wavebatch.batch.plan import check_outputs
-from wavebatch.batch.record import BATCH_SCHEMA, build_timing
-from wavebatch.batch.report import RunReport
-from wavebatch.batch.task import BatchOptions, StripTask
-from wavebatch.batch.work import StripJob
-from wavebatch.batch.workers import Workers
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.dask_cluster import Cluster
+from wavebatch.batch.preflight import check_outputs
+from wavebatch.batch.processes import Workers
+from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
+from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.unit import StripJob
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import remove_stale, reporting
 

@@ -14,7 +14,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.stages.score import QUANTITIES, find_isolated, match_echoes
-from wavebatch.survey import Survey, survey_block
+from wavebatch.surveying import Survey, survey_block
 
 CLEAR = 10.0
 """Signal to noise from which an echo's error is compared with its bound."""

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.auto import choose_chain
-from wavebatch.batch.work import BLOCK_SAMPLES
+from wavebatch.batch.unit import BLOCK_SAMPLES
 from wavebatch.bench.accuracy import Group, Tally, derive_seed, describe_found, make_groups
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.methods import list_methods
@@ -28,7 +27,8 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.simulate import Scene, simulate_blocks
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_chain, load_profile
-from wavebatch.survey import Survey
+from wavebatch.surveying import Survey
+from wavebatch.surveying.auto_chain import choose_chain
 
 SCHEMA = "wavebatch.bench/1"
 

@@ -15,7 +15,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.simulate.draws import Drawn
 from wavebatch.stages.chain import Chain
-from wavebatch.survey import SAMPLE, survey_blocks
+from wavebatch.surveying import SAMPLE, survey_blocks
 
 BENCH_SCENES: dict[str, str] = {
     "mixed": "mixed",

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.run import run_batch
-from wavebatch.batch.task import BatchOptions
-from wavebatch.batch.work import RunOptions, StripJob, choose_columns
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.bench.figures import median_range
 from wavebatch.bench.worker import Worker, peak_memory
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock

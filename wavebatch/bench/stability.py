@@ -19,7 +19,7 @@ from wavebatch.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.simulate.draws import LogUniform, Mixture
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import effective
-from wavebatch.survey import Survey, survey_block
+from wavebatch.surveying import Survey, survey_block
 
 AUTO = "auto"
 """Name of the chain that a survey chooses."""

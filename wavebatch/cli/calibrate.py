@@ -52,10 +52,10 @@ def calibrate(
     targets, each gets a constant of its own, and all others that of all together. Exit code: 0, 1 where the strip or
     its targets give no constant, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.calibration import format_calibration
     from wavebatch.files.disk.publish import refuse_existing
-    from wavebatch.systemfile import load_survey, write_text
-    from wavebatch.targets import calibrate_strip, load_targets
+    from wavebatch.surveying.calibration import format_calibration
+    from wavebatch.surveying.system_file import load_survey, write_text
+    from wavebatch.surveying.targets import calibrate_strip, load_targets
 
     sensor = read_sensor(options)
     if not overwrite:

@@ -103,10 +103,10 @@ def _is_chain(side: Path) -> bool:
 
 
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
-    from wavebatch.choice import COSTS
     from wavebatch.compare.chains import AUTO, find_contender, match_sides
     from wavebatch.core.suggest import nearest
-    from wavebatch.systemfile import load_survey
+    from wavebatch.surveying.choose_chain import COSTS
+    from wavebatch.surveying.system_file import load_survey
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` holds chains against a truth")

@@ -11,7 +11,7 @@ import click
 from wavebatch.cli.common import debug_option, print_json, report_errors
 from wavebatch.cli.options import direction_option, headerless_option, json_option
 from wavebatch.files.inputs import find_files
-from wavebatch.inspection import check_file, describe_strip
+from wavebatch.surveying.inspect_strip import check_file, describe_strip
 
 EXIT_PROBLEMS = 1
 """`check` found something."""

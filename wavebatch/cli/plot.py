@@ -117,11 +117,11 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any], str]:
     """The waveforms that are wanted, and the name of the chain that they were run through."""
-    from wavebatch.choice import make_choice
     from wavebatch.cli.run import choose_chain
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.plots.packets import find_places
     from wavebatch.plots.waveform import read_views
+    from wavebatch.surveying.choose_chain import make_choice
 
     chain, request = choose_chain({**options, "tolerance": None})
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])

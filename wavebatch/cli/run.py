@@ -134,11 +134,11 @@ def _check_options(options: dict[str, Any]) -> None:
 
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
-    from wavebatch.batch.plan import check_outputs, plan_memory
-    from wavebatch.batch.task import BatchOptions
-    from wavebatch.batch.work import RunOptions, StripJob, choose_columns
-    from wavebatch.calibration import load_calibration
+    from wavebatch.batch.preflight import check_outputs, plan_memory
+    from wavebatch.batch.strip_task import BatchOptions
+    from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
     from wavebatch.files.inputs import find_strips
+    from wavebatch.surveying.calibration import load_calibration
 
     chain, request = choose_chain(options)
     calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
@@ -177,10 +177,10 @@ def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
 
     options: chain_file, profile, tolerance and system_file, each None where it was not given.
     """
-    from wavebatch.choice import Request, widest
     from wavebatch.core.suggest import nearest
     from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-    from wavebatch.systemfile import load_survey
+    from wavebatch.surveying.choose_chain import Request, widest
+    from wavebatch.surveying.system_file import load_survey
 
     profile = options["profile"] or "auto"
     request = Request(
@@ -199,7 +199,7 @@ def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
 
 def _check_use(chain: Any, options: dict[str, Any]) -> None:
     """Raises ConfigError for options that the chain would ignore."""
-    from wavebatch.calibration import needs_sensor
+    from wavebatch.surveying.calibration import needs_sensor
 
     given = [name for name in ("trajectory", "flight_height", "calibration_file") if options[name] is not None]
     if given and not needs_sensor(chain):
@@ -219,7 +219,7 @@ def _read_tolerance(text: str | None) -> float | None:
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch.record import write_json
+    from wavebatch.batch.report_file import write_json
     from wavebatch.batch.run import run_batch
     from wavebatch.cli.progress import Progress
 
@@ -248,7 +248,7 @@ def exit_code(failed: int, strips: int) -> int:
 
 
 def _dry_run(jobs: list[Any], batch_options: Any) -> int:
-    from wavebatch.batch.plan import plan_strip
+    from wavebatch.batch.preflight import plan_strip
     from wavebatch.stages.chain_file import effective
 
     failed = 0

@@ -11,7 +11,7 @@ import click
 from wavebatch.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from wavebatch.sensor import SensorRequest
+    from wavebatch.surveying.sensor import SensorRequest
 
 
 _OPTIONS = (
@@ -33,7 +33,7 @@ def sensor_options(command: Callable) -> Callable:
 
 def read_sensor(options: Mapping[str, Any]) -> SensorRequest:
     """What --trajectory, --crs, --lever-arm and --flight-height ask for; ConfigError where they cannot be meant."""
-    from wavebatch.sensor import SensorRequest
+    from wavebatch.surveying.sensor import SensorRequest
 
     arm = _read_lever_arm(options["lever_arm"])
     for name in ("lever_arm", "crs"):

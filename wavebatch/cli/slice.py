@@ -14,7 +14,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.slices import SegmentWriter, SliceOptions, cut_slice, draw_slice, find_segments, read_scan_lines
-from wavebatch.survey import survey_blocks
+from wavebatch.surveying import survey_blocks
 
 _SURVEYED = 2000
 

@@ -21,7 +21,7 @@ from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.returns import ReturnStats, count_returns
-from wavebatch.systemfile import write_text
+from wavebatch.surveying.system_file import write_text
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others are counted."""

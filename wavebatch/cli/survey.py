@@ -15,7 +15,7 @@ from wavebatch.cli.options import direction_option, headerless_option, json_opti
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
     from wavebatch.files.strip.reader import StripReader, StripScan
-    from wavebatch.systemfile import SavedSurvey
+    from wavebatch.surveying.system_file import SavedSurvey
 
 
 @click.command()
@@ -41,9 +41,9 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     part of a chain that the scene does not need, with the reason. Exit code: 0, or 1 where the strip cannot be surveyed
     or a file not be written.
     """  # fmt: skip
-    from wavebatch.auto import chain_text
     from wavebatch.files.disk.publish import refuse_existing
-    from wavebatch.systemfile import write_survey, write_text
+    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.system_file import write_survey, write_text
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
@@ -66,12 +66,12 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
 
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
     """The survey, and what else is told about the strip."""
-    from wavebatch.choice import read_sample, survey_sample
     from wavebatch.core.errors import InputError
     from wavebatch.files.disk.fingerprint import take_fingerprint
     from wavebatch.files.strip.reader import StripReader
-    from wavebatch.outlook import survey_angles
-    from wavebatch.systemfile import SavedSurvey
+    from wavebatch.surveying.angle_limits import survey_angles
+    from wavebatch.surveying.choose_chain import read_sample, survey_sample
+    from wavebatch.surveying.system_file import SavedSurvey
 
     with StripReader(strip, direction=options["direction"], headerless=options["headerless"]) as reader:
         with reader.scan() as scan:
@@ -97,7 +97,7 @@ def _describe_strip(reader: StripReader, scan: StripScan) -> dict[str, Any]:
 
 def _decisions(saved: SavedSurvey) -> list[Any]:
     """Those of the chosen chain, then what the scene would need that no chain has without further files."""
-    from wavebatch.auto import decide
+    from wavebatch.surveying.auto_chain import decide
 
     chosen = decide(saved.survey)
     parts = {decision.part for decision in chosen}
@@ -105,8 +105,8 @@ def _decisions(saved: SavedSurvey) -> list[Any]:
 
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
-    from wavebatch.auto import chain_text
-    from wavebatch.systemfile import SYSTEM_SCHEMA, describe_system
+    from wavebatch.surveying.auto_chain import chain_text
+    from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
 
     return {
         "schema": SYSTEM_SCHEMA,

@@ -74,8 +74,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0, 1 where the strip cannot be read or the output not be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.calibration import load_calibration
-    from wavebatch.systemfile import load_survey
+    from wavebatch.surveying.calibration import load_calibration
+    from wavebatch.surveying.system_file import load_survey
     from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
 
     _check_options(options)

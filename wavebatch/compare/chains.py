@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.auto import choose_chain
-from wavebatch.choice import read_sample, survey_sample
 from wavebatch.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.compare.differences import SPEED
 from wavebatch.compare.goodness import FitQuality, Goodness, measure_fit
@@ -21,7 +19,9 @@ from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-from wavebatch.survey import Survey
+from wavebatch.surveying import Survey
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
 
 AUTO = "auto"
 """The chain that the strip's survey chooses."""

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.calibration import Calibration
-from wavebatch.choice import read_sample, survey_sample
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -19,8 +17,10 @@ from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
-from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
-from wavebatch.systemfile import SavedSurvey, describe_system
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.voxels.output import VoxelSpace, check_target, open_voxels

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.batch.remarks import explain_absence
-from wavebatch.batch.report import RunReport
-from wavebatch.batch.work import Prepared, StripJob
-from wavebatch.choice import describe_choice, describe_survey
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.explain import explain_absence
+from wavebatch.batch.unit import Prepared, StripJob
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import effective
-from wavebatch.systemfile import format_survey, write_text
+from wavebatch.surveying.choose_chain import describe_choice, describe_survey
+from wavebatch.surveying.system_file import format_survey, write_text
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 BATCH_SCHEMA = "wavebatch.batch-report/1"

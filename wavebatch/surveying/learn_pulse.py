@@ -14,7 +14,7 @@ from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
-from wavebatch.survey.measuring import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""

@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.batch.report import RunReport
-from wavebatch.batch.work import unpack
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.unit import unpack
 from wavebatch.core.echoes import COLUMNS, RAY
 from wavebatch.core.no_data import NoData
 from wavebatch.files.cloud.layout import OutputLayout

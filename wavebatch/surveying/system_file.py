@@ -15,7 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
-from wavebatch.survey import Decision, Survey
+from wavebatch.surveying import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
 

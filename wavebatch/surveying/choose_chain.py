@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch import survey
-from wavebatch.auto import choose_chain, decide, widest_chain
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.survey import Decision, Survey
-from wavebatch.systemfile import SavedSurvey, describe_system
-from wavebatch.trial import WAVEFORMS, Prediction, predict_errors
+from wavebatch.surveying import SAMPLE, Decision, Survey, join_digitizers, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain, decide, widest_chain
+from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, predict_errors
+from wavebatch.surveying.system_file import SavedSurvey, describe_system
 
 SAMPLE_SAMPLES = 1 << 21
 """Samples that a survey looks at, at most."""
@@ -73,19 +72,19 @@ def read_sample(reader: StripReader, scan: StripScan, waveforms: int | None = No
 
     The same ones every time. waveforms: how many to read; without it as many as a survey looks at.
     """
-    return survey.join_digitizers(reader.sample_blocks(scan, waveforms or sample_size(reader, scan)))
+    return join_digitizers(reader.sample_blocks(scan, waveforms or sample_size(reader, scan)))
 
 
 def sample_size(reader: StripReader, scan: StripScan) -> int:
     """Waveforms of a strip that a survey looks at."""
     used = (digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor)
     longest = max((digitizer.n_samples for digitizer in used), default=0)
-    return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, survey.SAMPLE))
+    return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
 
 
 def survey_sample(sample: list[WaveformBlock]) -> Survey:
     """The survey of a strip's sample; one that knows nothing where there is no waveform."""
-    return survey.survey_blocks(sample)
+    return survey_blocks(sample)
 
 
 def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> Choice:

@@ -12,8 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.cluster import Cluster
-from wavebatch.batch.record import (
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.dask_cluster import Cluster
+from wavebatch.batch.explain import find_remarks
+from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.processes import Workers
+from wavebatch.batch.report_file import (
     build_document,
     cloud_path,
     describe_chain,
@@ -23,11 +27,7 @@ from wavebatch.batch.record import (
     report_path,
     write_json,
 )
-from wavebatch.batch.remarks import find_remarks
-from wavebatch.batch.report import RunReport
-from wavebatch.batch.secondpass import SecondPass, process_tile
-from wavebatch.batch.work import Prepared, StripJob, prepare_strip, process_packed_unit
-from wavebatch.batch.workers import Workers
+from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_packed_unit
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint

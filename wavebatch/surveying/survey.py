@@ -10,8 +10,8 @@ import numpy as np
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.survey.learning import find_isolated, find_strong, learn_pulse
-from wavebatch.survey.measuring import (
+from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
+from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,

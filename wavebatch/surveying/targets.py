@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.calibration import Calibration
-from wavebatch.choice import read_sample, survey_sample
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import MAD_TO_STD
@@ -23,8 +21,10 @@ from wavebatch.files.geojson import find_inside, read_features
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
-from wavebatch.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 LEAST_ECHOES = 10
 """Echoes on a target below which it is left out."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.batch.report import RunReport, count_flags
+from wavebatch.batch.counts import RunReport, count_flags
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import count_reasons

@@ -17,7 +17,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.attribute.radiometry import is_alone, level_angle
 from wavebatch.stages.attribute.width_angle import added_variance
-from wavebatch.survey.measuring import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""

@@ -8,7 +8,7 @@ from typing import Any
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import format_step, parse_chain
-from wavebatch.survey import Decision, Survey
+from wavebatch.surveying import Decision, Survey
 
 LOST = 0.005
 """Share of the waveforms with echoes that may hold overlapping ones for fits not to grow.

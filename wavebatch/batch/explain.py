@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from wavebatch.angles import AngleOutlook, angle_parameters, predict_angles
-from wavebatch.batch.report import AMPLITUDE_BINS, RunReport
-from wavebatch.batch.work import Prepared
+from wavebatch.batch.counts import AMPLITUDE_BINS, RunReport
+from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
-from wavebatch.sensor import SensorSource
+from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
+from wavebatch.surveying.sensor import SensorSource
 
 _ANGLE = "incidence_angle"
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
 from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.chain import Chain
+from wavebatch.surveying import Decision, Survey
+from wavebatch.surveying.auto_chain import ANGLE
+from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.flat_ground import measure_level
+from wavebatch.surveying.sensor import SensorRequest, find_sensor
 
 SLOPE = 30.0
 """Angle at which the error is predicted [deg]: where widths tell most (ALGORITHMS 1.4)."""
@@ -71,3 +77,27 @@ def predict_angles(
         f"faces the sensor), and max_error is {max_error:g}"
     )
     return AngleOutlook(error, max_error, reason)
+
+
+def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float) -> Survey:
+    """The survey with a beam of `divergence` [mrad], the variance of level ground, and a decision about angles.
+
+    Raises InputError for strips that are not in metres.
+    """
+    system = replace(survey.system, divergence=divergence)
+    source = find_sensor(reader, scan, SensorRequest())
+    distance = source.describe().get("distance_m")
+    if distance is None:
+        reason = "nobody knows where the sensor was: give --trajectory to `wavebatch run`"
+        return _decide(replace(survey, system=system), needed=False, reason=reason)
+    spacing = survey.figures["spacing_ns"]
+    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
+    system = measure_level(blocks, system, spacing)
+    outlook = predict_angles(system, spacing, distance, divergence, survey.figures["amplitude_50"])
+    return _decide(replace(survey, system=system), needed=outlook.possible, reason=outlook.reason)
+
+
+def _decide(survey: Survey, *, needed: bool, reason: str) -> Survey:
+    """The survey with this decision about angles in place of its own."""
+    others = tuple(decision for decision in survey.decisions if decision.part != ANGLE)
+    return replace(survey, decisions=(*others, Decision(ANGLE, needed, reason)))

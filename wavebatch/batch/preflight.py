@@ -7,9 +7,9 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-from wavebatch.batch.record import cloud_path
-from wavebatch.batch.task import BatchOptions, StripTask
-from wavebatch.batch.work import StripJob, plan_layout
+from wavebatch.batch.report_file import cloud_path
+from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
 
 LEAST_MEMORY = 300 << 20

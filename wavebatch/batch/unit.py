@@ -12,21 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.angles import angle_parameters
-from wavebatch.auto import without_columns
-from wavebatch.batch.assemble import NEEDED, assemble_echoes, assemble_returns, gather_echoes
-from wavebatch.batch.report import RunReport
-from wavebatch.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.choice import Choice, Request, make_choice, sample_size
+from wavebatch.batch.counts import RunReport
+from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
-from wavebatch.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.survey.levels import measure_level
+from wavebatch.surveying.angle_limits import angle_parameters
+from wavebatch.surveying.auto_chain import without_columns
+from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice, sample_size
+from wavebatch.surveying.flat_ground import measure_level
+from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""
