@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wavebatch.simulate import simulate_strip
+from wavebatch.tools.simulate import simulate_strip
 
 
 @pytest.fixture
@@ -85,4 +85,4 @@ def timed_here(monkeypatch):
         def close(self):
             pass
 
-    monkeypatch.setattr("wavebatch.bench.speed.Worker", Here)
+    monkeypatch.setattr("wavebatch.tools.bench.speed.Worker", Here)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.simulate import Scene, find_scene, simulate_blocks
+from wavebatch.tools.simulate import Scene, find_scene, simulate_blocks
 
 
 def make_scene(name: str, **recording) -> Scene:

@@ -8,11 +8,11 @@ from wavebatch import surveying
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.simulate import Recording, find_scene, simulate_block
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.stages.decompose.merge import merge_unresolved
 from wavebatch.stages.score import score
+from wavebatch.tools.simulate import Recording, find_scene, simulate_block
 
 STD = float(np.hypot(1, 1 / np.sqrt(12)))
 """Noise of a recorded sample: standard deviation 1, rounded to whole counts."""

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from strips import make_raw
 
 from wavebatch.cli import main
-from wavebatch.cli.common import printable
-from wavebatch.simulate import simulate_strip
+from wavebatch.cli.messages import printable
+from wavebatch.tools.simulate import simulate_strip
 
 SIGNALLING = 0x7F800001
 """A signalling NaN: NumPy warns when it is cast."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from published import WAGNER
 from s1_wang import find_raw_maxima
 from table import Table, main
 
@@ -19,12 +20,11 @@ from wavebatch.core.units import MAD_TO_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
-from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_block, simulate_echoes
-from wavebatch.simulate.papers import WAGNER
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.correlation import asdf
 from wavebatch.stages.detect.maximum import TWICE_SMOOTHED_GAIN, maximum
 from wavebatch.stages.score import match_echoes
+from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_block, simulate_echoes
 
 PAPER_RULE = {"rule": "paper", "interpolation": "parabola"}
 RESOLUTION = {1.0: (3.58, 3.43, 3.24, 3.14), 0.5: (4.76, 4.34, 3.95, 3.74), 0.35: (5.75, 4.97, 4.33, 4.00)}

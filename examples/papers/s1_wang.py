@@ -11,12 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from published import PULSE_SIGMA, WANG_CASES, simulate_wang
 from table import Table, main
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.signal.signal import find_peaks
-from wavebatch.simulate import (
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.decompose.loops import residual_loop
+from wavebatch.stages.decompose.models import skewed
+from wavebatch.stages.detect.candidates import signal_above
+from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.detect.wavelet import wavelet
+from wavebatch.stages.score import score
+from wavebatch.tools.simulate import (
     FINE,
     find_scene,
     fine_recording,
@@ -25,14 +33,6 @@ from wavebatch.simulate import (
     simulate_block,
     simulate_echoes,
 )
-from wavebatch.simulate.papers import PULSE_SIGMA, WANG_CASES, simulate_wang
-from wavebatch.stages.decompose.fit import gaussian
-from wavebatch.stages.decompose.loops import residual_loop
-from wavebatch.stages.decompose.models import skewed
-from wavebatch.stages.detect.candidates import signal_above
-from wavebatch.stages.detect.maximum import maximum
-from wavebatch.stages.detect.wavelet import wavelet
-from wavebatch.stages.score import score
 
 PAPER_COUNTS = {"a": 1, "b": 2, "c": 1, "d": 2, "e": 3}
 LOCAL_MAXIMA = {"a": 1, "b": 2, "c": 1, "d": 1, "e": 2}

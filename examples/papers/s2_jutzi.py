@@ -11,6 +11,7 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from published import PULSE_SIGMA, paint_slice
 from table import Table, main
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -19,12 +20,11 @@ from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.least_squares import Limits, Windows, fit_windows
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.simulate.papers import PULSE_SIGMA, paint_slice
-from wavebatch.slices import ScanLine, SliceOptions, cut_slice, find_segments
 from wavebatch.stages.decompose.models import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
+from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.tools.slices import ScanLine, SliceOptions, cut_slice, find_segments
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

@@ -23,9 +23,9 @@ from wavebatch.kernels.physics.incidence import (
     spread_pulse,
     spread_variance,
 )
-from wavebatch.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
+from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""

@@ -12,13 +12,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from published import RETURN_TABLES
 from table import Table, main
 
 from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
-from wavebatch.returns import ReturnStats, count_returns
-from wavebatch.simulate import DiscreteReceiver, Recording, simulate_returns
-from wavebatch.simulate.papers import RETURN_TABLES
-from wavebatch.simulate.render import paint_echoes
+from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
+from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
+from wavebatch.tools.simulate.render import paint_echoes
 
 CORN = {0.64: (1.13, 0.90), 0.67: (1.15, 0.92)}
 """Mean separation of the first and the second, the second and the third return [m], by dead zone [m]."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from wavebatch.bench.table import align
+from wavebatch.tools.bench.report import align
 
 HEADS = ["figure", "paper", "spec", "ours", "accepted", ""]
 

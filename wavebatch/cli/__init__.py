@@ -7,7 +7,7 @@ import importlib
 import click
 
 from wavebatch import __version__
-from wavebatch.cli.common import NearestGroup
+from wavebatch.cli.messages import NearestGroup
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("wavebatch.cli.run:run", "Strips in, enriched point clouds out: the main job."),
@@ -18,7 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("wavebatch.cli.simulate:simulate", "A strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Two results or chains on one strip, or a result with the truth."),
     "stats": ("wavebatch.cli.stats:stats", "Return numbers, separations and flags of point clouds."),
-    "synthesize": ("wavebatch.cli.synthesize:synthesize", "Waveforms modelled from discrete returns."),
+    "synthesize": ("wavebatch.cli.simulate:synthesize", "Waveforms modelled from discrete returns."),
     "slice": ("wavebatch.cli.slice:slice_", "Straight surface lines in the scan lines of a strip."),
     "voxelize": ("wavebatch.cli.voxelize:voxelize", "What came back from every voxel of a 3D grid."),
     "plot": ("wavebatch.cli.plot:plot", "Pictures of waveforms with their fit, histograms and maps."),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option
 
 
@@ -51,11 +51,10 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, a
     survey finds them; or of named scenes (default: mixed). One row per chain; every figure with its standard error.
     Exit code: 0, 1 where the strip cannot be read or the folder not be written, 2 wrong usage.
     """
-    from wavebatch.bench.command import BenchOptions, run_bench
-    from wavebatch.bench.output import write_outputs
-    from wavebatch.bench.pareto import parse_length
-    from wavebatch.bench.promises import format_promises
-    from wavebatch.bench.table import format_document
+    from wavebatch.cli.options import parse_length
+    from wavebatch.tools.bench.command import BenchOptions, run_bench
+    from wavebatch.tools.bench.promises import format_promises
+    from wavebatch.tools.bench.report import format_document, write_outputs
 
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     if len(strips) > 1:

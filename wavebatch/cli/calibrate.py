@@ -7,9 +7,8 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import debug_option, report_errors, talk
-from wavebatch.cli.options import direction_option, overwrite_option, system_option
-from wavebatch.cli.sensor import read_sensor, sensor_options
+from wavebatch.cli.messages import debug_option, report_errors, talk
+from wavebatch.cli.options import direction_option, overwrite_option, read_sensor, sensor_options, system_option
 
 LEAST_DOUBT = 0.03
 """Relative error of a target, at least: constants that differ by six times this or its stated error are told."""

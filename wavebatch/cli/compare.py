@@ -11,16 +11,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
-from wavebatch.cli.compare_angles import list_lines, measure
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option, system_option
-from wavebatch.compare.clouds import Comparison, compare_clouds, compare_truth
+from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
-    from wavebatch.compare.chains import Matchup
+    from wavebatch.tools.compare.angles import AngleAgreement
+    from wavebatch.tools.compare.chains import Matchup
 
 EXIT_VIOLATED = 1
 """A threshold is not met."""
+
+_BAR = 40
+"""Characters of the longest bar of a histogram."""
 
 _SHARE, _LENGTH = click.FloatRange(0.0, 1.0), click.FloatRange(0.0)
 
@@ -61,8 +64,8 @@ def compare(
     Exit code: 0 fine, 1 a threshold is not met, 2 wrong usage or a file unreadable.
     """  # fmt: skip
     if angles:
-        agreement = measure(a, b, {**options, "strip": strip, "truth": truth})
-        print_json(agreement.to_json()) if as_json else click.echo("\n".join(list_lines(agreement)))
+        agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
+        print_json(agreement.to_json()) if as_json else click.echo("\n".join(_list_angles(agreement)))
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
@@ -97,16 +100,16 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
 
 
 def _is_chain(side: Path) -> bool:
-    from wavebatch.compare.chains import find_contender
+    from wavebatch.tools.compare.chains import find_contender
 
     return side.suffix.lower() == ".toml" or (not side.is_file() and not find_contender(str(side)).is_cloud)
 
 
 def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: dict) -> Matchup:
-    from wavebatch.compare.chains import AUTO, find_contender, match_sides
     from wavebatch.core.suggest import nearest
     from wavebatch.surveying.choose_chain import COSTS
     from wavebatch.surveying.system_file import load_survey
+    from wavebatch.tools.compare.chains import AUTO, find_contender, match_sides
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` holds chains against a truth")
@@ -215,3 +218,54 @@ def _list_errors(result: Comparison) -> list[str]:
             figures = " ".join(f"{'-':>10}" if math.isnan(value) else f"{value:>10.4f}" for value in values)
             lines.append(f"{kind + ' ' + name:<22} {stats.number:>10} {figures}")
     return lines
+
+
+def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
+    """The agreement of one cloud or two; UsageError for options that mean nothing here."""
+    from wavebatch.tools.compare.angles import compare_angles
+
+    for name, value in options.items():
+        if value is not None and name not in ("tolerance", "debug"):
+            raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with --angles")
+    given = {} if options["tolerance"] is None else {"tolerance_ns": options["tolerance"]}
+    return compare_angles(a, b, **given)
+
+
+def _list_angles(result: AngleAgreement) -> list[str]:
+    """Figures and histograms as text."""
+    lines = [f"A {result.a}"] + ([f"B {result.b}"] if result.b else [])
+    lines += [
+        f"points        {result.points:>12}   with angle from width {result.with_widths}, from normals "
+        f"{result.with_normals}, both {result.number}",
+    ]
+    if not result.number:
+        return [*lines, "no point has both angles; the report of the run says why"]
+    share = "no errors" if math.isnan(result.within_error) else f"{100 * result.within_error:.1f} %"
+    lines += [
+        f"bias          {result.bias:>12.3f}   deg, angle from width less angle from normals",
+        f"MAE           {result.mae:>12.3f}   deg",
+        f"median abs    {result.median_absolute:>12.3f}   deg",
+        f"rms           {result.rms:>12.3f}   deg",
+        f"within errors {share:>12}   of the differences within one standard deviation of both",
+        "",
+        f"{'angle deg':>12}  from width",
+        *_bars(result.edges, result.histogram_widths),
+        f"{'angle deg':>12}  from normals",
+        *_bars(result.edges, result.histogram_normals),
+        f"{'difference':>12}  width less normals",
+        *_bars(result.difference_edges, result.histogram_difference),
+    ]
+    return lines
+
+
+def _bars(edges: tuple[float, ...], counts: tuple[int, ...]) -> list[str]:
+    """A line per bin, from the first to the last that holds a thousandth of all; what lies beyond in one line."""
+    filled = [number for number, count in enumerate(counts) if 1000 * count >= sum(counts)]
+    most = max(counts)
+    beyond = sum(counts) - sum(counts[filled[0] : filled[-1] + 1])
+    lines = [
+        f"{edges[number]:>5.0f} to {edges[number + 1]:>3.0f} {counts[number]:>11} "
+        + "#" * math.ceil(_BAR * counts[number] / most)
+        for number in range(filled[0], filled[-1] + 1)
+    ]
+    return [*lines, f"{'beyond':>12} {beyond:>11}"] if beyond else lines

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors
+from wavebatch.cli.messages import debug_option, print_json, report_errors
 from wavebatch.cli.options import direction_option, headerless_option, json_option
 from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file, describe_strip

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import NearestGroup, debug_option, report_errors, talk
+from wavebatch.cli.messages import NearestGroup, debug_option, report_errors, talk
 from wavebatch.cli.options import direction_option, headerless_option, overwrite_option, quiet_option, system_option
 
 _output = click.option("-o", "--output", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
@@ -96,8 +96,8 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     """  # fmt: skip
     from wavebatch.core.errors import ConfigError
     from wavebatch.files.figure_file import check_picture
-    from wavebatch.plots.packets import Wanted
-    from wavebatch.plots.values import read_flags
+    from wavebatch.tools.plots.packets import Wanted
+    from wavebatch.tools.plots.values import read_flags
 
     if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
         raise ConfigError("--flags-with looks for waveforms itself; leave --packet, --point and --gps-time out")
@@ -106,7 +106,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         options["packets"], options["points"], options["times"], read_flags(options["flags_with"]), options["most"]
     )
     views, chain = _view(strip, wanted, options)
-    from wavebatch.plots.draw_waveform import draw_waveforms
+    from wavebatch.tools.plots.draw_waveform import draw_waveforms
 
     draw_waveforms(
         views, output, strip=strip.name, chain=chain, times=options["shown"], overwrite=options["overwrite"]
@@ -119,9 +119,9 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     """The waveforms that are wanted, and the name of the chain that they were run through."""
     from wavebatch.cli.run import choose_chain
     from wavebatch.files.strip.reader import StripReader
-    from wavebatch.plots.packets import find_places
-    from wavebatch.plots.waveform import read_views
     from wavebatch.surveying.choose_chain import make_choice
+    from wavebatch.tools.plots.packets import find_places
+    from wavebatch.tools.plots.waveform import read_views
 
     chain, request = choose_chain({**options, "tolerance": None})
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
@@ -156,7 +156,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     """  # fmt: skip
     from wavebatch.files.figure_file import check_picture
     from wavebatch.files.inputs import find_files
-    from wavebatch.plots.histogram import count_flags, count_values, is_flags
+    from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
 
     check_picture(output, overwrite=options["overwrite"])
     clouds = find_files(map(str, clouds))
@@ -165,7 +165,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     if is_flags(clouds[0], column):
         _refuse_for_flags(options)
         counted = count_flags(clouds, selection)
-        from wavebatch.plots.draw_cloud import draw_flags
+        from wavebatch.tools.plots.draw_cloud import draw_flags
 
         draw_flags(counted, output, names=tuple(path.name for path in clouds), **how)
         told = f"{counted.total.values} points, {counted.clean} without a flag"
@@ -173,7 +173,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
         found = count_values(
             clouds, selection, bins=options["bins"], limits=options["limits"], each=options["each"]
         )
-        from wavebatch.plots.draw_cloud import draw_histogram
+        from wavebatch.tools.plots.draw_cloud import draw_histogram
 
         draw_histogram(found, output, **how)
         total = found.total
@@ -183,7 +183,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
 
 
 def _select(column: str | None, options: dict[str, Any]) -> Any:
-    from wavebatch.plots.values import Selection, read_flags
+    from wavebatch.tools.plots.values import Selection, read_flags
 
     return Selection(column, read_flags(options["flags_with"]), read_flags(options["flags_without"]))
 
@@ -219,7 +219,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     from wavebatch.core.errors import ConfigError
     from wavebatch.files.figure_file import check_picture
     from wavebatch.files.inputs import find_files
-    from wavebatch.plots.raster import grid_values
+    from wavebatch.tools.plots.raster import grid_values
 
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"]
@@ -229,7 +229,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     found = grid_values(
         clouds, _select(column, options), statistic, size=options["size"], bounds=options["bounds"]
     )
-    from wavebatch.plots.draw_cloud import draw_map
+    from wavebatch.tools.plots.draw_cloud import draw_map
 
     draw_map(found, output, names=tuple(path.name for path in clouds), overwrite=options["overwrite"])
     if not options["quiet"]:

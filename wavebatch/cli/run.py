@@ -11,9 +11,15 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.common import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
-from wavebatch.cli.options import direction_option, headerless_option, overwrite_option, system_option
-from wavebatch.cli.sensor import read_sensor, sensor_options
+from wavebatch.cli.messages import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
+from wavebatch.cli.options import (
+    direction_option,
+    headerless_option,
+    overwrite_option,
+    read_sensor,
+    sensor_options,
+    system_option,
+)
 from wavebatch.core.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
@@ -210,7 +216,7 @@ def _check_use(chain: Any, options: dict[str, Any]) -> None:
 
 def _read_tolerance(text: str | None) -> float | None:
     """The length in m."""
-    from wavebatch.bench.pareto import parse_length
+    from wavebatch.cli.options import parse_length
 
     try:
         return None if text is None else parse_length(text) / 100
@@ -221,7 +227,7 @@ def _read_tolerance(text: str | None) -> float | None:
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.report_file import write_json
     from wavebatch.batch.run import run_batch
-    from wavebatch.cli.progress import Progress
+    from wavebatch.cli.messages import Progress
 
     level = -1 if options["quiet"] else int(options["verbose"])
     with Progress([job.path for job in jobs], options["progress"], level, options["debug"]) as progress:

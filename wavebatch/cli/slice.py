@@ -8,13 +8,13 @@ from pathlib import Path
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import direction_option, json_option, overwrite_option, quiet_option
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.slices import SegmentWriter, SliceOptions, cut_slice, draw_slice, find_segments, read_scan_lines
 from wavebatch.surveying import survey_blocks
+from wavebatch.tools.slices import SegmentWriter, SliceOptions, cut_slice, draw_slice, find_segments, read_scan_lines
 
 _SURVEYED = 2000
 

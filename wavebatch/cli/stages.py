@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors
+from wavebatch.cli.messages import debug_option, print_json, report_errors
 from wavebatch.cli.options import json_option
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest

@@ -13,15 +13,15 @@ from typing import Any
 
 import click
 
-from wavebatch.areas import AreaStats, Grid, PolygonSet
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option, overwrite_option
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
-from wavebatch.returns import ReturnStats, count_returns
 from wavebatch.surveying.system_file import write_text
+from wavebatch.tools.return_stats.areas import AreaStats, Grid, PolygonSet
+from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
 EXIT_UNREADABLE = 1
 """A cloud could not be read; the others are counted."""

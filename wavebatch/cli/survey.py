@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import direction_option, headerless_option, json_option, overwrite_option
 
 if TYPE_CHECKING:

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.common import debug_option, print_json, report_errors, talk
+from wavebatch.cli.messages import counting, debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import (
     direction_option,
     headerless_option,
     json_option,
     overwrite_option,
     quiet_option,
+    read_sensor,
+    sensor_options,
     system_option,
 )
-from wavebatch.cli.progress import counting
-from wavebatch.cli.sensor import read_sensor, sensor_options
 
 if TYPE_CHECKING:
-    from wavebatch.voxels import VoxelSummary
+    from wavebatch.tools.voxels import VoxelSummary
 
 _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 
@@ -76,7 +76,7 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     """  # fmt: skip
     from wavebatch.surveying.calibration import load_calibration
     from wavebatch.surveying.system_file import load_survey
-    from wavebatch.voxels import Deconvolution, VoxelOptions, voxelize_strip
+    from wavebatch.tools.voxels import Deconvolution, VoxelOptions, voxelize_strip
 
     _check_options(options)
     sensor = read_sensor(options)

@@ -1,0 +1,240 @@
+"""Runs whose work is done by the workers of a dask cluster."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.tools.simulate import simulate_strip
+
+distributed = pytest.importorskip("distributed", reason="needs dask's distributed: pip install wavebatch[cluster]")
+
+_WORKER = [sys.executable, "-m", "distributed.cli.dask_worker"]
+_SCHEDULER = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+
+
+class Dask:
+    """A scheduler and its workers, as processes of their own in a folder of their own."""
+
+    def __init__(self, folder):
+        self.folder, self.processes = folder, []
+        file = folder / "scheduler.json"
+        self.scheduler = self._start(
+            *_SCHEDULER, "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file)
+        )
+        self.wait_until(lambda: file.exists() and file.stat().st_size)
+        self.address = json.loads(file.read_text())["address"]
+
+    def start_worker(self):
+        path = os.pathsep.join(filter(None, (os.path.dirname(os.path.dirname(__file__)), os.environ.get("PYTHONPATH"))))
+        common = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--memory-limit", "0")
+        return self._start(*_WORKER, self.address, *common, PYTHONPATH=path)
+
+    def _start(self, *command, **env):
+        with open(self.folder / f"log{len(self.processes)}", "wb") as log:
+            process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env={**os.environ, **env})
+        self.processes.append(process)
+        return process
+
+    def wait_until(self, true):
+        deadline = time.monotonic() + 60
+        while not true():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+    def stop(self):
+        for process in reversed(self.processes):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def dask(tmp_path_factory):
+    """A cluster of two workers that are started in another folder than the tests."""
+    cluster = Dask(tmp_path_factory.mktemp("dask"))
+    cluster.start_worker()
+    cluster.start_worker()
+    yield cluster
+    cluster.stop()
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory, edit_points):
+    """Two strips, the second with two units that share packets."""
+    folder = tmp_path_factory.mktemp("strips")
+    simulate_strip("urban", folder / "a.las", pulses=300, seed=1)
+    simulate_strip("urban", folder.parent / "b.las", pulses=47_000, seed=2)
+    order = np.random.default_rng(1)
+    edit_points(folder.parent / "b.las", folder / "b.las", lambda points: order.permutation(points))
+    return folder
+
+
+def run(*arguments):
+    """Exit code and stderr of the command."""
+    done = CliRunner().invoke(main, ["run", "--profile", "fast", *map(str, arguments)])
+    assert not done.stdout
+    return done.exit_code, done.stderr
+
+
+def contents(folder):
+    """Bytes of the clouds, reports without timing."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        found[path.name] = path.read_bytes()
+        if path.suffix == ".json":
+            found[path.name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
+    return found
+
+
+def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
+    monkeypatch.chdir(strips.parent)
+    relative = os.path.relpath(strips)
+    (tmp_path / "bad").mkdir()
+    broken = tmp_path / "bad" / "broken.las"
+    broken.write_bytes((strips / "a.las").read_bytes()[:1000])
+    assert run(relative, "-o", tmp_path / "local", "-q") == (0, "")
+    code, said = run(relative, broken, "-o", tmp_path / "there", "-q", "--scheduler", dask.address)
+    assert code == 3, said
+    assert said.startswith(f"error: {broken}: ") and said.count("\n") == 1
+    assert contents(tmp_path / "there") == contents(tmp_path / "local")
+    skipped = run(relative, "-o", tmp_path / "there", "--scheduler", dask.address, "--resume")
+    assert skipped == (0, f"{relative}/a.las: is there already\n{relative}/b.las: is there already\n")
+
+
+@pytest.mark.slow
+def test_spooled_packets_travel_through_the_output_folder(dask, strips, tmp_path, monkeypatch):
+    """What one worker puts into a temporary file, the others read; nothing of it remains."""
+    from batch_tools import make_job
+
+    from wavebatch.batch.run import run_batch
+    from wavebatch.batch.strip_task import BatchOptions
+
+    with distributed.Client(dask.address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+        client.run(_spool_everything)
+        try:
+            result = run_batch([make_job(strips / "b.las")], BatchOptions(tmp_path, scheduler=dask.address))
+        finally:
+            made = [folder for folders in client.run(_spool_as_ever).values() for folder in folders]
+    assert result.outcomes[0].error is None
+    assert made and all(folder.startswith(str(tmp_path)) for folder in made)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.laz", "b.report.json"]
+
+
+def _spool_everything():
+    """Makes a worker spool to disk, and note where."""
+    from wavebatch.files.disk import spool, temp_folders
+
+    spool.made, spool.kept, spool.KEPT = [], spool.KEPT, 0
+
+    def make_folder():
+        spool.made.append(str(temp_folders.make_folder()))
+        return temp_folders.Path(spool.made[-1])
+
+    spool.make_folder = make_folder
+
+
+def _spool_as_ever():
+    """Takes that back; the folders that were made."""
+    from wavebatch.files.disk import spool, temp_folders
+
+    spool.KEPT, spool.make_folder = spool.kept, temp_folders.make_folder
+    return spool.made
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://none.invalid:8786", "tcp://", "a:b"])
+def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
+    monkeypatch.setattr("wavebatch.batch.dask_cluster._CONNECT", 0.5)
+    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached") and done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_distributed_the_line_says_what_to_install(strips, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.batch.dask_cluster.importlib.util.find_spec", lambda name: None)
+    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", "tcp://a:1"])
+    assert done.exit_code == 2 and "pip install wavebatch[cluster]" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", [["--jobs", "2"], ["--jobs", "0"], ["--memory", "2G"]])
+def test_the_cluster_decides_jobs_and_memory(strips, tmp_path, option):
+    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path), "--scheduler", "tcp://a:1", *option])
+    assert done.exit_code == 2 and f"--scheduler and {option[0]} exclude each other" in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "version", "words"),
+    [("numpy", "1.0", "has numpy 1.0, this machine"), ("wavebatch", None, "has no wavebatch, this machine")],
+)
+def test_workers_with_other_versions_are_refused(tmp_path, dask, package, version, words):
+    """The worker finds another package of that name first."""
+    other = tmp_path / "other"
+    other.mkdir()
+    text = "raise ImportError('not here')" if version is None else f"__version__ = {version!r}"
+    with distributed.Client(dask.address, set_as_default=False) as client:
+        try:
+            client.run(_shadow, package, text)
+            code, said = run(tmp_path / "x.las", "-o", tmp_path / "out", "--scheduler", dask.address)
+        finally:
+            client.run(_shadow, package, None)
+    assert code == 2 and words in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def _shadow(package, text, kept={}):  # noqa: B006 - what was hidden is put back by the next call
+    import types
+
+    if text is None:
+        sys.modules.pop(package, None)
+        sys.modules.update(kept)
+        kept.clear()
+        return
+    if package in sys.modules:
+        kept[package] = sys.modules[package]
+    sys.modules[package] = None if text.startswith("raise") else types.SimpleNamespace(__version__="1.0")
+
+
+@pytest.mark.slow
+def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, strips):
+    cluster = Dask(tmp_path)
+    out = tmp_path / "out"
+    try:
+        cluster.start_worker()
+        command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", "--profile", "fast", "-q"]
+        process = subprocess.Popen(
+            [*command, str(strips), "-o", str(out), "--scheduler", cluster.address], stderr=subprocess.PIPE, text=True
+        )
+        cluster.wait_until(lambda: (out / "a.report.json").exists())
+        cluster.stop()
+        _, said = process.communicate(timeout=150)
+    finally:
+        cluster.stop()
+    assert process.returncode == 3, said
+    assert "the cluster is lost" in said and "--resume" in said and said.count("\n") == 1
+    assert run(strips, "-o", out, "-q", "--resume") == (0, "")
+    assert run(strips, "-o", tmp_path / "local", "-q") == (0, "")
+    assert contents(out) == contents(tmp_path / "local")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path):
+    command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", str(strips), "--profile", "fast", "-q"]
+    process = subprocess.Popen(
+        [*command, "-o", str(tmp_path), "--scheduler", dask.address], stderr=subprocess.PIPE, text=True
+    )
+    dask.wait_until(lambda: list(tmp_path.glob(".wavebatch-*.tmp")))
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said.startswith("interrupted") and said.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"a.laz", "a.report.json", "b.laz", "b.report.json"}

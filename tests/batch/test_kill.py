@@ -1,0 +1,144 @@
+"""Runs that end in the middle: killed, interrupted, a worker shot. Nothing half-written is taken for a cloud."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from wavebatch.tools.simulate import simulate_strip
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+
+PROFILE = ["--profile", "fast"]
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """Three strips, the last with two units."""
+    folder = tmp_path_factory.mktemp("strips")
+    for name, pulses in (("a", 300), ("b", 300), ("c", 56_000)):
+        simulate_strip("flat", folder / f"{name}.las", pulses=pulses, seed=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(strips, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("undisturbed")
+    subprocess.run(_command(strips, folder), check=True)
+    return _contents(folder)
+
+
+def _command(strips, folder, *more):
+    return [sys.executable, "-m", "wavebatch", "run", str(strips), "-o", str(folder), *PROFILE, "-q", *more]
+
+
+def _contents(folder):
+    """Bytes of the clouds, reports without timing, by name; temporary files too."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        if path.name.endswith(".report.json"):
+            found[path.name] = {k: v for k, v in json.loads(path.read_text()).items() if k != "timing"}
+        else:
+            found[path.name] = path.read_bytes()
+    return found
+
+
+def _wait_for(folder, pattern, process):
+    """Until a file like that is in the folder."""
+    deadline = time.monotonic() + 120
+    while not list(folder.glob(pattern)):
+        assert time.monotonic() < deadline and process.poll() is None, "the run ended before it could be disturbed"
+        time.sleep(0.002)
+
+
+def _children(pid):
+    with open(f"/proc/{pid}/task/{pid}/children") as file:
+        return [int(word) for word in file.read().split()]
+
+
+def _is_alive(pid):
+    """Whether the process runs; one that ended and was not collected does not."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize(("jobs", "pattern"), [("1", "a.report.json"), ("2", ".wavebatch-*.tmp")])
+def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, jobs, pattern):
+    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", jobs))
+    _wait_for(tmp_path, pattern, process)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert _contents(tmp_path).keys() != undisturbed.keys()
+    subprocess.run(_command(strips, tmp_path, "--resume"), check=True)
+    assert _contents(tmp_path) == undisturbed
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
+    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"), stderr=subprocess.PIPE, text=True)
+    _wait_for(tmp_path, ".wavebatch-*.tmp", process)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert said.startswith("interrupted") and said.count("\n") == 1
+    assert set(_contents(tmp_path)) <= set(undisturbed)
+    for path in tmp_path.glob("*.report.json"):
+        assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
+def test_workers_die_with_their_parent(strips, tmp_path):
+    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"))
+    _wait_for(tmp_path, ".wavebatch-*.tmp", process)
+    children = _children(process.pid)
+    assert children
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    deadline = time.monotonic() + 60
+    while any(_is_alive(child) for child in children):
+        assert time.monotonic() < deadline, "a worker outlived its parent"
+        time.sleep(0.01)
+
+
+_SHOT = """
+import os, sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import wavebatch.batch.strip_task, wavebatch.batch.unit
+from batch_tools import make_job
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.strip_task import BatchOptions
+
+def prepare(job):
+    if job.path.stem == "b":
+        os.kill(os.getpid(), 9)
+    return wavebatch.batch.unit.prepare_strip(job)
+
+if __name__ == "__main__":
+    wavebatch.batch.strip_task.prepare_strip = prepare
+    folder = Path({strips!r})
+    jobs = [make_job(folder / name) for name in ("a.las", "b.las", "c.las")]
+    result = run_batch(jobs, BatchOptions(Path({out!r}), jobs=2))
+    print([outcome.status for outcome in result.outcomes])
+    print(result.outcomes[1].error)
+"""
+
+
+def test_a_worker_that_is_shot_fails_its_strip_only(strips, undisturbed, tmp_path):
+    script = tmp_path / "shot.py"
+    out = tmp_path / "out"
+    script.write_text(_SHOT.format(tests=os.path.dirname(os.path.dirname(__file__)), strips=str(strips), out=str(out)))
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    statuses, error = done.stdout.splitlines()
+    assert statuses == "['written', 'failed', 'written']"
+    assert "a worker process died" in error and "b.las" in error
+    found = _contents(out)
+    assert found == {name: content for name, content in undisturbed.items() if not name.startswith("b.")}

@@ -1,0 +1,314 @@
+"""The second pass: the same bytes for any tiles, jobs, blocks and deaths; known surfaces; bounded memory."""
+
+import json
+import signal
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from strips import descriptor, make_raw, vlr
+
+from wavebatch.batch import neighbour_pass
+from wavebatch.batch.neighbour_pass import SecondPass, process_tile
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
+from wavebatch.cli import main
+from wavebatch.core.echoes import RAY
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.disk import spool
+from wavebatch.stages.chain import STAGES, Step
+from wavebatch.stages.chain_file import parse_chain
+from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+
+STAGE = "attribute.incidence_angle_normals"
+COLUMNS = ["incidence_angle_normals", "incidence_angle_normals_err"]
+STAGES_OF_CHAIN = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position")
+CHAIN = "".join(f'[[chain]]\nstage = "{name}"\n' for name in (*STAGES_OF_CHAIN, STAGE)) + "radius = 2.0\n"
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """A slope and a town of known surfaces, and the chain."""
+    folder = tmp_path_factory.mktemp("strips")
+    (folder / "chain.toml").write_text(CHAIN)
+    for scene in ("slope", "urban"):
+        simulate_strip(scene, folder / f"{scene}.las", pulses=24_000, seed=5)
+    return folder
+
+
+def run_strip(path, folder, *, columns=None, text=CHAIN, batch=None, **options):
+    chain = parse_chain(text, "test")
+    job = StripJob(Path(path), chain, RunOptions(columns=choose_columns(chain, columns), **options))
+    outcome = run_batch([job], BatchOptions(Path(folder), **(batch or {}))).outcomes[0]
+    assert outcome.error is None, outcome.error
+    return outcome.report
+
+
+@pytest.fixture(scope="module")
+def clouds(strips, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clouds")
+    return folder, {scene: run_strip(strips / f"{scene}.las", folder) for scene in ("slope", "urban")}
+
+
+@pytest.mark.parametrize(("scene", "terrain"), [("slope", "facets"), ("urban", "blocks")])
+def test_angles_of_known_surfaces(clouds, scene, terrain):
+    folder, reports = clouds
+    cloud = laspy.read(folder / f"{scene}.laz")
+    rays = trace_rays(Flight(), terrain, np.rint((np.asarray(cloud.gps_time) - START_TIME) * Flight().pulse_rate))
+    angle, error = (np.asarray(cloud[name], np.float64) for name in COLUMNS)
+    known = angle != -9999
+    np.testing.assert_array_equal(known, error != -9999)
+    off = (angle - np.degrees(rays.incidence))[known]
+    assert known.mean() > 0.7
+    assert np.median(np.abs(off)) < 0.02
+    assert abs(np.median(off)) < 0.01
+    assert (np.abs(off) <= error[known]).mean() > 0.68
+    assert (np.abs(off) > 5).mean() < 0.02
+    passed = (np.asarray(cloud["echo_flags"]) & 1792) != 0
+    assert passed.any() and not known[passed].any()
+    counts = reports[scene].no_data["incidence_angle_normals"]
+    assert counts["KNOWN"] == known.sum() and sum(counts.values()) == reports[scene].count("echoes")
+    assert counts["NO_PLANE"] > 0 and "NO_RAY" not in counts
+
+
+def test_plants_are_no_surface(tmp_path):
+    simulate_strip("forest", tmp_path / "s.las", pulses=16_000, seed=2)
+    run_strip(tmp_path / "s.las", tmp_path / "out")
+    cloud = laspy.read(tmp_path / "out" / "s.laz")
+    rays = trace_rays(Flight(), "hills", np.rint((np.asarray(cloud.gps_time) - START_TIME) * Flight().pulse_rate))
+    above = np.linalg.norm(np.asarray(cloud.xyz) - rays.ground, axis=1)
+    known = np.asarray(cloud[COLUMNS[0]]) != -9999
+    assert known[above < 0.2].mean() > 0.4
+    assert known[above > 1.0].mean() < 0.005
+
+
+@pytest.mark.parametrize("batch", [{"jobs": 2}, {"block_size": 700}])
+def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch):
+    run_strip(strips / "urban.las", tmp_path, batch=batch)
+    assert (tmp_path / "urban.laz").read_bytes() == (clouds[0] / "urban.laz").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_the_same_bytes_for_any_tiles(strips, clouds, tmp_path, monkeypatch):
+    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 900)
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 400)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 5000)
+    monkeypatch.setattr(spool, "MEMORY", 1 << 18)
+    monkeypatch.setattr(spool, "KEPT", 1 << 16)
+    run_strip(strips / "urban.las", tmp_path)
+    assert (tmp_path / "urban.laz").read_bytes() == (clouds[0] / "urban.laz").read_bytes()
+
+
+def test_returns_and_other_names(strips, clouds, tmp_path):
+    report = run_strip(strips / "urban.las", tmp_path, points="returns", names="pdal", format="las")
+    cloud = laspy.read(tmp_path / "urban.las")
+    angle = np.asarray(cloud["IncidenceAngleNormals"])
+    counts = report.no_data["incidence_angle_normals"]
+    assert counts["KNOWN"] == (angle != -9999).sum() > 0.7 * len(cloud)
+    assert counts["NO_RAY"] == report.count("added_echoes") > 0
+    vendor = laspy.read(strips / "urban.las")
+    np.testing.assert_array_equal(cloud.X, vendor.X)
+
+
+def test_without_its_columns_there_is_no_second_pass(strips, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.batch.strip_task.SecondPass", None)
+    report = run_strip(strips / "slope.las", tmp_path, columns="echo_flags")
+    assert not report.no_data
+    assert COLUMNS[0] not in laspy.read(tmp_path / "slope.laz").point_format.dimension_names
+
+
+def test_only_the_error(strips, clouds, tmp_path):
+    run_strip(strips / "slope.las", tmp_path, columns=COLUMNS[1])
+    np.testing.assert_array_equal(
+        laspy.read(tmp_path / "slope.laz")[COLUMNS[1]], laspy.read(clouds[0] / "slope.laz")[COLUMNS[1]]
+    )
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("radius = 0.0", "radius must lie between 0.001 and 1000"),
+        ("radius = 1e9", "radius must lie between 0.001 and 1000"),
+        ("min_points = 3", "min_points must lie between 4 and 10000"),
+        ("max_error = 0.0", "max_error must lie between 0.001 and 180"),
+    ],
+)
+def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
+    chain = tmp_path / "c.toml"
+    chain.write_text(CHAIN.replace("radius = 2.0", value))
+    done = CliRunner().invoke(main, ["run", str(strips / "slope.las"), "-o", str(tmp_path / "out"), "-c", str(chain)])
+    assert done.exit_code == 2
+    assert f"({STAGE}): {message}" in done.stderr and "Traceback" not in done.stderr
+    assert not list((tmp_path / "out").glob("*"))
+
+
+_DIE = """
+import os, sys
+from wavebatch.batch import neighbour_pass
+def die(*arguments):
+    os.kill(os.getpid(), 9)
+neighbour_pass.SecondPass.{method} = die
+from wavebatch.cli import main
+main(sys.argv[1:])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+@pytest.mark.parametrize("method", ["take", pytest.param("rows", marks=pytest.mark.slow)])
+def test_killed_in_the_second_pass_resume_gives_what_an_undisturbed_run_gives(strips, clouds, tmp_path, method):
+    arguments = ["run", str(strips / "slope.las"), "-o", str(tmp_path), "-c", str(strips / "chain.toml"), "-q"]
+    done = subprocess.run([sys.executable, "-c", _DIE.format(method=method), *arguments], capture_output=True)
+    assert done.returncode == -signal.SIGKILL
+    assert not list(tmp_path.glob("*.laz")) and list(tmp_path.glob(".wavebatch-*.tmp"))
+    assert CliRunner().invoke(main, [*arguments, "--resume"]).exit_code == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["slope.laz", "slope.report.json"]
+    cloud, undisturbed = (laspy.read(folder / "slope.laz").points.array for folder in (tmp_path, clouds[0]))
+    assert cloud.tobytes() == undisturbed.tobytes()
+    assert json.loads((tmp_path / "slope.report.json").read_text())["counts"]["no_data"][COLUMNS[0]]["KNOWN"] > 0
+
+
+def test_a_failure_in_the_second_pass_leaves_nothing(strips, tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise ConfigError("no")
+
+    monkeypatch.setattr(SecondPass, "take", fail)
+    chain = parse_chain(CHAIN, "test")
+    job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
+    assert run_batch([job], BatchOptions(tmp_path)).failed == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def layout(tiny_strip):
+    return plan_output(tiny_strip, COLUMNS)
+
+
+def make_rows(layout, xyz, ray=(0, 0.1, -1)):
+    rows = np.zeros(len(xyz), layout.extended(RAY).dtype)
+    for axis, name in enumerate("XYZ"):
+        rows[name] = np.rint(np.asarray(xyz, float).reshape(-1, 3)[:, axis] / layout.scales[axis])
+    for value, name in zip(ray, RAY, strict=True):
+        rows[name] = value
+    return rows
+
+
+def fill(layout, parts, folder, step=None, **options):
+    """The rows of a cloud after a second pass, and the account."""
+    step = step or Step(STAGES[STAGE])
+    second = SecondPass(step, layout, folder / "cloud.laz", **options)
+    try:
+        for rows in parts:
+            second.add(rows)
+        second.cut()
+        while second.has_more:
+            second.take(process_tile(*second.next_tile()))
+        assert second.is_complete
+        rows = list(second.rows())
+        return np.concatenate([np.empty(0, layout.dtype), *rows]), second.count_reasons(sum(map(len, parts)))
+    finally:
+        second.close()
+        assert not list(folder.iterdir())
+
+
+def test_no_rows_one_row_and_rows_without_a_ray(layout, tmp_path):
+    for count in (0, 1):
+        rows, counts = fill(layout, [make_rows(layout, np.zeros((count, 3)))], tmp_path)
+        assert len(rows) == count
+        assert counts == {COLUMNS[0]: {"FEW_NEIGHBOURS": 1} if count else {}}
+        assert (rows[COLUMNS[0]] == -9999).all()
+    flat = np.random.default_rng(1).uniform(0, 8, (500, 3)) * [1, 1, 0]
+    for ray in ((0, 0, 0), (np.nan, 0, 0)):
+        rows, counts = fill(layout, [make_rows(layout, flat, ray)], tmp_path)
+        assert counts == {COLUMNS[0]: {"NO_RAY": 500}} and (rows[COLUMNS[0]] == -9999).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_any_tiles_give_the_same_bits_on_any_points(layout, tmp_path, monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    spread = rng.uniform(0, 60, (2500, 3)) * [1, 1, 0.001]
+    dense = rng.uniform(20, 22, (2500, 3)) * [1, 1, 0.001]
+    grid = np.stack(np.meshgrid(np.arange(0, 20, 0.5), np.arange(0, 20, 0.5), [0.0]), -1).reshape(-1, 3) + [80, 0, 0]
+    xyz = np.concatenate([spread, dense, grid, np.tile([[5, 5, 0]], (600, 1)), [[2e6, -2e6, 0], [0, 0, 1000]]])
+    rows = make_rows(layout, rng.permutation(xyz))
+    whole, counts = fill(layout, [rows], tmp_path, tile_points=10**9)
+    assert counts[COLUMNS[0]]["KNOWN"] > 4000
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 300)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
+    again, counts_again = fill(layout, np.array_split(rows, 7), tmp_path, tile_points=200)
+    assert counts_again == counts and again.tobytes() == whole.tobytes()
+
+
+def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, monkeypatch):
+    monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)
+    monkeypatch.setattr(spool, "MEMORY", 1 << 16)
+    monkeypatch.setattr(spool, "KEPT", 1 << 12)
+    monkeypatch.setattr("wavebatch.files.disk.row_file.RowStore.pieces.__defaults__", (2000,))
+    rng, peaks = np.random.default_rng(3), []
+    for n in (8000, 40_000):
+        parts = [make_rows(layout, rng.normal(0, 0.05, (2000, 3))) for _ in range(n // 2000)]
+        second = SecondPass(Step(STAGES[STAGE]), layout, tmp_path / "cloud.laz", tile_points=1000)
+        for rows in parts:
+            second.add(rows)
+        del parts
+        tracemalloc.start()
+        second.cut()
+        while second.has_more:
+            second.take(process_tile(*second.next_tile()))
+        number = sum(len(rows) for rows in second.rows())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        second.close()
+        assert number == n
+    assert peaks[1] < 1.3 * peaks[0]
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_strip(layout, tmp_path, monkeypatch):
+    monkeypatch.setattr(neighbour_pass, "SAMPLE", 4000)
+    monkeypatch.setattr(spool, "MEMORY", 1 << 20)
+    peaks = []
+    for n in (60_000, 240_000):
+        rng = np.random.default_rng(3)
+        second = SecondPass(Step(STAGES[STAGE]), layout, tmp_path / "cloud.laz", tile_points=10_000)
+        for start in range(0, n, 20_000):
+            xyz = rng.uniform(0, 100, (20_000, 3)) * [1, 1, 0.001] + [start / 200, 0, 0]
+            second.add(make_rows(layout, xyz))
+        tracemalloc.start()
+        second.cut()
+        while second.has_more:
+            second.take(process_tile(*second.next_tile()))
+        sum(len(rows) for rows in second.rows())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        second.close()
+    assert peaks[1] < 1.3 * peaks[0]
+    assert peaks[0] < 150e6
+
+
+def test_the_second_pass_is_not_told_as_units(strips, tmp_path, monkeypatch):
+    monkeypatch.setattr(neighbour_pass, "TILE_POINTS", 2000)
+    chain = parse_chain(CHAIN, "test")
+    job = StripJob(strips / "slope.las", chain, RunOptions(columns=choose_columns(chain)))
+    events = []
+    run_batch([job], BatchOptions(tmp_path), events.append)
+    units = [(event["done"], event["of"]) for event in events if event["event"] == "unit"]
+    assert units == [(number + 1, units[0][1]) for number in range(len(units))] and len(units) == units[0][1]
+
+
+def test_strips_that_are_not_in_metres_are_refused(tmp_path):
+    raw = make_raw(60)
+    raw.vlrs = [descriptor(1), vlr(b"LASF_Projection", 34735, np.array([1, 1, 0, 1, 1024, 0, 1, 2], "<u2").tobytes())]
+    raw.write(tmp_path / "s.las")
+    chain = parse_chain(CHAIN, "test")
+    job = StripJob(tmp_path / "s.las", chain, RunOptions(columns=choose_columns(chain)))
+    error = run_batch([job], BatchOptions(tmp_path / "out")).outcomes[0].error
+    assert "coordinates are degrees" in str(error) and "project the strip to metres" in str(error)

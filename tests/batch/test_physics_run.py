@@ -1,0 +1,276 @@
+"""`wavebatch run` with calibration, trajectory and neither: columns, report, the same bytes for any jobs and blocks."""
+
+import json
+import tomllib
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibration import (
+    Calibration,
+    format_calibration,
+    load_calibration,
+    parse_calibration,
+    with_physics,
+)
+from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+
+FOUND = Calibration(2.6e-8, 0.02, 0.3, 1.1, "strip.laz", "2026-11-21", "said by a test")
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cal") / "cal.toml"
+    path.write_text(format_calibration(FOUND))
+    return path
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory, wide_strip, calibration):
+    folder = tmp_path_factory.mktemp("plain")
+    done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration)
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def columns(folder, *names):
+    cloud = laspy.read(next(folder.glob("*.laz")))
+    return [np.asarray(cloud[name], np.float64) for name in names]
+
+
+def report(folder):
+    return json.loads(next(folder.glob("*.report.json")).read_text())
+
+
+def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
+    ranges, section, gamma, rho, angle = columns(
+        plain, "range", "cross_section", "backscatter_coefficient", "reflectance", "incidence_angle"
+    )
+    known = ranges != -9999
+    assert 0.9 < known.mean() < 1.0
+    assert (ranges[known] > 750).all() and (ranges[known] < 1000).all()
+    square = np.pi / 4 * (1.1e-3 * ranges) ** 2
+    assert section[known] == pytest.approx((gamma * square)[known], rel=1e-4)
+    assert np.isin(section[~known], -9999).all()
+    assert 0.0 < (rho != -9999).mean() < known.mean()
+    assert ((angle == -9999) | ((angle >= 0) & (angle <= 80))).all()
+    told = report(plain)
+    assert told["strip"]["sensor"]["source"] == "direction vectors"
+    assert told["strip"]["sensor"]["range_error_m"] < 0.01
+    assert told["request"]["calibration"]["constant"] == 2.6e-8
+
+
+def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, calibration):
+    done = run(wide_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration,
+               "--jobs", "2", "--block-size", "999")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert next(tmp_path.glob("*.laz")).read_bytes() == next(plain.glob("*.laz")).read_bytes()
+    told = report(plain)
+    for name, counts in told["counts"]["no_data"].items():
+        assert sum(counts.values()) == told["counts"]["echoes"], name
+    assert set(told["counts"]["no_data"]) >= {"range", "incidence_angle", "reflectance"}
+    again = report(tmp_path)
+    assert {key: again[key] for key in ("counts", "remarks")} == {key: told[key] for key in ("counts", "remarks")}
+
+
+def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
+    strip, cal = tmp_path / "flat.las", tmp_path / "cal.toml"
+    simulate_strip("flat", strip, pulses=1500, seed=2)
+    cal.write_text(format_calibration(replace(FOUND, divergence=0.3)))
+    done = run(strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", cal, "-v")
+    assert done.exit_code == 0, done.output
+    counts = report(tmp_path / "out")["counts"]
+    angle = counts["no_data"]["incidence_angle"]
+    assert "KNOWN" not in angle and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
+    (remark,) = report(tmp_path / "out")["remarks"]
+    assert f"incidence_angle: none of {counts['echoes']} echoes has one" in remark
+    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse of", "max_error is 10"):
+        assert number in remark
+    assert remark in done.stderr
+    told = f"no-data for {angle['UNCERTAIN']} of {counts['echoes']} echoes: more uncertain than max_error"
+    assert told in done.stderr
+    quiet = run(strip, "-o", tmp_path / "more", "--profile", "fast", "--calibration", cal)
+    assert remark in quiet.stderr and "no-data for" not in quiet.stderr
+
+
+def write_trajectory(path):
+    time = START_TIME + np.arange(-1.0, 2.0, 0.05)
+    rays = trace_rays(Flight(), "flat", (time - START_TIME) * Flight().pulse_rate)
+    sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
+    rows = np.column_stack([time, sensor])
+    path.write_text("time,x,y,z\n" + "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows))
+    return path
+
+
+def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, wide_strip, calibration):
+    path = write_trajectory(tmp_path / "t.csv")
+    folder = tmp_path / "out"
+    done = run(wide_strip, "-o", folder, "--profile", "fast", "--calibration", calibration, "--trajectory", path)
+    assert done.exit_code == 0, done.output
+    a, b = columns(folder, "cross_section")[0], columns(plain, "cross_section")[0]
+    known = a != -9999
+    np.testing.assert_array_equal(known, b != -9999)
+    assert np.abs(a[known] / b[known] - 1).max() < 0.002
+    assert report(folder)["strip"]["sensor"]["share_covered"] == 1.0
+
+
+def test_heights_of_another_kind_are_told(tmp_path, wide_strip):
+    path = write_trajectory(tmp_path / "t.csv")
+    head, *rows = path.read_text().splitlines()
+    raised = [f"{left},{float(height) + 45.0}" for left, _, height in (row.rpartition(",") for row in rows)]
+    path.write_text("\n".join([head, *raised]))
+    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--trajectory", path)
+    assert done.exit_code == 0, done.output
+    (remark,) = report(tmp_path / "out")["remarks"]
+    assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
+
+
+def test_verbose_says_where_the_sensor_was(tmp_path, wide_strip, calibration):
+    done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
+    (line,) = [line for line in done.stderr.splitlines() if "sensor from direction vectors: " in line]
+    for words in ("m above the points", "60.0 m/s", "heading 90 degrees", "smooth to", "ranges to"):
+        assert words in line
+    assert "sensor from" not in run(wide_strip, "-o", tmp_path / "bare", "--profile", "fast", "-v").stderr
+
+
+def test_resume_makes_it_anew_when_the_calibration_changes(tmp_path, tiny_strip):
+    path = tmp_path / "cal.toml"
+    arguments = (tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", path, "--resume", "-v")
+    path.write_text(format_calibration(FOUND))
+    assert run(*arguments).exit_code == 0
+    first = columns(tmp_path / "out", "backscatter_coefficient")[0]
+    path.write_text(format_calibration(replace(FOUND, constant=5.2e-8)))
+    assert run(*arguments).exit_code == 0
+    second = columns(tmp_path / "out", "backscatter_coefficient")[0]
+    known = first != -9999
+    assert known.any()
+    assert second[known] == pytest.approx(2 * first[known], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--lever-arm", "1,2"), "--lever-arm: '1,2' must be three numbers"),
+        (("--lever-arm", "1,2,3"), "--lever-arm is of no use without --trajectory"),
+        (("--calibration", "none.toml"), "none.toml: calibration file cannot be read"),
+    ],
+)
+def test_wrong_options(tmp_path, tiny_strip, arguments, message):
+    done = run(tiny_strip, "-o", tmp_path / "out", *arguments)
+    assert done.exit_code == 2
+    assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ((), {"range": "no stage attribute.range", "reflectance": "not calibrated", "incidence_angle": "divergence"}),
+        (("--flight-height", "800"), {"cross_section": "not calibrated", "backscatter_coefficient": "not calibrated"}),
+    ],
+)
+def test_columns_that_are_not_written_have_a_reason_in_the_report(tmp_path, tiny_strip, arguments, expected):
+    done = run(tiny_strip, "-o", tmp_path / "out", "--profile", "fast", *arguments)
+    assert done.exit_code == 0, done.output
+    told = report(tmp_path / "out")["output"]
+    for column, words in expected.items():
+        assert column not in told["columns"] and words in told["not_computed"][column]
+    assert not set(told["not_computed"]) & set(told["columns"])
+
+
+def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path, tiny_strip):
+    chain = tmp_path / "c.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position", "attribute.range",
+              "attribute.relative_backscatter", "attribute.relative_cross_section", "attribute.relative_reflectance",
+              "attribute.cross_section")  # fmt: skip
+    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
+    done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--points", "returns")
+    assert done.exit_code == 0, done.output
+    cloud = laspy.read(next((tmp_path / "out").glob("*.laz")))
+    ranges, gamma, section = columns(tmp_path / "out", "range", "relative_backscatter", "relative_cross_section")
+    known = gamma != -9999
+    assert known.mean() > 0.9 and (gamma[known] > 0).all()
+    assert (section / gamma)[known] == pytest.approx(ranges[known] ** 2, rel=1e-5)
+    said = {entry.name: entry.description for entry in cloud.point_format.extra_dimensions}
+    for name in ("relative_backscatter", "relative_cross_section", "relative_reflectance"):
+        assert "relative" in said[name] and "DN ns m" in said[name]
+    told = report(tmp_path / "out")
+    assert (columns(tmp_path / "out", "cross_section")[0] == -9999).all()
+    assert set(told["counts"]["no_data"]["cross_section"]) == {"NOT_CALIBRATED"}
+    assert any("cross_section: none of" in line and "relative_backscatter" in line for line in told["remarks"])
+
+
+def test_options_that_the_chain_ignores(tmp_path, tiny_strip):
+    chain = tmp_path / "c.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position")
+    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
+    done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--flight-height", "800")
+    assert done.exit_code == 2
+    assert "--flight-height: chain" in done.stderr and "add stage attribute.range" in done.stderr
+
+
+def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
+    path = tmp_path / "t.csv"
+    path.write_text("time,x,y,z\n1,2,3,4\n2,3,4,5\n")
+    done = run(tiny_strip, "-o", tmp_path / "out", "--trajectory", path)
+    assert done.exit_code == 4
+    assert "do not overlap on any clock" in done.stderr
+
+
+def test_calibration_files():
+    again = parse_calibration(format_calibration(FOUND), "cal")
+    assert replace(again, strip=FOUND.strip) == replace(FOUND)
+    written = tomllib.loads(format_calibration(FOUND))["section_constant"]
+    assert written == pytest.approx(np.pi / 4 * 1.1e-3**2 * 2.6e-8, rel=1e-12)
+    bare = parse_calibration('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n', "cal")
+    assert bare.divergence is None and bare.attenuation == 0.22
+    system = FOUND.apply(SystemPulse(2.0))
+    assert (system.calibration, system.divergence, system.attenuation) == (2.6e-8, 1.1, 0.3)
+    assert FOUND.apply(SystemPulse(2.0, divergence=0.5)).divergence == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = ", "not valid TOML"),
+        ('schema = "wavebatch.calibration/1"\nconstnt = 1.0', "unknown key 'constnt'; did you mean 'constant'"),
+        ('schema = "other"', "schema is 'other'"),
+        ('schema = "wavebatch.calibration/1"', "key 'constant' is missing"),
+        ('schema = "wavebatch.calibration/1"\nconstant = "a"\nrelative_error = 1', "constant must be a number"),
+        ('schema = "wavebatch.calibration/1"\nconstant = 0\nrelative_error = 1', "must lie between 1e-30 and"),
+        ('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\nsection_constant = 1e-15', "no div"),
+        (
+            'schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0\ndivergence_mrad = 1\n'
+            "section_constant = 8e-15",
+            "but there is 7.853981633974",
+        ),
+    ],
+)
+def test_wrong_calibration_files_are_one_line(tmp_path, text, message):
+    path = tmp_path / "cal.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_chains_get_what_is_known_and_nothing_twice():
+    chain = load_profile("fast")
+    none = with_physics(chain, sensor=False, calibrated=False, divergence=False)
+    assert none is chain
+    full = with_physics(chain, sensor=True, calibrated=True, divergence=True)
+    assert with_physics(full, sensor=True, calibrated=True, divergence=True) is full
+    assert set(full.makes) - set(chain.makes) >= {"range", "cross_section", "reflectance", "incidence_angle"}
+    assert "cross_section" not in with_physics(chain, sensor=True, calibrated=True, divergence=False).makes

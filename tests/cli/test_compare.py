@@ -1,0 +1,83 @@
+"""`wavebatch compare`: figures, thresholds and exit codes."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli.compare import compare
+from wavebatch.tools.simulate import simulate_strip
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("strips")
+    for name, seed in (("a", 1), ("b", 2)):
+        simulate_strip("mixed", folder / f"{name}.las", pulses=600, seed=seed, truth=folder / f"{name}.npz")
+    return folder
+
+
+def run(*arguments):
+    return CliRunner().invoke(compare, [str(argument) for argument in arguments])
+
+
+def test_a_strip_with_itself_is_identical(strips):
+    result = run(strips / "a.las", strips / "a.las", "--min-completeness", 1, "--min-correctness", 1, "--max-rmse", 0)
+    assert result.exit_code == 0, result.output
+    assert "missed 0   extra 0" in result.stdout
+    assert "completeness          1.0000" in result.stdout
+
+
+def test_json_holds_every_figure_and_no_nan(strips):
+    result = run(strips / "a.las", "--truth", strips / "a.npz", "--json")
+    assert result.exit_code == 0
+    assert "NaN" not in result.stdout
+    figures = json.loads(result.stdout)
+    assert figures["missed"] == figures["echoes_b"] - figures["matched"]
+    assert figures["errors"]["isolated"]["time"]["number"] > 200
+    assert figures["errors"]["isolated"]["amplitude"]["rmse"] is None
+    assert sum(figures["counts_b"].values()) == figures["pulses"]
+    assert figures["tolerance_ns"] == 1.5
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "code"),
+    [
+        ("--min-completeness", 0.7, 0),
+        ("--min-completeness", 0.97, 1),
+        ("--min-correctness", 0.99, 0),
+        ("--min-exact", 0.5, 0),
+        ("--min-exact", 0.98, 1),
+        ("--max-rmse", 0.1, 0),
+        ("--max-rmse", 0.0001, 1),
+        ("--max-nmad", 0.0001, 1),
+        ("--max-median", 0.01, 0),
+    ],
+)
+def test_thresholds_set_the_exit_code(strips, option, value, code):
+    result = run(strips / "a.las", "--truth", strips / "a.npz", option, value)
+    assert result.exit_code == code, result.output
+    assert (option in result.stderr) == bool(code)
+
+
+def test_a_figure_that_does_not_exist_meets_no_threshold(strips):
+    result = run(strips / "a.las", "--truth", strips / "b.npz", "--tolerance", 1e-6, "--max-rmse", 5)
+    assert result.exit_code == 1
+    assert "has nan" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["a.las"], "--truth"),
+        (["a.las", "b.las", "--truth", "a.npz"], "--truth"),
+        (["a.las", "a.npz"], "--truth"),
+        (["a.las", "--truth", "b.las"], "no truth file"),
+        (["a.las", "none.las"], "none.las"),
+        (["a.las", "b.las", "--tolerance", "-1"], "tolerance"),
+    ],
+)
+def test_wrong_usage_has_exit_code_2(strips, arguments, words):
+    result = run(*(strips / a if a.endswith(("las", "npz")) else a for a in arguments))
+    assert result.exit_code == 2
+    assert words in result.stderr

@@ -1,0 +1,205 @@
+"""`wavebatch run` as a user types it: exit codes, one line per failure, streams, options."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from batch_tools import read_cloud
+from click.testing import CliRunner
+
+from wavebatch.cli import COMMANDS, main
+
+
+def _run(*arguments):
+    return CliRunner().invoke(main, ["run", *map(str, arguments)])
+
+
+@pytest.fixture
+def done(tiny_strip, tmp_path):
+    """A folder with the tiny strip's outputs."""
+    assert _run(tiny_strip, "-o", tmp_path, "--profile", "fast").exit_code == 0
+    return tmp_path
+
+
+def test_a_strip_is_written_and_said_in_one_line_on_stderr(tiny_strip, tmp_path):
+    result = _run(tiny_strip, "-o", tmp_path / "new" / "folder", "--profile", "fast")
+    assert result.exit_code == 0 and result.stdout == ""
+    assert result.stderr.count("\n") == 1 and "tiny.las" in result.stderr and "waveforms" in result.stderr
+    assert sorted(p.name for p in (tmp_path / "new" / "folder").iterdir()) == ["tiny.laz", "tiny.report.json"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--profile", "balance"], "did you mean 'balanced'"),
+        (["--columns", "+echo_tim"], "did you mean 'echo_time'"),
+        (["--chain", "none.toml"], "none.toml: chain file cannot be read"),
+        (["--chain", "a.toml", "--profile", "fast"], "exclude each other"),
+        (["--overwrite", "--resume"], "exclude each other"),
+        (["-q", "-v"], "exclude each other"),
+        (["--memory", "12M"], "too little"),
+        (["--memory", "many"], "is not a size"),
+        (["--report", "none/batch.json"], "folder none does not exist"),
+        (["--report", "-", "--progress", "json"], "stdout"),
+        (["--jobs", "-1"], "--jobs"),
+        (["--points", "echos"], "--points"),
+        (["--nothing"], "--nothing"),
+        (["none*.las"], "matches no .las or .laz file"),
+    ],
+)
+def test_wrong_usage_is_2_and_nothing_is_started(tiny_strip, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    result = _run(tiny_strip, "-o", "out", *arguments)
+    assert result.exit_code == 2
+    assert words in result.stderr and "Traceback" not in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_strips_of_one_name_are_wrong_usage(tiny_strip, tmp_path):
+    other = tmp_path / "tiny.laz"
+    other.write_bytes(tiny_strip.read_bytes())
+    result = _run(tiny_strip, other, "-o", tmp_path / "out")
+    assert result.exit_code == 2 and "both would be written as tiny" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_that_is_the_input_is_wrong_usage(tiny_strip):
+    before = tiny_strip.read_bytes()
+    result = _run(tiny_strip, "-o", tiny_strip.parent, "--format", "las", "--overwrite")
+    assert result.exit_code == 2 and "would replace this input" in result.stderr
+    assert tiny_strip.read_bytes() == before
+
+
+def test_some_failed_is_3_none_written_is_4(tiny_strip, tmp_path):
+    bad = tmp_path / "bad.las"
+    bad.write_bytes(b"LASF")
+    some = _run(bad, tiny_strip, "-o", tmp_path / "out", "--profile", "fast", "-q")
+    assert some.exit_code == 3
+    assert some.stderr.count("\n") == 1 and "bad.las" in some.stderr and "Traceback" not in some.stderr
+    none = _run(bad, "-o", tmp_path / "out")
+    assert none.exit_code == 4
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["tiny.laz", "tiny.report.json"]
+
+
+def test_existing_outputs(tiny_strip, done):
+    refused = _run(tiny_strip, "-o", done)
+    assert refused.exit_code == 4 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
+    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--resume").stderr.endswith("is there already\n")
+    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--overwrite").exit_code == 0
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    result = _run(tmp_path / "none.las", "-o", tmp_path / "out", "--debug")
+    assert result.exit_code == 4 and "Traceback" in result.stderr and "none.las" in result.stderr
+
+
+def test_dry_run_says_what_would_be_done_and_touches_nothing(tiny_strip, tmp_path):
+    result = _run(tiny_strip, tmp_path / "none.las", "-o", tmp_path / "out", "--dry-run", "--columns", "+echo_time")
+    assert result.exit_code == 3
+    assert "tiny.las: write" in result.stdout and "echo_time" in result.stdout and "[[chain]]" in result.stdout
+    assert result.stderr.count("\n") == 1 and "none.las" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_report_of_the_batch_to_a_file_and_to_stdout(tiny_strip, tmp_path):
+    result = _run(tiny_strip, "-o", tmp_path / "a", "--report", tmp_path / "batch.json", "--profile", "fast")
+    assert result.exit_code == 0
+    document = json.loads((tmp_path / "batch.json").read_text())
+    assert document["schema"] == "wavebatch.batch-report/1"
+    assert [strip["status"] for strip in document["strips"]] == ["written"]
+    again = _run(tiny_strip, "-o", tmp_path / "a", "--report", "-", "--profile", "fast", "--resume", "-q")
+    printed = json.loads(again.stdout)
+    assert printed["counts"] == document["counts"] and printed["strips"][0]["status"] == "skipped"
+
+
+def test_progress_as_json_lines(tiny_strip, tmp_path):
+    result = _run(tiny_strip, tmp_path / "none.las", "-o", tmp_path / "a", "--progress", "json", "-q")
+    events = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [event["event"] for event in events] == ["start", "unit", "written", "failed"]
+    assert events[1]["done"] == events[1]["of"] == 1
+    assert "none.las" in events[3]["error"]
+
+
+def test_a_bar_on_request(tiny_strip, tmp_path):
+    result = _run(tiny_strip, "-o", tmp_path, "--progress", "bar", "--profile", "fast")
+    assert result.exit_code == 0 and "100%" in result.stderr
+
+
+def test_quiet_says_nothing_and_verbose_more(tiny_strip, tmp_path):
+    assert _run(tiny_strip, "-o", tmp_path / "q", "-q", "--profile", "fast").output == ""
+    loud = _run(tiny_strip, "-o", tmp_path / "v", "-v", "--profile", "fast")
+    assert "NO_WAVEFORM" in loud.stderr and "s elapsed" in loud.stderr
+
+
+def test_options_reach_the_cloud(tiny_strip, tmp_path):
+    options = ["--format", "las", "--point-format", "6", "--names", "asprs", "--columns", "echo_width,echo_flags",
+               "--points", "returns", "--direction", "toward", "--memory", "400M", "--block-size", "50"]  # fmt: skip
+    assert _run(tiny_strip, "-o", tmp_path, *options).exit_code == 0
+    cloud, _ = read_cloud(tmp_path / "tiny.las")
+    assert {"classification_flags", "pulse width", "echo_flags"} <= set(cloud.dtype.names)
+    assert "amplitude" not in cloud.dtype.names
+
+
+def test_the_wrong_direction_puts_echoes_elsewhere(tiny_strip, tmp_path):
+    warned = {}
+    for sign in ("toward", "away"):
+        result = _run(tiny_strip, "-o", tmp_path / sign, "--direction", sign, "--profile", "fast")
+        assert result.exit_code == 0
+        warned[sign] = [line for line in result.stderr.splitlines() if ": warning: " in line]
+    assert warned["toward"] == []
+    (line,) = warned["away"]
+    assert line.startswith(f"{tiny_strip}: warning: --direction away overrides what the file says: ")
+    quiet = _run(tiny_strip, "-o", tmp_path / "away", "--direction", "away", "--profile", "fast", "--overwrite", "-q")
+    assert quiet.exit_code == 0 and quiet.stderr == ""
+    report = json.loads((tmp_path / "away" / "tiny.report.json").read_text())
+    assert report["strip"]["direction"]["sign"] == "away"
+
+
+def test_a_headerless_wdp_is_refused_unless_forced(tmp_path):
+    from wavebatch.tools.simulate import StripOptions, simulate_strip
+
+    strip = tmp_path / "x.las"
+    simulate_strip("flat", strip, pulses=50, options=StripOptions(internal=False))
+    packets = strip.with_suffix(".wdp")
+    packets.write_bytes(b"\0" * 60 + packets.read_bytes()[60:])
+    refused = _run(strip, "-o", tmp_path / "a")
+    assert refused.exit_code == 4 and "headerless" in refused.stderr
+    assert _run(strip, "-o", tmp_path / "a", "--headerless").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["fullwave.laz", "pdrf10-1.4.laz", "pdrf4-1.3.laz", "pdrf5-1.3.laz", "pdrf9-1.4.laz",
+                                  "pdrf9-1.5.laz", "simple1_3.las"])  # fmt: skip
+def test_files_without_packets_give_one_line_and_4(data, tmp_path, name):
+    result = _run(data / "no-packets" / name, "-o", tmp_path)
+    assert result.exit_code == 4
+    assert result.stdout == "" and result.stderr.count("\n") == 1 and name in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_imports_neither_numpy_nor_laspy():
+    code = (
+        "import sys\nfrom wavebatch.cli import main\n"
+        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print(sorted({'numpy', 'laspy', 'scipy', 'tqdm', 'lazrs'} & sys.modules.keys()), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+    for name in COMMANDS:
+        assert f"  {name}" in done.stdout
+
+
+@pytest.mark.parametrize("name", list(COMMANDS))
+def test_every_command_has_help(name):
+    result = CliRunner().invoke(main, [name, "--help"])
+    assert result.exit_code == 0 and "Usage:" in result.output
+
+
+def test_an_unknown_command_names_the_nearest():
+    result = CliRunner().invoke(main, ["rum"])
+    assert result.exit_code == 2 and "did you mean 'run'" in result.output
+
+
+def test_python_m_wavebatch_is_the_command():
+    done = subprocess.run([sys.executable, "-m", "wavebatch", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("wavebatch ")

@@ -1,0 +1,108 @@
+"""`wavebatch simulate`: options reach the strip, errors are one line with the documented exit code."""
+
+import json
+import subprocess
+import sys
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli.simulate import simulate
+from wavebatch.tools.simulate import SCENES, TruthReader
+
+
+def run(*arguments):
+    return CliRunner().invoke(simulate, [str(argument) for argument in arguments])
+
+
+def test_strip_and_truth_are_written_and_counted(tmp_path):
+    result = run("urban", "-o", tmp_path / "s.laz", "--pulses", 500, "--truth", tmp_path / "t.npz", "--json")
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    with laspy.open(tmp_path / "s.laz", read_evlrs=False) as reader:
+        assert reader.header.point_count == summary["points"]
+        assert reader.header.point_format.id == 4
+    with TruthReader(tmp_path / "t.npz") as truth:
+        assert truth.meta["echoes"] == summary["echoes"]
+        assert truth.meta["scene"] == "urban"
+    assert summary["pulses"] == 500
+
+
+def test_talk_is_on_stderr_and_can_be_silenced(tmp_path):
+    result = run("flat", "-o", tmp_path / "a.las", "--pulses", 20)
+    assert result.stdout == ""
+    assert "20 pulses" in result.stderr
+    assert run("flat", "-o", tmp_path / "b.las", "--pulses", 20, "-q").output == ""
+
+
+def test_every_option_reaches_the_recording(tmp_path):
+    result = run(
+        *("mixed", "-o", tmp_path / "s.las", "--truth", tmp_path / "t.npz", "--pulses", 300, "--seed", 9, "--bits", 16),
+        *("--samples", 120, "--spacing", 2, "--noise", 3, "--rho", 0.667, "--noise-gain", 0.05, "--baseline", 200),
+        *("--saturation", 900, "--pulse", "leica", "--kappa", 0.05, "--ringing", 0.02, "--point-format", 10),
+        *("--external", "--scale", 0.01, "--without-waveform", 0.5, "--drop-empty", "--away"),
+    )
+    assert result.exit_code == 0, result.output
+    with TruthReader(tmp_path / "t.npz") as truth:
+        meta = truth.meta
+    recording = meta["recording"]
+    expected = {"bits": 16, "n_samples": 120, "spacing": 2, "noise_std": 3, "rho": 0.667, "noise_gain": 0.05}
+    expected |= {"baseline": 200, "saturation": 900}
+    assert {name: recording[name] for name in expected} == expected
+    assert recording["pulse"]["kappa"] == 0.05
+    assert recording["pulse"]["sigma"] == 3.0
+    assert len(recording["pulse"]["lobes"]) == 4
+    assert meta["seed"] == 9
+    cloud = laspy.read(tmp_path / "s.las")
+    assert cloud.header.point_format.id == 10
+    assert tuple(cloud.header.scales) == (0.01, 0.01, 0.01)
+    assert np.asarray(cloud.z_t).min() < 0
+    assert 0.35 < (np.asarray(cloud.wavepacket_index) == 0).mean() < 0.65
+    assert (tmp_path / "s.wdp").stat().st_size == 60 + meta["packets"] * 240
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["forrest"], "did you mean 'forest'"),
+        (["flat", "--rho", "0.3"], "rho must be"),
+        (["flat", "--kappa", "3"], "kappa"),
+        (["flat", "--pulses", "0"], "at least one pulse"),
+        (["flat", "--samples", "2"], "n_samples"),
+        (["flat", "--las-version", "1.3", "--point-format", "9"], "1.3"),
+        (["flat", "--baseline", "255"], "baseline must lie"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(tmp_path, arguments, words):
+    result = run(*arguments, "-o", tmp_path / "s.las")
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_exists_is_kept_unless_told_otherwise(tmp_path):
+    run("flat", "-o", tmp_path / "s.las", "--pulses", 20)
+    before = (tmp_path / "s.las").read_bytes()
+    result = run("flat", "-o", tmp_path / "s.las", "--pulses", 30)
+    assert result.exit_code == 1
+    assert "overwrite" in result.stderr
+    assert (tmp_path / "s.las").read_bytes() == before
+    assert run("flat", "-o", tmp_path / "s.las", "--pulses", 30, "--overwrite").exit_code == 0
+    assert (tmp_path / "s.las").read_bytes() != before
+
+
+def test_help_lists_every_scene():
+    text = run("--help").output
+    for name in SCENES:
+        assert f"{name}:" in text
+
+
+def test_as_a_shell_command(tmp_path):
+    command = [sys.executable, "-m", "wavebatch", "simulate", "flat", "-o", str(tmp_path / "s.laz"), "--pulses", "50"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stdout == ""
+    assert (tmp_path / "s.laz").exists()

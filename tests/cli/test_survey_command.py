@@ -1,0 +1,123 @@
+"""`wavebatch survey` as a user types it: what it prints, what it writes, and that `run` takes it."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.stages.chain_file import load_chain
+from wavebatch.surveying.auto_chain import chain_text, decide
+from wavebatch.surveying.system_file import load_survey
+from wavebatch.tools.simulate import simulate_strip
+
+
+def _survey(*arguments):
+    return CliRunner().invoke(main, ["survey", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def flat_strip(tmp_path_factory):
+    """2,500 pulses over bare ground."""
+    path = tmp_path_factory.mktemp("flat") / "flat.las"
+    simulate_strip("flat", path, pulses=2500, seed=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def surveyed(flat_strip, tmp_path_factory):
+    """Folder with SYSTEM.toml and CHAIN.toml, and what was printed."""
+    folder = tmp_path_factory.mktemp("surveyed")
+    result = _survey(flat_strip, "-o", folder / "SYSTEM.toml", "--chain", folder / "CHAIN.toml")
+    assert result.exit_code == 0, result.output
+    return folder, result
+
+
+def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
+    folder, result = surveyed
+    lines = result.stdout.splitlines()
+    for name in ("strip", "samples", "ADC range", "vectors", "baseline", "noise", "signal noise", "system pulse",
+                 "pulse models", "kappa", "ringing", "acceptance", "saturation", "waveforms", "amplitudes",
+                 "widths", "decisions"):  # fmt: skip
+        assert any(line.startswith(name) for line in lines), name
+    found = load_survey(folder / "SYSTEM.toml").survey
+    for kind, value in found.system.noise_by_kind.items():
+        assert any(line.split() == [*kind.split("_"), f"{value:.3f}", "DN"] for line in lines), kind
+    for decision in decide(found):
+        word = "needed" if decision.needed else "left out"
+        assert any(line.startswith(f"  {word}") and decision.part in line and decision.reason in line for line in lines)
+    assert any("s_ref 2.0" in line for line in lines) and any("1 gaussian" in line for line in lines)
+    assert str(folder / "SYSTEM.toml") in result.stderr and str(folder / "CHAIN.toml") in result.stderr
+
+
+def test_the_files_say_the_same(flat_strip, surveyed):
+    folder, _ = surveyed
+    saved = load_survey(folder / "SYSTEM.toml")
+    assert {one.part: one.needed for one in decide(saved.survey)}.items() <= {
+        one.part: one.needed for one in saved.survey.decisions
+    }.items()  # what is written are the decisions of the chain, not those of the survey before them
+    assert saved.strip == "flat.las" and saved.fingerprint == take_fingerprint(flat_strip)
+    assert (folder / "CHAIN.toml").read_text() == chain_text(saved.survey)
+    assert "# growth of fits: left out: " in (folder / "CHAIN.toml").read_text()
+    assert load_chain(folder / "CHAIN.toml").steps[2].effective()["max_echoes"] == 1
+
+
+def test_a_run_with_the_files_writes_the_cloud_of_a_run_that_surveys(flat_strip, surveyed, tmp_path):
+    folder, _ = surveyed
+    by_files = ["--system", folder / "SYSTEM.toml", "--chain", folder / "CHAIN.toml"]
+    reports = {}
+    for name, options in {"auto": [], "files": by_files, "system": by_files[:2]}.items():
+        arguments = ["run", flat_strip, "-o", tmp_path / name, "--format", "las", "-q", *options]
+        assert CliRunner().invoke(main, list(map(str, arguments))).exit_code == 0
+        reports[name] = json.loads((tmp_path / name / "flat.report.json").read_text())
+    assert reports["auto"]["chain"] == reports["files"]["chain"] == reports["system"]["chain"]
+    assert reports["auto"]["strip"]["system"] == reports["files"]["strip"]["system"]
+    assert reports["auto"]["counts"] == reports["files"]["counts"] == reports["system"]["counts"]
+    assert reports["auto"]["quality"] == reports["files"]["quality"]
+    assert reports["auto"]["strip"]["survey"]["from"] == "strip"
+    assert reports["files"]["strip"]["survey"]["from"] == "file"
+    assert reports["files"]["strip"]["survey"]["of_this_strip"] is True
+    assert reports["auto"]["choice"]["by"] == reports["system"]["choice"]["by"] == "auto"
+    assert reports["files"]["choice"]["by"] == "user"
+
+
+def test_json_for_programs(flat_strip, surveyed):
+    folder, _ = surveyed
+    result = _survey(flat_strip, "--json")
+    told, saved = json.loads(result.stdout), load_survey(folder / "SYSTEM.toml")
+    assert told["system"]["sigma_ref_ns"] == saved.survey.system.sigma_ref
+    assert told["figures"] == dict(saved.survey.figures) and told["waveforms"] == saved.survey.waveforms
+    assert told["chain"] == chain_text(saved.survey)
+    assert {decision["part"] for decision in told["decisions"]} >= {decision.part for decision in decide(saved.survey)}
+    assert told["direction"]["sign"] == "toward"
+
+
+def test_existing_files_are_kept_unless_told(flat_strip, tmp_path):
+    system, chain = tmp_path / "SYSTEM.toml", tmp_path / "CHAIN.toml"
+    chain.write_text("mine")
+    refused = _survey(flat_strip, "-o", system, "--chain", chain)
+    assert refused.exit_code == 1 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
+    assert not system.exists() and chain.read_text() == "mine" and refused.stdout == ""
+    assert _survey(flat_strip, "-o", system, "--chain", chain, "--overwrite").exit_code == 0
+    assert load_chain(chain) and load_survey(system)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["CHAIN.toml", "SYSTEM.toml"]
+
+
+def test_fewer_waveforms_on_request(flat_strip):
+    assert json.loads(_survey(flat_strip, "--json", "--waveforms", 300).stdout)["waveforms"] == 300
+
+
+def test_too_few_echoes_for_a_pulse_are_said(tmp_path):
+    path = tmp_path / "short.las"
+    simulate_strip("flat", path, pulses=15, seed=1)
+    result = _survey(path)
+    assert result.exit_code == 0 and "too few to learn a pulse" in result.stdout
+
+
+def test_what_is_no_strip_gives_one_line(tmp_path, data):
+    for path in (tmp_path / "none.las", data / "no-packets" / "pdrf4-1.3.laz"):
+        result = _survey(path, "-o", tmp_path / "SYSTEM.toml")
+        assert result.exit_code == 1 and result.stdout == ""
+        assert result.stderr.count("\n") == 1 and path.name in result.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,129 @@
+"""`wavebatch voxelize` as a user types it: what it writes and prints, and how it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.surveying.calibration import Calibration, format_calibration
+from wavebatch.tools.simulate import simulate_strip
+
+
+def voxelize(*arguments):
+    return CliRunner().invoke(main, ["voxelize", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    """600 pulses over streets and houses."""
+    path = tmp_path_factory.mktemp("voxelize") / "urban.las"
+    simulate_strip("urban", path, pulses=600, seed=5)
+    return path
+
+
+def test_counts_go_to_stdout_and_talk_to_stderr(strip, tmp_path):
+    result = voxelize(strip, "--size", 1, "-o", tmp_path / "v.npz", "--json")
+    assert result.exit_code == 0, result.output
+    counts = json.loads(result.stdout)
+    with np.load(tmp_path / "v.npz") as file:
+        assert counts["voxels"] == len(file["index"]) > 300
+        assert counts["origin"] == file["origin"].tolist() and file["size"] == counts["size"] == 1.0
+        assert json.loads(str(file["meta"]))["strip"] == "urban.las"
+    assert counts["method"] == "richardson_lucy" and 4.4 < counts["pulse_fwhm"] < 5.2
+    assert f"{counts['voxels']} voxels of 1 m" in result.stderr
+    quiet = voxelize(strip, "--size", 1, "-o", tmp_path / "w.npz", "-q")
+    assert quiet.exit_code == 0 and quiet.output == ""
+    assert (tmp_path / "w.npz").read_bytes() == (tmp_path / "v.npz").read_bytes()
+
+
+def test_a_saved_survey_gives_the_same_voxels(strip, tmp_path):
+    system = tmp_path / "SYSTEM.toml"
+    assert CliRunner().invoke(main, ["survey", str(strip), "-o", str(system)]).exit_code == 0
+    for name, more in (("a.npz", ()), ("b.npz", ("--system", system))):
+        assert voxelize(strip, "--size", 0.5, "-o", tmp_path / name, *more).exit_code == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_every_method_and_option_changes_the_result(strip, tmp_path):
+    variants = [
+        (), ("--iterations", 5), ("--method", "gold"), ("--method", "wiener"), ("--method", "wiener", "--snr", 5),
+        ("--threshold", 12), ("--all-crossed",), ("--all-crossed", "--headroom", 30),
+    ]  # fmt: skip
+    made = set()
+    for number, variant in enumerate(variants):
+        result = voxelize(strip, "--size", 1, "-o", tmp_path / f"{number}.npz", *variant)
+        assert result.exit_code == 0, result.output
+        with np.load(tmp_path / f"{number}.npz") as file:
+            made.add(b"".join(file[name].tobytes() for name in ("index", "energy", "rays")))
+    assert len(made) == len(variants)
+
+
+def test_calibrated_strips_have_cross_sections(strip, tmp_path):
+    path = tmp_path / "CAL.toml"
+    path.write_text(format_calibration(Calibration(2.5e-8, 0.03, 0.22, 0.5)))
+    result = voxelize(strip, "--size", 2, "-o", tmp_path / "v.npz", "--calibration", path, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["sensor"] == "direction vectors"
+    with np.load(tmp_path / "v.npz") as file:
+        assert (file["cross_section"] > 0).all()
+    path.write_text(format_calibration(Calibration(2.5e-8, 0.03)))
+    result = voxelize(strip, "--size", 2, "-o", tmp_path / "w.npz", "--calibration", path)
+    assert result.exit_code == 2 and "divergence" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("-o", "v.npz"), 2, "--size"),
+        (("--size", 1), 2, "--output"),
+        (("--size", 0, "-o", "v.npz"), 2, "--size 0"),
+        (("--size", "nan", "-o", "v.npz"), 2, "--size nan"),
+        (("--size", 1e-7, "-o", "v.npz"), 2, "too small"),
+        (("--size", 1, "-o", "v.tif"), 2, ".npz, .las or .laz"),
+        (("--size", 1, "-o", "nowhere/v.npz"), 1, "make the folder first"),
+        (("--size", 1, "-o", "v.npz", "--snr", 5), 2, "--snr needs --method wiener"),
+        (("--size", 1, "-o", "v.npz", "--method", "wiener", "--iterations", 5), 2, "has no --iterations"),
+        (("--size", 1, "-o", "v.npz", "--flight-height", 500), 2, "of no use without --calibration"),
+        (("--size", 1, "-o", "v.npz", "--trajectory", "t.txt"), 2, "of no use without --calibration"),
+        (("--size", 1, "-o", "v.npz", "--calibration", "none.toml", "--crs", "EPSG:25832"), 2, "--trajectory"),
+        (("--size", 1, "-o", "v.npz", "--calibration", "none.toml"), 2, "cannot be read"),
+        (("--size", 1, "-o", "v.npz", "--system", "none.toml"), 2, "cannot be read"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_writes_nothing(strip, tmp_path, monkeypatch, arguments, code, said):
+    monkeypatch.chdir(tmp_path)
+    result = voxelize(strip, *arguments)
+    assert result.exit_code == code and said in result.stderr, result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_is_kept_without_overwrite(strip, tmp_path):
+    target = tmp_path / "v.laz"
+    target.write_text("old")
+    result = voxelize(strip, "--size", 1, "-o", target)
+    assert result.exit_code == 1 and "--overwrite" in result.stderr and target.read_text() == "old"
+    assert voxelize(strip, "--size", 1, "-o", target, "--overwrite").exit_code == 0
+    assert target.read_bytes()[:4] == b"LASF"
+
+
+def test_strips_without_packets_are_one_line(data, tmp_path):
+    for path in sorted((data / "no-packets").iterdir()):
+        result = voxelize(path, "--size", 1, "-o", tmp_path / "v.npz")
+        assert result.exit_code == 1 and result.stderr.startswith("error: "), path
+        assert result.stderr.count("\n") == 1 and path.name in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_strip_is_one_line(tmp_path):
+    (tmp_path / "x.las").write_text("no strip")
+    for name in ("x.las", "missing.las"):
+        result = voxelize(tmp_path / name, "--size", 1, "-o", tmp_path / "v.npz")
+        assert result.exit_code == 1 and result.stderr.count("\n") == 1 and name in result.stderr
+
+
+def test_help_says_what_a_voxel_holds():
+    text = voxelize("--help").output
+    for word in ("energy", "cross_section", "rays", "path", "light", "share", "--all-crossed", "--headroom", "DN ns"):
+        assert word in text

@@ -1,0 +1,571 @@
+"""Whole output files: read back with lazrs and LASzip, byte by byte where bytes must be kept."""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from writer_tools import BACKENDS, data_file, read_raw, write_source, write_strip
+
+from wavebatch import __version__
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.cloud.writer import CloudWriter, read_provenance, remove_stale
+from wavebatch.files.las import laz_encode
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import Vlr, find_evlrs, read_header
+
+RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
+LEICA = "leica-als/simple1_3_full_internal.las"
+YELLOWSCAN = "no-packets/fullwave.laz"
+VERSION_1_5 = "no-packets/pdrf9-1.5.laz"
+COLUMNS = ["amplitude", "echo_width", "range", "echo_flags"]
+NOT_KEPT = (("LASF_Spec", 4), "laszip encoded", "wavebatch")
+VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
+
+
+def make_rows(layout, points, seed=0):
+    rng = np.random.default_rng(seed)
+    n = len(points)
+    columns = {name: rng.normal(50, 10, n) for name in COLUMNS[:-1]}
+    columns["amplitude"][rng.random(n) < 0.1] = np.nan
+    columns["echo_flags"] = rng.integers(0, 65536, n).astype(np.uint16)
+    return layout.rows(points, columns=columns, matched=rng.random(n) < 0.8)
+
+
+def write(layout, target, rows, *, provenance=None, size=None, **options):
+    with CloudWriter(layout, target, provenance=provenance or {}, **options) as cloud:
+        for at in range(0, len(rows), size or max(1, len(rows))):
+            cloud.write(rows[at : at + (size or len(rows))])
+        cloud.commit()
+    return cloud
+
+
+def payloads(path, *left_out):
+    return [v for v in read_header(path).vlrs if (v.user, v.record_id) not in left_out and v.user not in left_out]
+
+
+def check_truth(path, rows):
+    """Header and extra-byte records say what the rows are."""
+    header = read_header(path)
+    assert header.point_count == len(rows)
+    with laspy.open(path, laz_backend=laspy.LazBackend.Laszip, read_evlrs=False) as reader:
+        seen = reader.header
+        record = laspy.PackedPointRecord(rows, seen.point_format)
+    numbers = np.array(record["return_number"])
+    expected = [np.count_nonzero(numbers == number) for number in range(1, 16)]
+    limit = 5 if header.version < (1, 4) else 15
+    assert list(seen.number_of_points_by_return[:limit]) == expected[:limit]
+    for axis, name in enumerate("XYZ"):
+        bounds = [value * seen.scales[axis] + seen.offsets[axis] for value in (rows[name].min(), rows[name].max())]
+        np.testing.assert_allclose([seen.mins[axis], seen.maxs[axis]], bounds, rtol=0, atol=1e-9)
+    for struct in seen.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs if seen.point_format.num_extra_bytes else ():
+        if struct.data_type == 0:
+            continue
+        values = rows[struct.format_name()].reshape(len(rows), -1)
+        for element in range(values.shape[1]):
+            column = values[:, element]
+            if struct.no_data is not None:
+                column = column[column != struct.no_data[element]]
+            if column.dtype.kind == "f":
+                column = column[np.isfinite(column)]
+            assert struct._raw_min()[element] == column.min() and struct._raw_max()[element] == column.max()
+
+
+@pytest.mark.parametrize("name", [RIEGL, LEICA, YELLOWSCAN, "no-packets/pdrf5-1.3.laz", "no-packets/pdrf10-1.4.laz"])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_real_files_come_back_by_both_readers(tmp_path, name, suffix):
+    path = data_file(name)
+    points = read_raw(path)
+    layout = plan_output(path, COLUMNS)
+    rows = make_rows(layout, points)
+    target = tmp_path / f"out{suffix}"
+    write(layout, target, rows)
+    for backend in BACKENDS:
+        assert read_raw(target, backend).tobytes() == rows.tobytes()
+    check_truth(target, rows)
+    before, after = read_header(path), read_header(target)
+    assert after.version == before.version and after.creation == before.creation
+    assert after.point_format == {4: 1, 5: 3, 9: 6, 10: 8}[before.point_format]
+    assert after.global_encoding & 0b110 == 0 and after.waveform_start == 0 and after.evlr_count == 0
+    assert after.system_identifier.strip(b"\0") == b"MODIFICATION"
+    assert after.generating_software.strip(b"\0") == f"wavebatch {__version__}".encode()
+    kept = [v for v in payloads(path, *NOT_KEPT) if not 100 <= v.record_id <= 355]
+    assert [v.encode() for v in kept] == [v.encode() for v in payloads(target, *NOT_KEPT)]
+    assert sorted(os.listdir(tmp_path)) == [target.name]
+
+
+def test_lascompressed_1_5_input(tmp_path):
+    path = data_file(VERSION_1_5)
+    points = read_raw(path, laspy.LazBackend.Laszip)
+    layout = plan_output(path, COLUMNS)
+    rows = make_rows(layout, points)
+    write(layout, tmp_path / "out.laz", rows)
+    for backend in BACKENDS:
+        assert read_raw(tmp_path / "out.laz", backend).tobytes() == rows.tobytes()
+    header = read_header(tmp_path / "out.laz")
+    assert (header.version, header.point_format) == ((1, 5), 6)
+    assert header.gps_range == (rows["gps_time"].max(), rows["gps_time"].min())
+
+
+@pytest.mark.parametrize("new", [6, 7, 8])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_promoted_files_come_back(tmp_path, new, suffix):
+    wkt = Vlr(b"LASF_Projection", 2112, b"PROJCRS[]\0", b"wkt")
+    points = write_source(tmp_path / "a.las", 4, (1, 3), vlrs=[wkt], creation=(60, 2024), user_bytes=b"mine")
+    layout = plan_output(tmp_path / "a.las", COLUMNS, point_format=new)
+    rows = make_rows(layout, points)
+    target = tmp_path / f"out{suffix}"
+    write(layout, target, rows)
+    for backend in BACKENDS:
+        assert read_raw(target, backend).tobytes() == rows.tobytes()
+    check_truth(target, rows)
+    header = read_header(target)
+    assert (header.version, header.point_format, header.user_bytes) == ((1, 4), new, b"mine")
+    assert header.global_encoding & 16 and header.vlrs[0].encode() == wkt.encode()
+
+
+def test_the_wkt_bit_says_the_truth(tmp_path):
+    geotiff, wkt = Vlr(b"LASF_Projection", 34735, bytes(8)), Vlr(b"LASF_Projection", 2112, b"PROJCRS\0")
+    for name, vlrs, evlrs, bit in (
+        ("none", [], [], 16),
+        ("geo", [geotiff], [], 0),
+        ("both", [geotiff, wkt], [], 16),
+        ("extended", [geotiff], [(b"LASF_Projection", 2112, b"PROJCRS\0")], 16),
+    ):
+        path = tmp_path / f"{name}.las"
+        points = write_source(path, 9, (1, 4), vlrs=vlrs, evlrs=evlrs)
+        layout = plan_output(path, [])
+        write(layout, tmp_path / f"{name}.laz", layout.rows(points))
+        assert read_header(tmp_path / f"{name}.laz").global_encoding & 16 == bit, name
+
+
+def test_records_are_kept_to_the_byte(tmp_path):
+    vlrs = [
+        Vlr(b"LASF_Spec", 100, bytes(26), b"descriptor"),
+        Vlr(b"caf\xe9", 1, b"not UTF-8", b"d\0rubbish behind", 0xAABB),
+        Vlr(b"LASF_Spec", 0, bytes(range(256)), b"classes"),
+        Vlr(b"copc", 1, bytes(160)),
+        Vlr(b"LASF_Projection", 2112, b"WKT without final NUL"),
+        Vlr(b"empty", 65535, b""),
+        Vlr(b"LAS_Spec", 101, bytes(26), b"Leica's spelling"),
+        Vlr(b"long", 2, bytes(65535)),
+    ]
+    points = write_source(tmp_path / "a.laz", 9, (1, 4), vlrs=vlrs, padding=b"\xdd\xcc", project_id=bytes(range(16)))
+    layout = plan_output(tmp_path / "a.laz", COLUMNS)
+    for suffix in (".las", ".laz"):
+        write(layout, tmp_path / f"out{suffix}", layout.rows(points))
+        header = read_header(tmp_path / f"out{suffix}")
+        assert (header.padding, header.project_id) == (b"\xdd\xcc", bytes(range(16)))
+        expected = [vlr.encode() for vlr in vlrs if vlr.record_id not in (100, 101) and vlr.user != "copc"]
+        assert [vlr.encode() for vlr in header.vlrs][: len(expected)] == expected
+        users = [vlr.user for vlr in header.vlrs[len(expected) :]]
+        assert users == ["wavebatch", "LASF_Spec", "laszip encoded"][: 3 if suffix == ".laz" else 2]
+
+
+def test_extra_bytes_records_stay_where_they_were(tmp_path):
+    records = [ExtraRecord.build("Amplitude", "u2", "dB", scale=0.01)]
+    path = tmp_path / "a.las"
+    vlrs = [Vlr(b"LASF_Spec", 4, b"", b"MAKER", 7), Vlr(b"z", 9, b"")]
+    points = write_source(path, 9, (1, 4), records=records, vlrs=vlrs)
+    layout = plan_output(path, COLUMNS, points="returns")
+    write(layout, tmp_path / "out.las", layout.rows(points))
+    first = read_header(tmp_path / "out.las").vlrs[0]
+    assert (first.record_id, first.description.strip(b"\0"), first.reserved) == (4, b"MAKER", 7)
+    with laspy.open(tmp_path / "out.las") as reader:
+        names = list(reader.header.point_format.extra_dimension_names)
+    assert names == ["Amplitude", "wb amplitude", "echo_width", "range", "echo_flags"]
+
+
+def test_extended_records_are_copied_and_what_is_not_is_said(tmp_path):
+    evlrs = [
+        (b"mine", 5, os.urandom(5_000_000)),
+        (b"copc", 1000, b"hierarchy"),
+        (b"LASF_Spec", 4, bytes(192)),
+        (b"LASF_Spec", 65535, b"packets"),
+        (b"last", 6, b""),
+    ]
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4), evlrs=evlrs)
+    layout = plan_output(path, [])
+    for suffix in (".las", ".laz"):
+        target = tmp_path / f"out{suffix}"
+        cloud = write(layout, target, layout.rows(points))
+        assert set(cloud.dropped) == {"EVLR copc 1000", "EVLR LASF_Spec 4"}
+        found, missing = find_evlrs(target, read_header(target))
+        assert [(e.user, e.record_id, e.length) for e in found] == [("mine", 5, 5_000_000), ("last", 6, 0)]
+        assert missing == 0
+        data = target.read_bytes()
+        assert data[found[0].start + 60 :][:5_000_000] == evlrs[0][2]
+        assert laspy.read(target).evlrs[0].record_data == evlrs[0][2]
+    with open(path, "r+b") as file:
+        file.seek(243)
+        file.write(b"\xff\xff\xff\xff")
+    with CloudWriter(layout, tmp_path / "b.las", provenance={}) as cloud:
+        assert "4294967290 EVLRs" in cloud.dropped
+
+
+def test_the_same_bytes_again_and_for_any_size_of_writes(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4), n=1000, records=[ExtraRecord.build("a", "f4", "")])
+    layout = plan_output(path, COLUMNS)
+    rows = make_rows(layout, points)
+    seen = set()
+    for number, size in enumerate((1000, 1000, 7, 333, 1)):
+        target = tmp_path / f"{number}.laz"
+        write(layout, target, rows, size=size, provenance={"chain": {"b": 1, "a": [1, 2]}})
+        seen.add(target.read_bytes())
+    write(layout, tmp_path / "other.laz", rows, provenance={"chain": {"a": [1, 2], "b": 1}})
+    seen.add((tmp_path / "other.laz").read_bytes())
+    assert len(seen) == 1
+
+
+def test_provenance_is_json_that_keeps_the_history(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4), system_identifier=b"LMS-Q680i", generating_software=b"RiPROCESS")
+    layout = plan_output(path, [])
+    write(layout, tmp_path / "b.las", layout.rows(points), provenance={"input": "a.las", "n": np.int64(3)})
+    (account,) = read_provenance(tmp_path / "b.las")
+    assert account["input"] == "a.las" and account["n"] == 3 and account["wavebatch"] == __version__
+    assert account["input_header"] == {"system_identifier": "LMS-Q680i", "generating_software": "RiPROCESS"}
+    again = plan_output(tmp_path / "b.las", [])
+    write(again, tmp_path / "c.las", again.rows(read_raw(tmp_path / "b.las")), provenance={"input": Path("b.las")})
+    assert [account["input"] for account in read_provenance(tmp_path / "c.las")] == ["a.las", "b.las"]
+    vlrs = [vlr for vlr in read_header(tmp_path / "c.las").vlrs if vlr.user == "wavebatch"]
+    assert [vlr.record_id for vlr in vlrs] == [1, 2]
+    assert json.dumps(json.loads(vlrs[0].payload), sort_keys=True, separators=(",", ":")).encode() == vlrs[0].payload
+    assert read_provenance(path) == []
+    with pytest.raises(ConfigError, match="provenance of its output takes .* a VLR holds 65535"):
+        CloudWriter(layout, tmp_path / "d.las", provenance={"long": "x" * 70000})
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(("point_format", "version"), [(4, (1, 3)), (9, (1, 4)), (10, (1, 5))])
+def test_no_points_at_all(tmp_path, suffix, point_format, version):
+    points = write_source(tmp_path / "a.las", point_format, version, n=0)
+    layout = plan_output(tmp_path / "a.las", COLUMNS)
+    target = tmp_path / f"out{suffix}"
+    write(layout, target, layout.rows(points))
+    header = read_header(target)
+    assert header.point_count == 0 and header.mins == header.maxs == (0.0, 0.0, 0.0)
+    for backend in BACKENDS:
+        assert len(read_raw(target, backend)) == 0
+    with laspy.open(target) as reader:
+        structs = reader.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs
+    assert not any(struct.min_is_relevant() or struct.max_is_relevant() for struct in structs)
+
+
+def test_odd_extra_bytes_survive_in_returns(tmp_path):
+    records = [
+        ExtraRecord(bytes([0, 0, 29, 0]) + b"normal".ljust(188, b"\0")),
+        ExtraRecord(bytes([0, 0, 13, 0]) + b"pair".ljust(188, b"\0")),
+        ExtraRecord.undocumented("ExtraBytes", 7),
+    ]
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4), records=records)
+    layout = plan_output(path, COLUMNS, points="returns")
+    rows = make_rows(layout, points)
+    write(layout, tmp_path / "out.laz", rows)
+    for backend in BACKENDS:
+        seen = read_raw(tmp_path / "out.laz", backend)
+        assert seen.tobytes() == rows.tobytes()
+    for name in ("normal", "pair", "ExtraBytes"):
+        assert seen[name].tobytes() == points[name].tobytes()
+    check_truth(tmp_path / "out.laz", rows)
+
+
+def test_bytes_that_no_record_describes_get_one(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4), records=[ExtraRecord.undocumented("ExtraBytes", 7)])
+    data = path.read_bytes()
+    header = read_header(path)
+    header.vlrs = []
+    bare = header.encode()
+    path.write_bytes(bare + data[-header.point_count * header.point_length :])
+    layout = plan_output(path, ["amplitude"], points="returns")
+    write(layout, tmp_path / "out.laz", layout.rows(read_raw(path)))
+    seen = read_raw(tmp_path / "out.laz")
+    assert seen["ExtraBytes"].tobytes() == points["ExtraBytes"].tobytes() and "amplitude" in seen.dtype.names
+
+
+# --- packets kept -----------------------------------------------------------------------------------------------
+
+
+def packets_of(path, points):
+    """The bytes of every point's packet, found by the header alone."""
+    header = read_header(path)
+    file = path.with_suffix(".wdp") if header.global_encoding & 4 else path
+    data, base = file.read_bytes(), 0 if header.global_encoding & 4 else header.waveform_start
+    places = zip(points["wavepacket_offset"].astype(int) + base, points["wavepacket_size"].astype(int), strict=True)
+    return [data[at : at + size] for at, size in places]
+
+
+@pytest.mark.parametrize("name", [RIEGL, LEICA])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_real_files_keep_their_packets(tmp_path, name, suffix):
+    path = data_file(name)
+    points = read_raw(path)
+    layout = plan_output(path, COLUMNS, keep_packets=True)
+    rows = make_rows(layout, points)
+    target = tmp_path / f"out{suffix}"
+    write(layout, target, rows)
+    for backend in BACKENDS:
+        seen = read_raw(target, backend)
+        assert seen.tobytes() == rows.tobytes()
+    before, after = read_header(path), read_header(target)
+    assert after.global_encoding & 0b110 == before.global_encoding & 0b110
+    assert packets_of(target, seen) == packets_of(path, points)
+    descriptors = [v.encode() for v in before.vlrs if v.user == "LASF_Spec" and 100 <= v.record_id <= 355]
+    assert [v.encode() for v in after.vlrs if v.user == "LASF_Spec" and 100 <= v.record_id <= 355] == descriptors
+
+
+@pytest.mark.parametrize(
+    ("point_format", "version", "new"),
+    [(4, "1.3", None), (5, "1.3", None), (4, "1.3", 9), (5, "1.4", 10), (9, "1.4", None), (10, "1.5", None)],
+)
+@pytest.mark.parametrize("internal", [True, False])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_kept_packets_in_every_format(tmp_path, point_format, version, new, internal, suffix):
+    path = tmp_path / "a.laz"
+    points = write_strip(path, point_format=point_format, version=version, internal=internal)
+    layout = plan_output(path, ["amplitude"], keep_packets=True, point_format=new)
+    (tmp_path / "out").mkdir()
+    target = tmp_path / "out" / f"a{suffix}"
+    rows = layout.rows(points)
+    write(layout, target, rows)
+    for backend in BACKENDS:
+        assert read_raw(target, backend).tobytes() == rows.tobytes()
+    assert packets_of(target, rows) == packets_of(path, points)
+    header = read_header(target)
+    found, missing = find_evlrs(target, header)
+    assert missing == 0 and len(found) == (internal and header.version >= (1, 4))
+    assert not found or (found[0].start, found[0].record_id) == (header.waveform_start, 65535)
+
+
+def test_a_file_without_header_gets_one_and_offsets_follow(tmp_path):
+    class Facts:
+        path, packet_file, internal = tmp_path / "a.las", tmp_path / "a.wdp", False
+        packet_start, packet_base, packet_end = 0, 0, 0
+
+    points = write_strip(Facts.path, internal=False)
+    before = packets_of(Facts.path, points)
+    bare = Facts.packet_file.read_bytes()[60:]
+    Facts.packet_file.write_bytes(bare)
+    Facts.packet_end = len(bare)
+    points["wavepacket_offset"] -= np.uint64(60)
+    points["wavepacket_index"][3] = 0
+    layout = plan_output(Facts, [], keep_packets=True)
+    (tmp_path / "out").mkdir()
+    write(layout, tmp_path / "out" / "a.las", layout.rows(points))
+    seen = read_raw(tmp_path / "out" / "a.las")
+    assert seen["wavepacket_offset"][3] == points["wavepacket_offset"][3]
+    after = packets_of(tmp_path / "out" / "a.las", seen)
+    assert after[:3] + after[4:] == before[:3] + before[4:]
+
+
+def multi_channel(path):
+    points = write_strip(path, n=100)
+    points["classification_flags"] = (points["classification_flags"] & 0b11001111) | ((np.arange(100) % 3) << 4)
+    return points
+
+
+def test_several_scanner_channels_go_through_laszip(tmp_path):
+    points = multi_channel(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", COLUMNS, keep_packets=True)
+    rows = make_rows(layout, points)
+    write(layout, tmp_path / "out.laz", rows)
+    for backend in BACKENDS:
+        assert read_raw(tmp_path / "out.laz", backend).tobytes() == rows.tobytes()
+
+
+def test_several_scanner_channels_are_refused_without_laszip(tmp_path, monkeypatch):
+    monkeypatch.setattr(laz_encode, "laszip", None)
+    points = multi_channel(tmp_path / "a.las")
+    layout = plan_output(tmp_path / "a.las", [], keep_packets=True)
+    rows = layout.rows(points)
+    with (
+        pytest.raises(InputError, match=r"out.laz: points of several scanner channels .* pip install laszip"),
+        CloudWriter(layout, tmp_path / "out.laz", provenance={}) as cloud,
+    ):
+        cloud.write(rows)
+    assert os.listdir(tmp_path) == ["a.las"]
+    one = rows[::3].copy()
+    write(layout, tmp_path / "one.laz", one)  # a single channel is fine, whichever it is
+    for backend in BACKENDS:
+        assert read_raw(tmp_path / "one.laz", backend).tobytes() == one.tobytes()
+    write(layout, tmp_path / "las.las", rows)
+    assert read_raw(tmp_path / "las.las").tobytes() == rows.tobytes()
+
+
+def test_packets_that_are_not_there(tmp_path):
+    write_source(tmp_path / "a.las", 9, (1, 4), global_encoding=4)
+    with pytest.raises(InputError, match="a.las: a.wdp with its packets is not beside it"):
+        plan_output(tmp_path / "a.las", [], keep_packets=True)
+    write_source(tmp_path / "b.las", 9, (1, 4), global_encoding=2)
+    with pytest.raises(InputError, match="b.las: the record of its packets would begin at byte 0"):
+        plan_output(tmp_path / "b.las", [], keep_packets=True)
+    points = write_strip(tmp_path / "c.las", internal=False)
+    layout = plan_output(tmp_path / "c.las", [], keep_packets=True)
+    (tmp_path / "c.wdp").write_bytes(b"cut")
+    with pytest.raises(InputError, match="ends .* bytes too early"):
+        write(layout, tmp_path / "d.las", layout.rows(points))
+    assert not (tmp_path / "d.las").exists() and not list(tmp_path.glob(".wavebatch*"))
+
+
+def test_a_killed_publication_of_two_files_can_be_finished(tmp_path):
+    points = write_strip(tmp_path / "a.las", internal=False)
+    layout = plan_output(tmp_path / "a.las", [], keep_packets=True)
+    (tmp_path / "out").mkdir()
+    target = tmp_path / "out" / "a.las"
+    write(layout, target, layout.rows(points))
+    target.unlink()  # killed after the .wdp, before the cloud
+    write(layout, target, layout.rows(points))
+    target.unlink()
+    target.with_suffix(".wdp").write_bytes(b"somebody else's")
+    with pytest.raises(InputError, match="a.wdp: exists already"):
+        write(layout, target, layout.rows(points))
+    assert os.listdir(tmp_path / "out") == ["a.wdp"]
+    write(layout, target, layout.rows(points), overwrite=True)
+    assert packets_of(target, points) == packets_of(tmp_path / "a.las", points)
+
+
+# --- whole or not at all ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_an_aborted_file_leaves_nothing(tmp_path, suffix):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    with pytest.raises(KeyError), CloudWriter(layout, tmp_path / f"out{suffix}", provenance={}) as cloud:
+        cloud.write(layout.rows(points))
+        raise KeyError("stop")
+    cloud.abort()
+    assert os.listdir(tmp_path) == ["a.las"]
+
+
+def test_outputs_are_not_replaced_unless_asked_and_never_the_input(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4))
+    layout = plan_output(path, [])
+    rows = layout.rows(points)
+    (tmp_path / "out.laz").write_bytes(b"old")
+    with pytest.raises(InputError, match="out.laz: exists already; .*--overwrite"):
+        CloudWriter(layout, tmp_path / "out.laz", provenance={})
+    write(layout, tmp_path / "out.laz", rows, overwrite=True)
+    assert read_raw(tmp_path / "out.laz").tobytes() == rows.tobytes()
+    (tmp_path / "link.las").symlink_to(path)
+    for target in (path, tmp_path / "link.las"):
+        with pytest.raises(InputError, match="is the input itself"):
+            CloudWriter(layout, target, provenance={}, overwrite=True)
+    with pytest.raises(ConfigError, match="out.txt: an output's name must end in .las or .laz"):
+        CloudWriter(layout, tmp_path / "out.txt", provenance={})
+    with pytest.raises(InputError, match="make the folder first"):
+        CloudWriter(layout, tmp_path / "none" / "out.las", provenance={})
+    assert remove_stale(tmp_path) == []
+
+
+def test_kept_packets_never_replace_those_of_the_input(tmp_path):
+    points = write_strip(tmp_path / "a.laz", internal=False)
+    layout = plan_output(tmp_path / "a.laz", [], keep_packets=True)
+    before = (tmp_path / "a.wdp").read_bytes()
+    with pytest.raises(InputError, match="a.wdp: is the input itself"):
+        write(layout, tmp_path / "a.las", layout.rows(points), overwrite=True)
+    assert (tmp_path / "a.wdp").read_bytes() == before
+    assert sorted(os.listdir(tmp_path)) == ["a.laz", "a.wdp"]
+
+
+REMEDY = "free space or choose another output folder"
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from wavebatch.core.errors import InputError
+from wavebatch.files.cloud.layout import plan_output
+from wavebatch.files.cloud.writer import CloudWriter
+source, target = map(Path, sys.argv[1:3])
+layout = plan_output(source, ["amplitude"], keep_packets=target.stem == "keep")
+rows = layout.rows(np.frombuffer(np.random.default_rng(0).bytes(60000 * 59), dtype="V59").view(
+    np.dtype([("a", "V59")])).view(__import__("wavebatch.files.las.header", fromlist="x").STANDARD_DTYPES[9]))
+rows["classification_flags"] &= 0b11001111
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+try:
+    with CloudWriter(layout, target, provenance={}) as cloud:
+        cloud.write(rows)
+        cloud.write(rows)
+        cloud.commit()
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("name", ["out.las", "out.laz", "keep.laz"])
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, name):
+    write_strip(tmp_path / "a.las")
+    (tmp_path / "out").mkdir()
+    target = tmp_path / "out" / name
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", FULL_DISK, str(tmp_path / "a.las"), str(target)],
+        capture_output=True, text=True, cwd=Path(__file__).resolve().parents[2], timeout=60,
+    )  # fmt: skip
+    assert run.stderr == "" and run.returncode == 0
+    lines = run.stdout.splitlines()
+    assert len(lines) == 1 and lines[0] == f"{target}: cannot be written: File too large; {REMEDY}", lines
+    assert os.listdir(tmp_path / "out") == []
+
+
+def test_rows_of_another_layout_are_refused(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    with (
+        CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud,
+        pytest.raises(InputError, match="rows of another layout"),
+    ):
+        cloud.write(points)
+
+
+def test_nothing_waits_in_a_buffer_that_a_forked_worker_would_write_again(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
+        sizes = []
+        for _ in range(3):
+            cloud.write(layout.rows(points))
+            sizes.extend(path.stat().st_size for path in tmp_path.glob(".wavebatch-*"))
+    assert np.diff(sizes).tolist() == [200 * layout.dtype.itemsize] * 2
+
+
+def test_more_points_than_an_old_header_counts(tmp_path):
+    points = write_source(tmp_path / "a.las", 4, (1, 3))
+    layout = plan_output(tmp_path / "a.las", [])
+    with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
+        cloud._file._statistics.count = 2**32 - 100
+        with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; promote with --point-format 6"):
+            cloud.write(layout.rows(points))
+
+
+def test_laszip_is_optional():
+    code = (
+        "import sys; sys.modules['laszip'] = None; import wavebatch.files.las.laz_encode as module; "
+        "assert module.laszip is None"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).resolve().parents[2])
+
+
+def test_every_format_and_suffix_in_hand_made_combinations(tmp_path):
+    """Point formats without waveforms pass through too: simulated and synthetic clouds are written by the same code."""
+    for point_format, suffix in itertools.product((0, 1, 2, 3, 6, 7, 8), (".las", ".laz")):
+        version = (1, 2) if point_format < 4 else (1, 4)
+        path = tmp_path / f"{point_format}.las"
+        points = write_source(path, point_format, version)
+        layout = plan_output(path, ["amplitude"])
+        target = tmp_path / f"{point_format}out{suffix}"
+        rows = layout.rows(points, columns={"amplitude": np.arange(len(points))})
+        write(layout, target, rows)
+        for backend in BACKENDS:
+            assert read_raw(target, backend).tobytes() == rows.tobytes()
+        check_truth(target, rows)

@@ -1,0 +1,168 @@
+"""Temporary folders go with their process: at its end, or at the start of the next one when it was killed."""
+
+import errno
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk import temp_folders
+from wavebatch.files.disk.spool import Spool
+from wavebatch.files.disk.temp_folders import make_folder, owning_scratch, remove_orphans, use_scratch
+from wavebatch.tools.simulate import simulate_strip
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="file locks of POSIX systems")
+
+HOLD = """
+import sys
+from pathlib import Path
+from wavebatch.files.disk.temp_folders import owning_scratch
+with owning_scratch(Path(sys.argv[1])) as folder:
+    (folder / "data").write_bytes(bytes(1000))
+    print(folder, flush=True)
+    sys.stdin.read()
+"""
+
+LIVE_AND_LET_LIVE = """
+import sys
+from pathlib import Path
+from wavebatch.files.disk.temp_folders import owning_scratch, remove_orphans
+for turn in range(60):
+    with owning_scratch(Path(sys.argv[1])) as folder:
+        (folder / "data").write_text("mine")
+        remove_orphans(Path(sys.argv[1]))
+        assert (folder / "data").read_text() == "mine"
+        assert (folder / "lock").exists()
+"""
+
+
+@pytest.fixture
+def hold(tmp_path):
+    """`hold()`: a process that owns a folder in tmp_path, and that folder."""
+    processes = []
+
+    def start():
+        process = subprocess.Popen(
+            [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        processes.append(process)
+        return process, Path(process.stdout.readline().strip())
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def test_a_folder_is_there_while_it_is_needed(tmp_path):
+    with owning_scratch(tmp_path) as folder:
+        inner = make_folder()
+        assert inner.parent == folder and folder.parent == tmp_path and folder.name.startswith(".wavebatch-")
+        assert remove_orphans(tmp_path) == []
+        (inner / "file").write_text("x")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_process_left_goes_and_what_is_in_use_stays(tmp_path, hold):
+    killed, orphan = hold()
+    _, used = hold()
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    assert orphan.exists() and used.exists()
+    assert remove_orphans(tmp_path) == [orphan]
+    assert (used / "data").read_bytes() == bytes(1000) and not orphan.exists()
+    assert remove_orphans(tmp_path) == []
+
+
+def test_only_what_is_surely_an_orphan_is_removed(tmp_path):
+    """Other machines', links, files, and what merely looks alike."""
+    here = f"wavebatch-{socket.gethostname()}-"
+    kept = [tmp_path / "wavebatch-another.machine-1-abc", tmp_path / f"my-{here}1", tmp_path / "elsewhere"]
+    for folder in kept:
+        folder.mkdir()
+        (folder / "precious").write_text("x")
+    (tmp_path / f"{here}2-link").symlink_to(kept[2])
+    (tmp_path / f"{here}3-file").write_text("x")
+    (tmp_path / f"{here}4-mine").mkdir()
+    assert remove_orphans(tmp_path) == [tmp_path / f"{here}4-mine"]
+    assert all((folder / "precious").exists() for folder in kept)
+    assert (tmp_path / f"{here}3-file").exists() and (tmp_path / f"{here}2-link").is_symlink()
+
+
+def test_processes_that_start_together_leave_each_other_alone(tmp_path):
+    runs = [subprocess.Popen([sys.executable, "-c", LIVE_AND_LET_LIVE, str(tmp_path)]) for _ in range(4)]
+    assert [run.wait(timeout=120) for run in runs] == [0] * 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_given_by_another_process_is_this_thread_s_only(tmp_path):
+    found = []
+    use_scratch(tmp_path)
+    try:
+        thread = threading.Thread(target=lambda: found.append(temp_folders.scratch_place()))
+        thread.start()
+        thread.join()
+        assert make_folder().parent == tmp_path and found != [tmp_path]
+    finally:
+        use_scratch(None)
+
+
+def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
+    with owning_scratch(tmp_path / "missing") as folder:
+        assert folder is None
+    monkeypatch.setattr("wavebatch.files.disk.spool.KEPT", 0)
+
+    def refuse(*args, **options):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(temp_folders.tempfile, "mkdtemp", refuse)
+    spool = Spool(2, np.dtype("<i8"))
+    spool.append(np.array([0, 1]), np.array([5, 6]))
+    with pytest.raises(InputError, match="No space left.*set TMPDIR"):
+        spool.seal()
+
+
+RUN = """
+import sys
+from wavebatch.files.disk import spool
+from wavebatch.files.strip import reader
+spool.KEPT, reader.UNIT_POINTS = 0, 500
+if __name__ == "__main__":
+    sys.argv[0] = "wavebatch"
+    from wavebatch.cli import main
+    main()
+"""
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_the_next_run_clears_up_after_one_that_was_killed(tmp_path, edit_points, jobs):
+    strips, temporary, out = tmp_path / "in", tmp_path / "tmp", tmp_path / "out"
+    strips.mkdir()
+    temporary.mkdir()
+    simulate_strip("urban", tmp_path / "b.las", pulses=3000, seed=2)
+    order = np.random.default_rng(1)
+    edit_points(tmp_path / "b.las", strips / "b.las", lambda points: order.permutation(points))
+    script = tmp_path / "run.py"
+    script.write_text(RUN)
+    command = [sys.executable, str(script), "run", str(strips), "-o", str(out), "--profile", "fast", "-q"]
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    run = subprocess.Popen([*command, "--jobs", jobs], env=environment)
+    deadline = time.monotonic() + 60
+    while not list(temporary.rglob("spool")):
+        assert run.poll() is None and time.monotonic() < deadline
+        time.sleep(0.002)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    assert list(temporary.rglob("spool"))
+    while subprocess.run([*command, "--resume"], env=environment).returncode:
+        assert time.monotonic() < deadline
+    assert list(temporary.iterdir()) == []
+    assert sorted(path.name for path in out.iterdir()) == ["b.laz", "b.report.json"]

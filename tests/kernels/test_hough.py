@@ -1,0 +1,129 @@
+"""Lines in images: position and angle to the acceptance of ALGORITHMS.md 1.3 (T8), segments, scan lines."""
+
+import numpy as np
+import pytest
+from published import paint_slice
+
+from wavebatch.kernels.geometry.hough import THETA_STEP, _Accumulator, find_lines
+from wavebatch.kernels.geometry.scan_lines import LAG, find_sweeps
+
+
+def detect(image, sigma=8.0, **options):
+    roi = image > 2 * image.std()
+    row, column = np.nonzero(roi)
+    return find_lines(column.astype(float), row.astype(float), image[roi], sigma=sigma, **options)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1, 0.2, 0.5, 1.0, -0.7])
+def test_position_and_angle_meet_the_acceptance(slope):
+    off, turn = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(1000 + seed)
+        column = 200 + rng.uniform(-3, 3)
+        (line,) = detect(paint_slice(rng, [(column, slope, 0, 320)]))
+        x, y = np.add(line.start, line.end) / 2
+        off.append((x - slope * (y - 160) - column) / np.hypot(1, slope))
+        turn.append((line.theta - np.degrees(np.arctan2(-slope, 1)) + 90) % 180 - 90)
+        assert line.start[0] * np.cos(np.radians(line.theta)) + line.start[1] * np.sin(
+            np.radians(line.theta)
+        ) == pytest.approx(line.rho, abs=1e-9)
+    assert np.sqrt(np.mean(np.square(off))) < 0.05
+    assert np.sqrt(np.mean(np.square(turn))) < 0.1
+
+
+def test_segments_of_one_line_are_told_apart_by_their_gap(rng):
+    image = paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
+    lines = detect(image)
+    assert sorted(round(line.length / 10) for line in lines) == [14, 14]
+    assert len(detect(image, gap=60.0)) == 1
+
+
+def test_crossing_lines_are_both_found(rng):
+    lines = detect(paint_slice(rng, [(200, 0.6, 0, 320), (200, -0.6, 0, 320)]))
+    angles = sorted(line.theta for line in lines[:2])
+    assert angles == pytest.approx([-30.96, 30.96], abs=0.6)
+
+
+def test_short_pieces_and_noise_are_no_segments(rng):
+    assert detect(paint_slice(rng, [(200, 0.0, 100, 112)])) == []
+    assert detect(rng.standard_normal((100, 100)), sigma=2.0, gap=3.0) == []
+    assert find_lines(np.empty(0), np.empty(0), np.empty(0), sigma=1.0) == []
+    assert find_lines(np.ones(3), np.ones(3), np.ones(3), sigma=1.0) == []
+
+
+def test_pixels_belong_to_one_segment_and_coordinates_may_lie_anywhere(rng):
+    image = paint_slice(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
+    roi = image > 2 * image.std()
+    row, column = np.nonzero(roi)
+    lines = find_lines(column + 5.4e6, row + 5e5, image[roi], sigma=8.0)
+    assert len(lines) == 2
+    rows = np.concatenate([line.rows for line in lines])
+    assert len(np.unique(rows)) == len(rows)
+    assert sorted(line.start[0] - 5.4e6 for line in lines) == pytest.approx([100, 300], abs=0.5)
+
+
+def test_most_limits_the_segments(rng):
+    image = paint_slice(rng, [(100, 0.0, 0, 320), (300, 0.0, 0, 320)])
+    assert len(detect(image, most=1)) == 1
+
+
+def test_votes_are_split_between_bins_and_can_be_taken_back(rng):
+    points = rng.uniform(-20, 20, (50, 2))
+    weight = rng.uniform(1, 2, 50)
+    sheet = _Accumulator(points)
+    sheet.vote(np.arange(50), weight)
+    assert sheet._sums.sum(axis=1) == pytest.approx(np.full(round(180 / THETA_STEP), weight.sum()))
+    centre = sheet._sums @ (np.arange(sheet._width) - sheet._reach)
+    assert centre[180] == pytest.approx(weight @ points[:, 0])
+    sheet.vote(np.arange(50), -weight)
+    assert np.abs(sheet._sums).max() < 1e-9
+
+
+def test_wide_slices_have_coarse_steps_and_the_same_lines(rng):
+    image = paint_slice(rng, [(200, 0.1, 0, 320)])
+    roi = image > 2 * image.std()
+    row, column = np.nonzero(roi)
+    far_x, far_y = np.append(column, 90_000.0), np.append(row, 0.0)
+    weight = np.append(image[roi], 0.1)
+    assert _Accumulator(np.stack([far_x, far_y], axis=1))._sums.nbytes < 200e6
+    (line,) = find_lines(far_x, far_y, weight, sigma=8.0)
+    (near,) = detect(image)
+    assert line.theta == pytest.approx(near.theta, abs=0.02)
+    assert line.start == pytest.approx(near.start, abs=0.1)
+
+
+def zigzag(lines, pulses):
+    up = np.linspace(-0.4, 0.4, pulses)
+    return np.concatenate([up if number % 2 == 0 else up[::-1] for number in range(lines)])
+
+
+def test_scan_lines_end_where_the_mirror_turns(rng):
+    angle = zigzag(6, 200) + 1e-4 * rng.standard_normal(1200)
+    found = find_sweeps(angle, np.arange(1200) * 1e-5)
+    assert found[0] == 0 and len(found) == 6
+    assert np.abs(found[1:] - np.arange(200, 1200, 200)).max() <= 2
+
+
+def test_scan_lines_end_where_the_mirror_jumps_back_or_pauses():
+    angle = np.tile(np.linspace(0.4, -0.4, 150), 4)
+    assert find_sweeps(angle, np.arange(600.0)).tolist() == [0, 150, 300, 450]
+    time = np.arange(600.0)
+    time[40:] += 500
+    assert find_sweeps(np.linspace(0, 1, 600), time).tolist() == [0, 40]
+    time[300:] -= 800
+    assert find_sweeps(np.linspace(0, 1, 600), time).tolist() == [0, 40, 300]
+
+
+def test_a_sinusoidal_mirror_and_lost_pulses(rng):
+    phase = np.sort(rng.choice(4000, 3200, replace=False))
+    found = find_sweeps(np.sin(phase / 4000 * 10 * np.pi + 0.3), phase * 1e-5)
+    turns = np.searchsorted(phase, (np.arange(10) + 0.5) * 400 - 0.3 * 400 / np.pi)
+    assert len(found) == 11
+    assert np.abs(found[1:] - turns).max() < LAG
+
+
+def test_few_or_constant_angles_are_one_line():
+    assert find_sweeps(np.empty(0), np.empty(0)).tolist() == []
+    assert find_sweeps(np.zeros(1), np.zeros(1)).tolist() == [0]
+    assert find_sweeps(np.zeros(500), np.arange(500.0)).tolist() == [0]
+    assert find_sweeps(np.zeros(500), np.zeros(500)).tolist() == [0]

@@ -1,0 +1,115 @@
+"""Noise of whole counts (H10, H11, T14, T16): pooled std, its floor, spread of baselines, coloured noise."""
+
+import numpy as np
+import pytest
+
+from wavebatch import surveying
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.noise import estimate_noise
+from wavebatch.stages.chain import STAGES
+from wavebatch.tools.simulate import Recording, simulate_block
+
+
+def record(std, n=2000, s=80, level=12.0, spread=0.5, seed=0, amplitude=60.0):
+    """Rounded waveforms (s, n), one echo in each (none where amplitude is 0)."""
+    rng = np.random.default_rng(seed)
+    base = level + spread * rng.standard_normal(n)
+    time = rng.uniform(20, 60, n)
+    y = base + std * rng.standard_normal((s, n))
+    y += amplitude * np.exp(-0.5 * ((np.arange(s)[:, None] - time) / 2.0) ** 2)
+    return np.clip(np.rint(y), 0, 255).astype(np.float32)
+
+
+@pytest.mark.parametrize("std", [0.2, 0.3, 0.4, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize("amplitude", [0.0, 60.0])
+def test_std_of_whole_counts_includes_rounding(std, amplitude):
+    """Within 6 % of sqrt(std^2 + 1/12) from 0.2 counts on, within 1 % from 0.5 on (H10)."""
+    pooled = estimate_noise(record(std, amplitude=amplitude), 6)
+    true = np.hypot(std, QUANTISATION_STD)
+    assert pooled.std == pytest.approx(true, rel=0.06 if std < 0.5 else 0.01)
+    assert pooled.level == pytest.approx(12.0, abs=0.05)
+    assert pooled.share > 0.5
+
+
+@pytest.mark.parametrize("level", [0.0, 12.0, 255.0])
+def test_constant_waveforms_have_the_noise_of_rounding(level):
+    pooled = estimate_noise(np.full((40, 30), level, np.float32), 6)
+    assert pooled.std == pytest.approx(QUANTISATION_STD)
+    assert pooled.level == level
+    assert pooled.spread == 0
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (80, 0), (1, 1), (2, 5), (5, 1)])
+def test_little_or_nothing_gives_finite_numbers(shape):
+    assert np.isfinite(estimate_noise(np.full(shape, 3.0, np.float32), 6)).all()
+
+
+def test_waveforms_without_a_quiet_sample_give_the_first_guess():
+    signal = np.tile(np.array([[10.0], [200.0]], np.float32), (20, 50))
+    signal[0] = 9.0
+    pooled = estimate_noise(signal, 6)
+    assert pooled.share == 0
+    assert pooled.std >= QUANTISATION_STD
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.4, 1.5, 4.0])
+@pytest.mark.parametrize("std", [0.7, 1.5])
+def test_spread_of_baselines_is_told_from_noise(std, spread):
+    pooled = estimate_noise(record(std, n=3000, level=30.0, spread=spread), 6)
+    assert pooled.spread == pytest.approx(spread, rel=0.08, abs=0.04)
+    assert pooled.std == pytest.approx(np.hypot(std, QUANTISATION_STD), rel=0.02)
+
+
+def test_white_noise_is_the_same_raw_and_smoothed():
+    pooled = estimate_noise(record(1.0, n=4000), 6)
+    assert pooled.smoothed_std == pytest.approx(pooled.std, rel=0.02)
+
+
+@pytest.mark.parametrize(("rho", "factor"), [(0.5, 1.29), (0.667, 1.39), (0.8, 1.48)])
+def test_coloured_noise_shows_in_the_smoothed_std(rho, factor):
+    """H11: the remedy multiplies the noise by 1.29, 1.39, 1.48; the survey takes the larger of the two."""
+    recording = Recording(rho=rho, noise_std=3.0, baseline=40.0, baseline_spread=0.0)
+    block, _ = simulate_block("flat", 4000, np.random.default_rng(5), recording=recording)
+    pooled = estimate_noise(block.samples.T.astype(np.float32), 6)
+    assert pooled.smoothed_std / pooled.std == pytest.approx(factor, rel=0.03)
+    assert surveying.survey_block(block).system.noise_std >= 0.99 * pooled.smoothed_std
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5, 2.0, 6.0])
+def test_baselines_of_waveforms_are_recovered(spread):
+    """noise.pooled weighs the waveform's own quiet samples against the strip's baseline: never worse than either."""
+    n = 3000
+    rng = np.random.default_rng(8)
+    base = 40 + spread * rng.standard_normal((n, 1))
+    y = base + rng.standard_normal((n, 80))
+    y += 90 * np.exp(-0.5 * ((np.arange(80) - rng.uniform(20, 60, (n, 1))) / 2.0) ** 2)
+    block = WaveformBlock.from_samples(np.rint(y).astype(np.uint8))
+    noise = STAGES["noise.pooled"].function(block, surveying.survey_block(block).system)
+    error = np.abs(noise.baseline - base[:, 0])
+    own = np.hypot(1, QUANTISATION_STD) / np.sqrt(60)
+    lost = error > 1
+    assert lost.mean() < 0.003
+    rms = np.sqrt(np.mean(error[~lost] ** 2))
+    assert rms < 1.1 * own * spread / np.hypot(own, spread) + 0.02
+    assert noise.std == pytest.approx(np.full(n, np.hypot(1, QUANTISATION_STD)), rel=0.03)
+
+
+def test_tail_noise_follows_a_drifting_baseline():
+    n = 400
+    rng = np.random.default_rng(9)
+    base = np.linspace(10, 90, n)[:, None]
+    block = WaveformBlock.from_samples(np.rint(base + rng.standard_normal((n, 64))).astype(np.uint8))
+    noise = STAGES["noise.tail"].function(block, SystemPulse(2.0, noise_std=0.5), samples=20)
+    assert np.abs(noise.baseline - base[:, 0]).max() < 1.5
+    assert np.median(noise.std) == pytest.approx(1.04, rel=0.1)
+
+
+@pytest.mark.parametrize(("level", "std"), [(0, 5.0), (4, 5.0), (12, 8.0), (0, 0.4), (3, 40.0)])
+def test_noise_that_is_cut_at_zero_is_not_taken_for_silence(level, std):
+    rng = np.random.default_rng(10)
+    y = level + std * rng.standard_normal((80, 2000))
+    y += 60 * std * np.exp(-0.5 * ((np.arange(80)[:, None] - rng.uniform(20, 60, 2000)) / 2.0) ** 2)
+    pooled = estimate_noise(np.maximum(np.rint(y), 0), 6)
+    true = np.std(np.maximum(np.rint(level + std * rng.standard_normal(100_000)), 0))
+    assert pooled.std == pytest.approx(max(true, QUANTISATION_STD), rel=0.1)

@@ -1,0 +1,205 @@
+"""Other pulse models and undamped steps: the tables of ALGORITHMS.md 1.2 and 1.3 (T7, T8), plain twins."""
+
+import naive
+import numpy as np
+import pytest
+from published import PULSE_SIGMA
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.fit.gauss_newton import step_undamped
+from wavebatch.kernels.fit.least_squares import Windows
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.stages.chain import STAGES
+
+FINE = 100.0
+"""Counts per unit of amplitude."""
+
+
+def record(y, spacing=1.0, std=1.0):
+    """Waveforms (n, s) as a block of fine counts above 2000; the noise (in units of y) known."""
+    block = WaveformBlock.from_samples(np.rint(2000 + FINE * y).astype(np.uint16), spacing=spacing)
+    n = len(y)
+    return block, Noise(np.full(n, 2000, np.float32), np.full(n, FINE * max(std, 0.01), np.float32))
+
+
+def decompose(name, block, noise, system, **parameters):
+    candidates = STAGES["detect.maximum"].function(block, noise, system)
+    return STAGES[f"decompose.{name}"].function(block, noise, system, candidates, **parameters)
+
+
+def evaluate(shape, x, t, s):
+    return [part[:, 0] for part in evaluate_pulse(shape, x[:, None].copy(), np.array([t]), np.array([s]))]
+
+
+@pytest.mark.parametrize("power", [1.4, 2.4, 4.0])
+def test_generalized_gaussians_and_their_derivatives(power):
+    x = np.arange(-8, 14, 0.23)
+    pulse, by_time, by_width = evaluate(PulseShape(power=power), x, 3.1, 1.8)
+    np.testing.assert_allclose(pulse, naive.power_pulse(x, 3.1, 1.8, power), atol=1e-7)
+    slopes = naive.differentiate(lambda p: naive.power_pulse(x, *p, power), [3.1, 1.8])
+    np.testing.assert_allclose(np.stack([by_time, by_width], 1), 1.8 * slopes, atol=1e-5)
+
+
+def test_tabulated_pulses_and_their_derivatives():
+    samples = np.exp(-0.5 * ((np.arange(25) - 9.3) / 2) ** 2) + 0.2 * np.exp(-0.5 * ((np.arange(25) - 14) / 2) ** 2)
+    table = tabulate_pulse(np.arange(25.0), samples)
+    assert table.value.max() == pytest.approx(1, abs=1e-5)
+    shape = PulseShape(table=table)
+    x = np.arange(-20, 30, 0.21)
+    pulse, by_time, by_width = evaluate(shape, x, 3.1, 2.6)
+    above = x[pulse > 0.5]
+    assert np.ptp(above) == pytest.approx(2.354820 * 2.6, abs=0.42)
+    assert x[np.argmax(pulse)] == pytest.approx(3.1, abs=0.11)
+    step = 0.05
+    for k, (part, scale) in enumerate(((by_time, 2.6), (by_width, 2.6))):
+        up, down = ([3.1, 2.6] + sign * step * np.eye(2)[k] for sign in (1, -1))
+        slope = (evaluate(shape, x, *up)[0] - evaluate(shape, x, *down)[0]) / (2 * step)
+        np.testing.assert_allclose(part, scale * slope, atol=2e-3)
+    assert [part.item() for part in evaluate(shape, np.array([-1e4]), 3.0, 2.0)] == [0, 0, 0]
+
+
+def test_a_tabulated_gaussian_is_a_gaussian():
+    x = np.arange(-12.0, 13)
+    shape = PulseShape(table=tabulate_pulse(x, np.exp(-0.5 * (x / 2) ** 2)))
+    for table, plain in zip(evaluate(shape, x, 0.4, 1.7), evaluate(GAUSSIAN, x, 0.4, 1.7), strict=True):
+        np.testing.assert_allclose(table, plain, atol=4e-3)
+
+
+WANG = [(0.104, 0.0214, 0.0089, 0.0069), (0.184, 0.0158, 0.0100, 0.0037), (0, 0.0097, 0.0014, 0.0014)]
+WANG += [(0.05, 0.0186, 0.0058, 0.0052)]
+
+
+@pytest.mark.parametrize(("kappa", "noise_share", "gaussian", "log_normal"), WANG)
+def test_goodness_of_fit_of_wang(kappa, noise_share, gaussian, log_normal):
+    """T7: E = |f - y|^2 / |f|^2 of Gaussian and log-normal fits to 60 samples, FWHM 5 ns, within 10 %."""
+    n, x, sigma = 400, np.arange(60.0), PULSE_SIGMA
+    rng = np.random.default_rng(int(1e4 * noise_share))
+    time = 30 + rng.uniform(-0.5, 0.5, n)
+    std = 100 * noise_share
+    y = np.stack([100 * naive.pulse(x, t, sigma, kappa) for t in time]) + std * rng.standard_normal((n, 60))
+    block, noise = record(y, std=std)
+    system = SystemPulse(sigma, kappa=kappa)
+    for name, published in (("gaussian", gaussian), ("skewed", log_normal)):
+        found = decompose(name, block, noise, system)
+        alone = found.take(found.count(n)[found.waveform] == 1)
+        assert len(alone) > 0.95 * n
+        skew = kappa if name == "skewed" else 0
+        ratios = []
+        for echo in range(len(alone)):
+            f = alone.amplitude[echo] / FINE * naive.pulse(x, alone.time[echo], alone.sigma[echo], skew)
+            ratios.append(np.sum((f - y[alone.waveform[echo]]) ** 2) / np.sum(f**2))
+        assert np.mean(ratios) == pytest.approx(published, rel=0.10), name
+
+
+def test_a_given_skew_overrides_that_of_the_survey():
+    x = np.arange(60.0)
+    y = np.stack([200 * naive.pulse(x, t, 2.0, 0.12) for t in np.linspace(30, 31, 9)])
+    block, noise = record(y, std=0.3)
+    found = decompose("skewed", block, noise, SystemPulse(2.0), kappa=0.12, tolerance=1e-6)
+    np.testing.assert_allclose(found.time, np.linspace(30, 31, 9), atol=2e-3)
+    plain = decompose("skewed", block, noise, SystemPulse(2.0), tolerance=1e-6)
+    assert (plain.time - found.time).min() > 0.1
+
+
+@pytest.mark.parametrize("model", ["broadened", "stretched", "given"])
+def test_system_pulses_are_found_with_time_peak_and_width(model):
+    """A learned pulse with an after-pulse, fitted as what it is, convolved or stretched; one echo per waveform."""
+    components = ((1.0, 0.0, 2.0), (0.12, 7.0, 2.0))
+    x = np.arange(80.0)
+    time = np.linspace(30, 31, 11)
+    y = 200 * sum(w * np.exp(-0.5 * ((x - time[:, None] - d) / s) ** 2) for w, d, s in components)
+    block, noise = record(y, std=0.3)
+    shown = np.arange(-9, 18)
+    pulse = " ".join(f"{sum(w * np.exp(-0.5 * ((v - d) / s) ** 2) for w, d, s in components):.6f}" for v in shown)
+    found = decompose("reference", block, noise, SystemPulse(2.0, components=components), model=model, pulse=pulse)
+    strong = found.take(found.amplitude > 100 * FINE)
+    np.testing.assert_allclose(strong.time, time, atol=0.02)
+    np.testing.assert_allclose(strong.amplitude, 200 * FINE, rtol=0.01)
+    np.testing.assert_allclose(strong.sigma, 2.0, rtol=0.02)
+    if model == "broadened":
+        assert found.count(len(time)).tolist() == [1] * len(time)
+
+
+@pytest.mark.parametrize("power", [1.4, 2.0, 3.0])
+def test_generalized_gaussians_fit_flat_and_peaked_echoes(power):
+    x, time = np.arange(60.0), np.linspace(30, 31, 21)
+    y = 200 * naive.power_pulse(x, time[:, None], 3.0, power)
+    y = y + 0.5 * np.random.default_rng(1).standard_normal(y.shape)
+    block, noise = record(y, std=0.5)
+    system = SystemPulse(2.0)
+    found = decompose("generalized_gaussian", block, noise, system)
+    assert found.count(21).tolist() == [1] * 21
+    np.testing.assert_allclose(found.time, time, atol=0.03)
+    fwhm = 2 * (2 * np.log(2)) ** (1 / power) * 3.0
+    np.testing.assert_allclose(2.354820 * found.sigma, fwhm, rtol=0.03)
+    assert np.median(found.residual) < 1.3
+    if power != 2.0:
+        assert np.median(decompose("gaussian", block, noise, system).residual) > 3
+
+
+def start_from(y, spacing):
+    """The paper's start: the highest sample, and the width at half of its height over 2.3548."""
+    top = np.argmax(y, axis=1)
+    height = y[np.arange(len(y)), top]
+    width = np.count_nonzero(y > 0.5 * height[:, None], axis=1) / 2.354820
+    return top * spacing, height, width * spacing
+
+
+@pytest.mark.parametrize(("metres", "ratio"), [(2.10, 20.4), (3.49, 12.3), (1.46, 29.4), (2.07, 20.7)])
+def test_gauss_newton_reaches_the_bound_at_fifty_picoseconds(metres, ratio):
+    """T8: the pulses of Jutzi and Stilla's table 1; standard deviations of range and sigma against the bound [mm]."""
+    n, spacing, sigma = 300, 0.05, 0.217 / HALF_C
+    x = np.arange(320) * spacing
+    rng = np.random.default_rng(int(100 * ratio))
+    time = 8 + rng.uniform(-0.025, 0.025, n)
+    y = ratio * np.exp(-0.5 * ((x - time[:, None]) / sigma) ** 2)
+    y += rng.standard_normal(y.shape)
+    block, noise = record(y, spacing)
+    at, height, width = start_from(np.apply_along_axis(np.convolve, 1, y, np.ones(9) / 9, "same"), spacing)
+    start = EchoTable.build(np.arange(n), at, FINE * height, width)
+    found = STAGES["decompose.gauss_newton"].function(block, noise, SystemPulse(sigma), start, max_iterations=8)
+    assert found.waveform.tolist() == list(range(n))
+    assert not (found.flags & EchoFlag.NOT_CONVERGED).any()
+    bound = 1000 * HALF_C * float(bound_time(np.array(ratio), np.array(sigma), 1.0, spacing))
+    assert bound == pytest.approx(metres, rel=0.06)
+    for values in (found.time - time, found.sigma - sigma):
+        assert 1000 * HALF_C * np.std(values) / bound == pytest.approx(1, abs=0.13)
+
+
+def test_undamped_steps_equal_the_plain_ones():
+    rng = np.random.default_rng(2)
+    x = np.arange(40.0)
+    true = np.stack([[60, 50], [15, 21.5], [2.0, 2.5]]) * np.ones((6, 1, 1))
+    y = np.stack([naive.model(p, x) for p in true]) + rng.standard_normal((6, 40))
+    start = true * rng.uniform(0.97, 1.03, true.shape)
+    windows = Windows(y.astype(np.float32), np.tile(x, (6, 1)).astype(np.float32), np.ones(6))
+    found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-8, max_iterations=12)
+    assert converged.all()
+    plain = np.stack([naive.gauss_newton(y[i], x, start[i], 12) for i in range(6)])
+    np.testing.assert_allclose(found, plain, atol=2e-3)
+
+
+@pytest.mark.parametrize(("off", "least", "most"), [(0.5, 1, 1), (1.0, 1, 1), (2.0, 0, 0)])
+@pytest.mark.parametrize("width", [0.8, 2.0, 3.0])
+def test_basin_of_undamped_steps(off, width, least, most):
+    """s = 2, SNR 100: from up to one sigma off every fit converges, from two none (ALGORITHMS 1.3)."""
+    n, x = 100, np.arange(60.0)
+    y = 100 * np.exp(-0.5 * ((x - 30) / 2) ** 2) + np.random.default_rng(3).standard_normal((n, 60))
+    windows = Windows(y.astype(np.float32), np.tile(x, (n, 1)).astype(np.float32), np.ones(n))
+    start = np.tile(np.array([[100.0], [30 + 2 * off], [width]]), (n, 1, 1))
+    found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-3, max_iterations=40)
+    right = converged & (np.abs(found[:, 1, 0] - 30) < 0.2)
+    assert least <= right.mean() <= most
+    np.testing.assert_array_equal(found[~converged], start[~converged])
+
+
+def test_lost_fits_give_their_start_back_with_a_flag():
+    y = 100 * np.exp(-0.5 * ((np.arange(60.0) - 30) / 2) ** 2)[None]
+    block, noise = record(y)
+    start = EchoTable.build(np.zeros(1), np.array([35.0]), np.array([100 * FINE]), np.array([2.0]))
+    found = STAGES["decompose.gauss_newton"].function(block, noise, SystemPulse(2.0), start)
+    assert found.time.tolist() == [35.0]
+    assert (found.flags & EchoFlag.NOT_CONVERGED).all()

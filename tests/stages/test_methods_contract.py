@@ -1,0 +1,85 @@
+"""The contract of all stages, held by the methods with parameters other than their defaults."""
+
+import numpy as np
+import pytest
+from contract_tools import SYSTEMS, assert_same, check_echoes, inputs, make_block, pieces, scene_blocks, waveforms
+
+from wavebatch import surveying
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.stages.chain import STAGES
+
+PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
+VARIANTS = [
+    ("detect.threshold", {"correct_walk": False}),
+    ("detect.zero_crossing", {"derivative": "second"}),
+    ("detect.correlation", {"reference": "given", "pulse": PULSE}),
+    ("detect.asdf", {"rule": "paper", "interpolation": "parabola"}),
+    ("detect.asdf", {"reference": "system"}),
+    ("detect.asdf", {"reference": "given", "pulse": PULSE}),
+    ("detect.wavelet", {"wavelet": "mexican_hat"}),
+    ("detect.wavelet", {"scale": 4.0}),
+    ("detect.richardson_lucy", {"reference": "given", "pulse": PULSE, "iterations": 3}),
+    ("decompose.asdf_only", {"mode": "mixed"}),
+    ("decompose.skewed", {"kappa": 0.2}),
+    ("decompose.reference", {"model": "stretched"}),
+    ("decompose.reference", {"model": "given", "pulse": PULSE}),
+]
+
+
+def call(name, parameters, block, system):
+    noise, candidates, _ = inputs(block, system)
+    given = (candidates,) if name.startswith("decompose") else ()
+    return STAGES[name].function(block, noise, system, *given, **parameters)
+
+
+@pytest.mark.parametrize(("name", "parameters"), VARIANTS)
+@pytest.mark.parametrize("system", ["gaussian", "learned", "short"])
+@pytest.mark.parametrize("s", [1, 2, 40])
+def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system):
+    for samples in waveforms(s).values():
+        block = make_block(samples)
+        table = call(name, parameters, block, SYSTEMS[system])
+        check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
+
+
+@pytest.mark.parametrize(("name", "parameters"), VARIANTS)
+def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
+    block = scene_blocks()["mixed"].rows(slice(0, 29))
+    system = surveying.survey_block(block).system
+    whole = call(name, parameters, block, system)
+    assert len(whole) > 15
+    for size in (1, 7):
+        cuts = pieces(len(block), size)
+        parts = [(call(name, parameters, block.rows(cut), system), cut.start) for cut in cuts]
+        assert_same(EchoTable.concatenate(parts), whole)
+
+
+def test_parts_of_a_block_do_not_show(monkeypatch):
+    """More waveforms than are worked on at a time."""
+    from wavebatch.stages.detect import correlation, wavelet
+
+    block = scene_blocks()["mixed"].rows(slice(0, 60))
+    system = surveying.survey_block(block).system
+    names = ("detect.asdf", "detect.correlation", "detect.richardson_lucy")
+    whole = [call(name, {}, block, system) for name in names]
+    monkeypatch.setattr(correlation, "COLUMNS_AT_A_TIME", 7)
+    monkeypatch.setattr(wavelet, "AT_A_TIME", 7)
+    for name, table in zip(names, whole, strict=True):
+        assert_same(call(name, {}, block, system), table)
+        assert np.unique(table.waveform).size > 40
+
+
+@pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith(("detect.", "decompose."))))
+@pytest.mark.parametrize("s", [1, 2, 80])
+def test_a_constant_waveform_holds_no_echo(name, s):
+    """H10, T15: whatever its level, whatever a filter makes of its ends or a loop of its residual, and its company."""
+    level = np.repeat(np.array([0, 12, 40, 255], np.uint8)[:, None], s, axis=1)
+    pulse = 12 + np.rint(80 * np.exp(-0.5 * ((np.arange(s) - 0.6 * s) / 2) ** 2)).astype(np.uint8)
+    block = WaveformBlock.from_samples(np.insert(level, [1, 3], pulse, axis=0))
+    system = SystemPulse(2.0, baseline=12, noise_std=1.0)
+    noise = Noise(np.full(6, 12, np.float32), np.ones(6, np.float32))
+    given = (STAGES["detect.maximum"].function(block, noise, system),) if name.startswith("decompose") else ()
+    table = STAGES[name].function(block, noise, system, *given)
+    assert set(table.waveform.tolist()) <= {1, 4}
+    assert s < 80 or set(table.waveform.tolist()) == {1, 4}

@@ -1,0 +1,323 @@
+"""Range, backscatter, reflectance and angle of echoes: recovered, with errors that hold; no-data, never zeros."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.files.cloud.column_names import describe
+from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.physics.incidence import spread_of_angle
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.angle_limits import SLOPE, predict_angles
+from wavebatch.surveying.calibration import with_physics
+from wavebatch.tools.simulate.blocks import simulate_pulses
+from wavebatch.tools.simulate.geometry import AIR_SPEED
+from wavebatch.tools.simulate.scenes import find_scene
+
+SYSTEM = SystemPulse(1.2, baseline=12.0, noise_std=1.0, divergence=1.1, calibration=2.6e-8, attenuation=0.22)
+NAMES = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+COLUMNS = [name for stage in NAMES for name in STAGES[f"attribute.{stage}"].makes]
+
+
+def run(block, echoes, system, *names, **parameters):
+    noise = Noise(np.full(len(block), 12, np.float32), np.ones(len(block), np.float32))
+    for name in names:
+        echoes = STAGES[f"attribute.{name}"].function(block, noise, system, echoes, **parameters.get(name, {}))
+    return echoes
+
+
+def make(degrees, snr=100.0, height=640.0, per_waveform=1, seed=1):
+    """Block and fitted echoes on planes that the ray strikes at `degrees` (n,), with errors at the bound."""
+    rng = np.random.default_rng(seed)
+    n = len(degrees)
+    sigma = np.hypot(SYSTEM.sigma_ref, spread_of_angle(np.radians(degrees), height, 1e-3 * SYSTEM.divergence))
+    amplitude = np.full(n, snr) * np.cos(np.radians(degrees)) * SYSTEM.sigma_ref / sigma
+    errors = crlb(amplitude, sigma, 1.0, 1.0)
+    block = WaveformBlock.from_samples(np.zeros((n // per_waveform, 8), np.uint8))
+    sensor = np.array([5e5, 5.4e6, 120.0]) + rng.uniform(-100, 100, (len(block), 3)) * [1, 1, 0] + [0, 0, height]
+    block = replace(block, sensor=sensor)
+    draw = rng.multivariate_normal(np.zeros(2), [[1, -1 / np.sqrt(3)], [-1 / np.sqrt(3), 1]], n).T
+    waveform = np.arange(n) // per_waveform
+    echoes = EchoTable.build(
+        waveform, np.arange(n) % per_waveform * 20.0, amplitude + errors[1] * draw[0], sigma + errors[2] * draw[1],
+        time_err=errors[0], amplitude_err=errors[1], sigma_err=errors[2],
+    )  # fmt: skip
+    xyz = sensor[waveform] - [0, 0, height]
+    echoes = echoes.with_attributes(x=xyz[:, 0], y=xyz[:, 1], z=xyz[:, 2], range_err=(errors[0] * HALF_C).astype("f4"))
+    return block, echoes, amplitude * sigma
+
+
+def test_backscatter_and_range():
+    block, echoes, energy = make(np.full(4000, 20.0))
+    done = run(block, echoes, SYSTEM, "range", "backscatter_coefficient", "cross_section").attributes
+    assert done["range"] == pytest.approx(640.0, abs=1e-4)
+    gamma = 2.6e-8 * 640.0**2 * energy / 10 ** (-2 * 640 * 0.22 / 10_000)
+    off = done["backscatter_coefficient"] - gamma
+    assert np.median(np.abs(off) / gamma) < 0.03
+    assert np.mean(np.abs(off) < done["backscatter_coefficient_err"]) == pytest.approx(0.683, abs=0.03)
+    section = gamma * np.pi / 4 * (1.1e-3 * 640) ** 2
+    assert np.median(done["cross_section"] / section) == pytest.approx(1.0, abs=0.003)
+
+
+def test_a_wrong_position_is_in_the_error():
+    block, echoes, _ = make(np.full(10, 20.0), snr=1e6)
+    system = replace(SYSTEM, sensor_error=6.4, attenuation=0.0)
+    done = run(block, echoes, system, "backscatter_coefficient", "cross_section").attributes
+    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.04, rel=0.01)
+    assert done["backscatter_coefficient_err"] / done["backscatter_coefficient"] == pytest.approx(0.02, rel=0.02)
+    calibrated = replace(SYSTEM, attenuation=0.0, calibration_err=0.03)
+    done = run(block, echoes, calibrated, "cross_section").attributes
+    assert done["cross_section_err"] / done["cross_section"] == pytest.approx(0.03, rel=0.01)
+
+
+@pytest.mark.parametrize(("surface", "factor"), [("level", 1.0), ("facing", 1.0), ("echo", 1.0 / np.cos(np.pi / 6))])
+def test_reflectance(surface, factor):
+    block, echoes, energy = make(np.full(500, 30.0), snr=3000.0)
+    done = run(block, echoes, SYSTEM, "incidence_angle", "backscatter_coefficient", "reflectance",
+               reflectance={"surface": surface}).attributes  # fmt: skip
+    assert np.median(done["reflectance"] / done["backscatter_coefficient"]) * 4 == pytest.approx(factor, rel=0.002)
+    assert (done["reflectance_err"] > 0).all()
+
+
+def test_level_ground_is_struck_at_the_angle_of_the_ray():
+    block, echoes, _ = make(np.full(4, 30.0))
+    slanted = np.tile([0.0, np.sin(np.pi / 3), -np.cos(np.pi / 3)], (4, 1)) * HALF_C
+    done = run(replace(block, direction=slanted), echoes, SYSTEM, "backscatter_coefficient", "reflectance").attributes
+    assert done["reflectance"] == pytest.approx(done["backscatter_coefficient"] / 2, rel=1e-5)
+
+
+def test_only_echoes_alone_have_a_reflectance_and_an_angle():
+    block, echoes, _ = make(np.full(40, 30.0), per_waveform=2)
+    done = run(block, echoes, SYSTEM, *NAMES).attributes
+    assert np.isnan(done["reflectance"]).all() and np.isnan(done["reflectance_err"]).all()
+    assert np.isnan(done["incidence_angle"]).all()
+    assert np.isfinite(done["cross_section"]).all()
+    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"alone": False}).attributes
+    assert np.isfinite(done["incidence_angle"]).all()
+
+
+@pytest.mark.parametrize(
+    ("system", "known"),
+    [
+        (replace(SYSTEM, calibration=None), {"range", "incidence_angle", "incidence_angle_err"}),
+        (
+            replace(SYSTEM, divergence=None),
+            {"range", "backscatter_coefficient", "backscatter_coefficient_err", "reflectance", "reflectance_err"},
+        ),
+        (replace(SYSTEM, sigma_ref=0.64), set(COLUMNS) - {"incidence_angle", "incidence_angle_err"}),
+        (SYSTEM, set(COLUMNS)),
+    ],
+    ids=["no calibration", "no divergence", "pulse too short for the sampling", "everything"],
+)
+def test_what_is_not_known_is_no_data(system, known):
+    block, echoes, _ = make(np.full(50, 30.0), snr=500.0)
+    done = run(block, echoes, system, *NAMES).attributes
+    for name in COLUMNS:
+        assert done[name].dtype == np.float32
+        assert np.isfinite(done[name]).all() if name in known else np.isnan(done[name]).all(), name
+
+
+def test_without_a_sensor_nothing_is_known():
+    block, echoes, _ = make(np.full(50, 30.0))
+    for sensor in (None, np.full((50, 3), np.nan)):
+        done = run(replace(block, sensor=sensor), echoes, SYSTEM, *NAMES).attributes
+        assert all(np.isnan(done[name]).all() for name in COLUMNS)
+
+
+def test_amplitudes_that_are_guesses_say_nothing():
+    block, echoes, _ = make(np.full(3, 30.0))
+    echoes = echoes.with_flags(EchoFlag.AMPLITUDE_UNRELIABLE | EchoFlag.SATURATED, np.array([True, False, False]))
+    done = run(block, echoes, SYSTEM, "cross_section", "reflectance").attributes
+    assert np.isnan(done["cross_section"]).tolist() == np.isnan(done["reflectance"]).tolist() == [True, False, False]
+
+
+def test_angles_of_a_village_and_their_errors():
+    rng = np.random.default_rng(5)
+    true = rng.choice([10.0, 20, 30, 40, 50, 60], 20_000)
+    block, echoes, _ = make(true, snr=100.0)
+    done = run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"max_error": 90.0}).attributes
+    off, error = done["incidence_angle"] - true, done["incidence_angle_err"]
+    assert np.median(np.abs(off)) == pytest.approx(np.median(0.6745 * error), rel=0.2)
+    assert np.mean(np.abs(off) < error) == pytest.approx(0.683, abs=0.05)
+
+
+def with_sensor(made):
+    """The simulated block with the true positions of the sensor."""
+    back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
+    return replace(made.block, sensor=made.rays.ground - back)
+
+
+def test_angles_of_simulated_slopes():
+    off, errors = [], []
+    scene = find_scene("slope")
+    chain = with_physics(load_profile("balanced"), sensor=True, calibrated=False, divergence=True)
+    system = None
+    for part in range(3):
+        made = simulate_pulses(scene, 2000, np.random.default_rng(part), first=2003 * part)
+        block = with_sensor(made)
+        # On slopes alone the system's width cannot be measured: level ground elsewhere, or SYSTEM.toml, must say it.
+        known = {"sigma_ref": scene.recording.pulse.sigma, "divergence": scene.divergence}
+        system = system or replace(survey_block(block).system, **known)
+        echoes = chain.run(block, system)
+        true = np.degrees(made.rays.incidence)[echoes.waveform]
+        off.append(echoes.attributes["incidence_angle"] - true)
+        errors.append(echoes.attributes["incidence_angle_err"])
+    off, errors = np.concatenate(off), np.concatenate(errors)
+    known = np.isfinite(off)
+    assert 0.4 < known.mean() < 1.0
+    assert np.median(np.abs(off[known])) == pytest.approx(np.median(0.6745 * errors[known]), rel=0.2)
+    assert np.mean(np.abs(off[known]) < errors[known]) == pytest.approx(0.683, abs=0.05)
+
+
+def test_an_infrared_beam_has_no_angles():
+    system = replace(SYSTEM, sigma_ref=1.7, divergence=0.4)
+    block, echoes, _ = make(np.linspace(0, 40, 500), snr=50.0)
+    narrow = replace(echoes, sigma=np.full(500, 1.7, np.float32))
+    done = run(block, narrow, system, "incidence_angle").attributes
+    assert np.isnan(done["incidence_angle"]).all() and np.isnan(done["incidence_angle_err"]).all()
+
+
+def test_modes_agree_where_they_should():
+    block, echoes, _ = make(np.full(400, 45.0), snr=2000.0)
+    angle = {
+        mode: np.median(run(block, echoes, SYSTEM, "incidence_angle", incidence_angle={"mode": mode})
+                        .attributes["incidence_angle"])
+        for mode in ("system", "pulse", "paper")
+    }  # fmt: skip
+    assert angle["system"] == pytest.approx(45.0, abs=0.2)
+    assert angle["pulse"] == pytest.approx(45.0, abs=3.0)
+    assert angle["paper"] > 60.0
+
+
+def test_a_learned_pulse_has_its_own_width():
+    components = ((1.0, 0.0, 1.2), (0.2, 2.5, 1.8))
+    from wavebatch.stages.pulse_tables import describe_echoes, pulse_shape, shape_limits
+
+    system = replace(SYSTEM, components=components)
+    shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
+    block, echoes, _ = make(np.full(50, 40.0), snr=1000.0)
+    wide = np.hypot(1.2, spread_of_angle(np.radians(40.0), 640.0, 1.1e-3))
+    whole, _ = describe_echoes(shape, limits, np.tile([100.0, 20.0, wide], (50, 1)), np.ones((50, 3)))
+    echoes = replace(echoes, sigma=whole[:, 2].astype(np.float32), sigma_err=np.full(50, 0.01, np.float32))
+    done = run(block, echoes, system, "incidence_angle").attributes
+    assert done["incidence_angle"] == pytest.approx(40.0, abs=0.3)
+
+
+def test_blocks_cut_anywhere_give_the_same_bits():
+    block, echoes, _ = make(np.linspace(0, 70, 301))
+    whole = run(block, echoes, SYSTEM, *NAMES).attributes
+    for start, stop in [(0, 1), (1, 8), (8, 301)]:
+        rows = np.arange(start, stop)
+        part = echoes.take(rows)
+        part = replace(part, waveform=(part.waveform - start).astype(np.int32))
+        done = run(block.rows(slice(start, stop)), part, SYSTEM, *NAMES).attributes
+        for name in COLUMNS:
+            np.testing.assert_array_equal(done[name], whole[name][rows])
+
+
+def reasons(echoes):
+    return count_reasons(echoes.attributes)
+
+
+@pytest.mark.parametrize(
+    ("system", "sensor", "column", "reason"),
+    [
+        (SYSTEM, False, "range", NoData.NO_SENSOR),
+        (SYSTEM, False, "incidence_angle", NoData.NO_SENSOR),
+        (replace(SYSTEM, calibration=None), True, "reflectance", NoData.NOT_CALIBRATED),
+        (replace(SYSTEM, calibration=None, divergence=None), True, "cross_section", NoData.NOT_CALIBRATED),
+        (replace(SYSTEM, divergence=None), True, "cross_section", NoData.NO_DIVERGENCE),
+        (replace(SYSTEM, divergence=None), True, "incidence_angle", NoData.NO_DIVERGENCE),
+        (replace(SYSTEM, sigma_ref=0.6), True, "incidence_angle", NoData.SHORT_PULSE),
+        (replace(SYSTEM, divergence=0.01), True, "incidence_angle", NoData.UNCERTAIN),
+    ],
+)
+def test_every_missing_value_has_a_reason(system, sensor, column, reason):
+    block, echoes, _ = make(np.zeros(50), snr=50.0)
+    echoes = replace(echoes, sigma=np.full(50, system.sigma_ref, np.float32))
+    if not sensor:
+        block = replace(block, sensor=None)
+    done = run(block, echoes, system, *NAMES)
+    assert reasons(done)[column] == {reason.name: 50}
+
+
+def test_reasons_of_single_echoes_and_that_they_add_up():
+    block, echoes, _ = make(np.full(12, 30.0), snr=300.0)
+    marks = (EchoFlag.SATURATED | EchoFlag.AMPLITUDE_UNRELIABLE, EchoFlag.NEAR_EDGE, EchoFlag.NOT_CONVERGED,
+             EchoFlag.AT_BOUND, EchoFlag.MERGED)  # fmt: skip
+    for row, flag in enumerate(marks):
+        echoes = echoes.with_flags(flag, np.arange(12) == row)
+    done = run(block, echoes, SYSTEM, NAMES[-1], *NAMES[:-1], reflectance={"surface": "echo"})
+    told = reasons(done)
+    assert told["incidence_angle"] == {"KNOWN": 7, "OVERLAPPED": 1, "SATURATED": 1, "CUT": 1, "UNSETTLED": 2}
+    assert told["reflectance"] == {"KNOWN": 7, "SATURATED": 1, "NO_ANGLE": 4}
+    assert set(told) == set(NAMES)
+    for name, counts in told.items():
+        assert sum(counts.values()) == 12
+        assert np.isfinite(done.attributes[name]).sum() == counts["KNOWN"]
+
+
+def test_the_first_reason_counts_and_all_are_explained():
+    values = np.array([1.0, np.nan, np.nan, np.inf])
+    first = np.array([True, True, False, False])
+    codes = explain(values, (NoData.NO_SENSOR, first), (NoData.CUT, np.array([True, True, True, False])))
+    assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.OTHER]
+    assert explain(values, (NoData.NO_SENSOR, True)).tolist() == [0, 1, 1, 1]
+    assert set(REASONS) == set(NoData) - {NoData.KNOWN}
+
+
+def test_echoes_that_are_far_too_narrow_are_flagged():
+    block, echoes, _ = make(np.zeros(3))
+    width = np.float32(SYSTEM.sigma_ref) * np.array([0.999, 0.99, 0.9], np.float32)
+    echoes = replace(echoes, sigma=width, sigma_err=np.full(3, 0.012, np.float32))
+    done = run(block, echoes, SYSTEM, "incidence_angle")
+    assert ((done.flags & np.uint16(EchoFlag.NARROW)) != 0).tolist() == [False, False, True]
+    assert done.attributes["incidence_angle"].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_relative_columns_need_no_calibration_and_become_absolute_with_its_constant():
+    block, echoes, _ = make(np.full(200, 30.0), snr=300.0)
+    bare = replace(SYSTEM, calibration=None, divergence=None)
+    names = ("relative_backscatter", "relative_cross_section", "relative_reflectance")
+    relative = run(block, echoes, bare, *names).attributes
+    absolute = run(block, echoes, SYSTEM, *NAMES[1:4]).attributes
+    area = np.pi / 4 * 1.1e-3**2
+    for name, other, factor in zip(names, NAMES[1:4], (1.0, area, 1.0), strict=True):
+        assert relative[name] * 2.6e-8 * factor == pytest.approx(absolute[other], rel=1e-5)
+        assert relative[f"{name}_err"] * 2.6e-8 * factor == pytest.approx(absolute[f"{other}_err"], rel=1e-5)
+        column = COLUMNS_TABLE[name]
+        assert "relative" in name and "not calibrated" in column.meaning and "DN" in column.unit
+        assert "relative" in describe(column)
+
+
+def test_channels_have_constants_of_their_own():
+    block, echoes, _ = make(np.full(20, 30.0), snr=300.0)
+    one = run(block, echoes, SYSTEM, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    channels = {(1, 0): (5.2e-8, 0.0), (1, 2): (7.8e-8, 0.1), (2, 0): (1.0, 0.0)}
+    system = replace(SYSTEM, channels=channels)
+    two = run(block, echoes, system, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    assert two == pytest.approx(2 * one, rel=1e-6)
+    mixed = replace(block, scanner=np.arange(20, dtype=np.uint8) % 4)
+    done = run(mixed, echoes, system, "backscatter_coefficient").attributes["backscatter_coefficient"]
+    # Scanner channels 1 and 3 have none of their own: they get that of all together.
+    assert done == pytest.approx(np.array([2, 1, 3, 1])[mixed.scanner] * one, rel=1e-6)
+    assert mixed.rows(slice(4, 9)).scanner.tolist() == [0, 1, 2, 3, 0]
+
+
+def test_the_outlook_is_the_error_that_echoes_then_have():
+    block, echoes, _ = make(np.full(500, SLOPE), snr=200.0)
+    outlook = predict_angles(SYSTEM, 1.0, 640.0, 1.1, float(np.median(echoes.amplitude)))
+    done = run(block, echoes, SYSTEM, "incidence_angle").attributes
+    assert outlook.error == pytest.approx(np.median(done["incidence_angle_err"]), rel=0.05)
+    assert outlook.possible and "640 m" in outlook.reason
+    assert not predict_angles(SYSTEM, 1.0, 640.0, 0.05, 50.0).possible
+    short = predict_angles(SYSTEM, 2.0, 640.0, 1.1, 50.0)
+    assert not short.possible and "0.60 samples wide" in short.reason

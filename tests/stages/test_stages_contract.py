@@ -1,0 +1,167 @@
+"""What every registered stage and every shipped chain must hold, whatever the waveforms: found by walking STAGES."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from contract_tools import (
+    SYSTEMS,
+    assert_same,
+    check_echoes,
+    inputs,
+    make_block,
+    pieces,
+    scene_blocks,
+    waveforms,
+)
+
+from wavebatch import surveying
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, ReturnTable, WaveformBlock
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import list_profiles, load_profile
+
+PROFILES = list_profiles()
+
+
+def call(stage, block, system, given=None):
+    noise, candidates, fitted = given or inputs(block, system)
+    arguments = {
+        "noise": (block, system),
+        "detect": (block, noise, system),
+        "decompose": (block, noise, system, candidates),
+        "attribute": (block, noise, system, fitted),
+    }
+    return stage.function(*arguments[stage.kind])
+
+
+def check_noise(noise, block, system):
+    assert noise.baseline.dtype == noise.std.dtype == np.float32
+    assert noise.baseline.shape == noise.std.shape == (len(block),)
+    assert np.isfinite(noise.baseline).all()
+    assert (noise.std >= np.float32(1 / np.sqrt(12))).all()
+    assert np.isfinite(noise.std).all()
+
+
+def check(stage, result, block, system):
+    if stage.kind == "noise":
+        check_noise(result, block, system)
+        return
+    fitted = stage.kind in ("decompose", "attribute") and stage.name != "decompose.none"
+    check_echoes(result, block, system, fitted)
+    for name in stage.makes:
+        assert len(result.attributes[name]) == len(result)
+
+
+@pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
+@pytest.mark.parametrize("s", [1, 2, 9, 64])
+def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
+    for name, samples in waveforms(s).items():
+        block = make_block(samples)
+        before = block.samples.copy()
+        given = inputs(block, system)
+        for stage in STAGES.values():
+            try:
+                check(stage, call(stage, block, system, given), block, system)
+            except Exception as error:
+                error.add_note(f"{stage.name} on {name}")
+                raise
+        np.testing.assert_array_equal(block.samples, before)
+
+
+@pytest.mark.parametrize("s", [1, 2, 5, 40, 150])
+def test_every_chain_keeps_the_contract_after_its_own_survey(s):
+    chains = [load_profile(profile) for profile in PROFILES]
+    for name, samples in waveforms(s).items():
+        block = make_block(samples)
+        system = surveying.survey_block(block).system
+        for chain in chains:
+            try:
+                table = chain.run(block, system)
+                check_echoes(table, block, system, fitted=True)
+                assert set(chain.makes) <= set(table.attributes)
+            except Exception as error:
+                error.add_note(f"{chain.name} on {name}")
+                raise
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("level", [0, 12, 255])
+@pytest.mark.parametrize("system", ["of the file", "of another file"])
+def test_constant_waveforms_have_no_echo(profile, level, system):
+    block = WaveformBlock.from_samples(np.full((20, 80), level, np.uint8))
+    measured = surveying.survey_block(block).system
+    assert np.isfinite(measured.sigma_ref)
+    if system == "of another file":
+        measured = replace(measured, baseline=float(level), noise_std=0.3, sigma_ref=3.0)
+    assert len(load_profile(profile).run(block, measured)) == 0
+
+
+@pytest.fixture(scope="module", params=["mixed", "stiff"])
+def scene(request):
+    """A block with returns near its echoes, and its survey."""
+    block = scene_blocks()[request.param]
+    system = surveying.survey_block(block).system
+    echoes = load_profile("fast").run(block, system)
+    returns = ReturnTable(echoes.waveform, echoes.time - 0.3, np.arange(len(echoes)), np.zeros((len(echoes), 3)))
+    return replace(block, returns=returns), system
+
+
+@pytest.mark.parametrize(
+    ("system_name", "size"), [("survey", 1), ("survey", 7), ("survey", 100), ("learned", 7), ("skewed", 7)]
+)
+@pytest.mark.parametrize("profile", PROFILES)
+def test_chains_give_the_same_bits_for_any_block_size(scene, profile, size, system_name):
+    block, system = scene
+    block = block.rows(slice(0, 40 if size == 1 else 110))
+    if system_name != "survey":
+        system = SYSTEMS[system_name]
+    chain = load_profile(profile)
+    whole = chain.run(block, system)
+    parts = [(chain.run(block.rows(piece), system), piece.start) for piece in pieces(len(block), size)]
+    assert len(whole) > 20
+    assert_same(EchoTable.concatenate(parts), whole)
+
+
+@pytest.mark.parametrize("size", [1, 7])
+def test_stages_give_the_same_bits_for_any_block_size(scene, size):
+    block, system = scene
+    block = block.rows(slice(0, 30))
+    cuts = pieces(len(block), size)
+    parts = [(part, inputs(part, system)) for part in (block.rows(cut) for cut in cuts)]
+    given = inputs(block, system)
+    for stage in STAGES.values():
+        whole = call(stage, block, system, given)
+        results = [call(stage, part, system, part_given) for part, part_given in parts]
+        if stage.kind == "noise":
+            joined = Noise(np.concatenate([r.baseline for r in results]), np.concatenate([r.std for r in results]))
+        else:
+            joined = EchoTable.concatenate(zip(results, (cut.start for cut in cuts), strict=True))
+        try:
+            assert_same(joined, whole)
+        except AssertionError as error:
+            error.add_note(stage.name)
+            raise
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_permuted_waveforms_give_permuted_echoes(scene, profile):
+    block, system = scene
+    order = np.random.default_rng(4).permutation(len(block))
+    chain = load_profile(profile)
+    whole, mixed = chain.run(block, system), chain.run(block.rows(order), system)
+    back = replace(mixed, waveform=order[mixed.waveform].astype(np.int32))
+    assert_same(back.take(np.argsort(back.waveform, kind="stable")), whole)
+
+
+def test_the_same_waveforms_twice_give_the_same_bits(scene):
+    block, system = scene
+    for profile in PROFILES:
+        assert_same(load_profile(profile).run(block, system), load_profile(profile).run(block, system))
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_every_stage_says_what_comes_out(name):
+    stage = STAGES[name]
+    assert stage.summary.endswith((".", ":"))
+    assert all(parameter.meaning for parameter in stage.parameters.values())

@@ -1,0 +1,83 @@
+"""Predicted errors come true on what was simulated, whatever the pulse."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_scenes import make_block, make_scene
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.stages.chain_file import list_profiles, load_profile
+from wavebatch.stages.score import score
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.choose_chain import COSTS
+from wavebatch.surveying.predict_error import Prediction, predict_errors, simulate_again
+from wavebatch.tools.simulate import find_pulse, known_system
+
+CHAINS = {name: load_profile(name) for name in COSTS}
+
+
+def test_every_shipped_chain_has_its_place_among_the_costs():
+    assert sorted(COSTS) == list_profiles()
+
+
+@pytest.mark.parametrize(
+    ("scene", "optimism"),
+    [
+        (make_scene("flat"), 0.95),
+        (make_scene("flat", pulse=find_pulse("leica"), n_samples=100), 0.9),
+        (make_scene("urban"), 0.7),
+        (make_scene("mixed"), 0.5),
+    ],
+    ids=["flat", "flat leica", "urban", "mixed"],
+)
+def test_predictions_come_true(scene, optimism):
+    """Of isolated echoes nearly exactly; pairs that no survey can resolve make the truth worse than predicted."""
+    block, truth = make_block(scene, 6000, seed=3)
+    system = survey_block(block).system
+    for prediction in predict_errors(block, system, CHAINS):
+        found = CHAINS[prediction.name].run(block, system)
+        measured = score(found, truth, len(block), noise_std=scene.recording.recorded_noise)
+        rmse = measured.errors["all"]["time"].rmse * HALF_C
+        assert optimism * rmse < prediction.range_error < 1.1 * rmse, prediction
+        assert prediction.completeness >= measured.completeness - 0.01
+
+
+def test_the_bound_and_a_perfect_chain_agree_on_flat_ground():
+    scene = make_scene("flat")
+    block, _ = make_block(scene, 4000, seed=4)
+    accurate = predict_errors(block, known_system(scene.recording), CHAINS)[-1]
+    assert accurate.name == "accurate" and accurate.factor == pytest.approx(1.0, abs=0.06)
+    assert accurate.range_error == accurate.bound * accurate.factor
+    assert accurate.to_json()["range_error_m"] == pytest.approx(accurate.range_error, rel=1e-5)
+
+
+def test_predictions_are_the_same_every_time():
+    block, _ = make_block("urban", 3000, seed=5)
+    system = survey_block(block).system
+    assert predict_errors(block, system, CHAINS) == predict_errors(block, system, dict(CHAINS))
+
+
+def test_what_is_simulated_again_holds_the_echoes_noise_and_clipping():
+    block = WaveformBlock.from_samples(np.zeros((4000, 60), np.uint8))
+    system = known_system(make_scene("flat").recording)
+    system = replace(system, noise_gain=0.05, saturation=200.0)
+    waveform = np.arange(4000)
+    echoes = EchoTable.build(waveform, np.full(4000, 30.0), np.where(waveform % 2, 100.0, 400.0), np.full(4000, 2.0))
+    again = simulate_again(block, system, echoes, np.random.default_rng(1))
+    assert again.samples.dtype == np.uint8 and again.samples.max() == 200
+    quiet, peak = again.samples[:, :15].astype(float), again.samples[1::2, 30].astype(float)
+    assert quiet.mean() == pytest.approx(system.baseline, abs=0.05)
+    assert (quiet - quiet.mean(axis=1, keepdims=True)).std() == pytest.approx(system.noise_std, rel=0.06)
+    assert peak.mean() == pytest.approx(system.baseline + 100, abs=0.3)
+    expected = np.sqrt(system.noise_std**2 + 0.05 * 100 + system.baseline_spread**2)
+    assert peak.std() == pytest.approx(expected, rel=0.06)
+
+
+def test_nothing_to_find_is_no_error():
+    block = WaveformBlock.from_samples(np.full((300, 60), 12, np.uint8))
+    for prediction in predict_errors(block, known_system(make_scene("flat").recording), CHAINS):
+        assert prediction.range_error == 0
+    assert Prediction("x", 0.01, np.inf, 0.0).to_json()["range_error_m"] is None

@@ -1,0 +1,195 @@
+"""Where a strip's sensor was: real and simulated strips, trajectory files right and wrong, what nobody can know."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.trajectory import ADJUSTED
+from wavebatch.core.units import HALF_C
+from wavebatch.core.waveforms import ReturnTable, WaveformBlock
+from wavebatch.files.las.crs import CrsUnits
+from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
+from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
+
+
+def find(path, **request):
+    with StripReader(path) as reader, reader.scan() as scan:
+        return find_sensor(reader, scan, SensorRequest(**request))
+
+
+def true_sensor(gps_time):
+    rays = trace_rays(Flight(), "flat", (gps_time - START_TIME) * Flight().pulse_rate)
+    return rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
+
+
+@pytest.fixture(scope="module")
+def found(wide_strip):
+    return find(wide_strip)
+
+
+def test_a_simulated_flight(found):
+    time = START_TIME + np.linspace(0.0, 0.559, 200)
+    assert found.kind == "direction vectors"
+    assert np.abs(found.trajectory.at(time) - true_sensor(time)).max() < 0.01
+    told = found.describe()
+    assert told["speed_m_s"] == pytest.approx(60.0, abs=0.1)
+    assert told["heading_deg"] == pytest.approx(90.0, abs=1.0)
+    assert told["range_error_m"] < 0.01
+
+
+def test_riegl(riegl):
+    told = find(riegl).describe()
+    assert told["source"] == "direction vectors"
+    assert told["height_m"] == pytest.approx(556.0, abs=1.0)
+    assert told["speed_m_s"] == pytest.approx(55.8, abs=0.5)
+    assert told["heading_deg"] == pytest.approx(337.7, abs=1.0)
+    assert told["range_error_m"] < 0.1
+    assert told["smoothness_m"] < 0.05
+
+
+def test_leica(leica):
+    told = find(leica).describe()
+    assert told["source"] == "direction vectors"
+    assert told["height_m"] == pytest.approx(726.8, abs=0.5)
+    assert told["speed_m_s"] == pytest.approx(60.4, abs=1.0)
+    assert told["range_error_m"] < 0.1
+
+
+@pytest.mark.parametrize("name", ["riegl", "leica"])
+def test_every_waveform_of_a_real_file_has_a_sensor(request, name):
+    path = request.getfixturevalue(name)
+    with StripReader(path) as reader, reader.scan() as scan:
+        source = find_sensor(reader, scan, SensorRequest())
+        for block, _ in reader.read_blocks(reader.read_unit(0, scan), 500, owned_only=True):
+            sensor = source.fill(block).sensor
+            assert np.isfinite(sensor).all()
+            ahead = block.origin - sensor
+            cosine = (ahead * block.direction).sum(axis=1)
+            cosine /= np.linalg.norm(ahead, axis=1) * np.linalg.norm(block.direction, axis=1)
+            assert np.degrees(np.arccos(np.minimum(cosine, 1.0))).max() < 0.01
+
+
+def write_trajectory(path, shift=0.0, off=(0.0, 0.0, 0.0), clock=0.0, stop=3.0):
+    time = START_TIME + np.arange(-1.0, stop, 0.05)
+    rows = np.column_stack([time + shift + clock, true_sensor(time) + off])
+    path.write_text("gps_time,x,y,z\n" + "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows) + "\n")
+    return path
+
+
+def test_a_trajectory_file(tmp_path, wide_strip, found):
+    given = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv", clock=ADJUSTED))
+    assert given.kind == "trajectory"
+    told = given.describe()
+    assert told["clocks"] == "standard to adjusted GPS time"
+    assert told["share_covered"] == 1.0
+    assert told["angle_to_packet_vectors_deg"] < 0.01
+    time = START_TIME + np.linspace(0.0, 0.559, 50)
+    assert np.abs(given.trajectory.at(time) - found.trajectory.at(time)).max() < 0.02
+
+
+def test_a_trajectory_has_the_error_that_the_vectors_see(tmp_path, wide_strip):
+    told = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv")).describe()
+    assert told["range_error_m"] < 0.01 and abs(told["farther_than_by_vectors_m"]) < 0.01
+    given = find(wide_strip, trajectory=write_trajectory(tmp_path / "u.csv", off=(0.0, 0.0, 6.0)))
+    told = given.describe()
+    assert told["range_error_m"] == pytest.approx(6.0 * 0.97, rel=0.03) and given.error == pytest.approx(5.8, abs=0.2)
+    assert told["farther_than_by_vectors_m"] == pytest.approx(5.8, abs=0.2)
+
+
+def test_gaps_are_told(tmp_path, wide_strip):
+    told = find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv", stop=0.3)).describe()
+    assert told["share_covered"] == pytest.approx(0.45, abs=0.05)
+    assert len(told["gaps_s"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"shift": 86_400.0}, "do not overlap on any clock"),
+        ({"off": (300_000.0, 0.0, 0.0)}, "degrees off the packets' vectors"),
+        ({"shift": -18.0, "stop": 30.0}, "clock is off by seconds"),
+    ],
+)
+def test_a_trajectory_of_something_else_is_refused(tmp_path, wide_strip, change, message):
+    with pytest.raises(InputError, match=message) as caught:
+        find(wide_strip, trajectory=write_trajectory(tmp_path / "t.csv", **change))
+    assert "t.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_pairs_of_returns():
+    time = START_TIME + np.sort(np.random.default_rng(1).uniform(0.0, 3.0, 8000))
+    rays = trace_rays(Flight(), "flat", (time - START_TIME) * 1e5)
+    noise = 0.01 * np.random.default_rng(2).standard_normal((2, 8000, 3))
+    first, last = rays.ground - 15 * rays.direction / HALF_C + noise[0], rays.ground + noise[1]
+    apart = last - first
+    found = estimate_path(Rays(time, 0.5 * (first + last), apart, (apart**2).sum(axis=1)), "pairs of returns")
+    off = np.linalg.norm(found.trajectory.at(time) - true_sensor(time), axis=1)
+    assert np.sqrt(np.mean(off**2)) < 1.0
+    assert 0.02 < found.error < 1.0
+
+
+def test_flights_with_a_break_have_no_positions_in_it():
+    rng = np.random.default_rng(3)
+    time = START_TIME + np.sort(np.r_[rng.uniform(0, 2, 4000), rng.uniform(60, 62, 4000)])
+    rays = trace_rays(Flight(), "flat", (time - START_TIME) * 1e5)
+    found = estimate_path(Rays(time, rays.ground, rays.direction, np.ones(8000)), "direction vectors")
+    assert np.abs(found.trajectory.at(time) - true_sensor(time)).max() < 0.02
+    assert np.isnan(found.trajectory.at(START_TIME + np.array([30.0]))).all()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 3.0])
+def test_rays_that_say_nothing(seconds):
+    time = np.linspace(0.0, seconds, 500)
+    down = np.tile([0.0, 0.0, -1.0], (500, 1))
+    assert estimate_path(Rays(time, np.zeros((500, 3)), down, np.ones(500)), "direction vectors") is None
+    nothing = Rays(np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+    assert estimate_path(nothing, "direction vectors") is None
+
+
+def test_height_is_the_last_resort():
+    block = WaveformBlock.from_samples(np.zeros((4, 8), np.uint8))
+    slanted = np.tile([0.0, np.sin(0.5), -np.cos(0.5)], (4, 1)) * HALF_C
+    slanted[3] = [0.0, 0.0, HALF_C]
+    block = replace(block, direction=slanted)
+    sensor = SensorSource("flight height", height=800.0).fill(block).sensor
+    assert sensor[:3, 2] == pytest.approx(800.0)
+    assert np.linalg.norm(sensor[:3], axis=1) == pytest.approx(800.0 / np.cos(0.5))
+    assert np.isnan(sensor[3]).all()
+    xyz = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, -14.0], [0.0, 0.0, -5.0]])
+    returns = ReturnTable(np.array([0, 0, 2], np.int32), np.array([10.0, 90.0, 30.0]), np.arange(3), xyz)
+    above = SensorSource("flight height", height=800.0).fill(replace(block, returns=returns)).sensor
+    assert above[:3, 2] == pytest.approx([786.0, 800.0, 795.0])
+    assert NOBODY.fill(block).sensor is None
+
+
+@pytest.mark.parametrize(
+    ("units", "ratio", "message"),
+    [
+        (CrsUnits("geographic"), 1.0, "coordinates are degrees"),
+        (CrsUnits("geocentric"), 1.0, "coordinates are geocentric"),
+        (CrsUnits("projected", 1200 / 3937), 3.2804, "coordinates are US survey feet, in which"),
+        (CrsUnits("projected", 1.0, 0.3048), 1.0, "coordinates are metres with heights in international feet"),
+        (CrsUnits("projected", np.nan), 1.0, "coordinates are a unit that is not known"),
+        (CrsUnits(None), 3.2798, "packet vectors are 3.280 times c/2 long, as they are in feet"),
+    ],
+)
+def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
+    with StripReader(wide_strip) as reader, reader.scan() as scan:
+        reader.facts = replace(reader.facts, units=(CrsUnits("projected", 1.0), units))
+        with pytest.raises(InputError, match=message) as caught:
+            find_sensor(reader, replace(scan, vector_ratio=ratio), SensorRequest())
+    assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
+
+
+def test_a_few_rays_of_every_place(wide_strip):
+    with StripReader(wide_strip) as reader, reader.scan() as scan:
+        vectors, _ = sample_rays(reader, scan)
+        again, _ = sample_rays(reader, scan)
+    assert 500 < len(vectors.time) <= MOST_SLICES * RAYS_PER_SLICE
+    assert (np.diff(vectors.time) >= 0).all()
+    np.testing.assert_array_equal(vectors.direction, again.direction)

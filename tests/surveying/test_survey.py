@@ -1,0 +1,120 @@
+"""The survey finds what was simulated, and on real strips what is known of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers_scenes import make_block, make_scene
+
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.measure import FIRST_LOOK
+from wavebatch.tools.simulate import PulseModel, find_pulse
+
+
+@pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])
+def test_the_width_is_found_however_far_from_the_first_guess(sigma):
+    scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
+    system = survey_block(make_block(scene, 3000, seed=3)[0]).system
+    assert system.sigma_ref == pytest.approx(sigma, rel=0.03)
+    assert system.noise_std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
+
+
+@pytest.mark.parametrize("spacing", [0.5, 2.0])
+def test_widths_are_in_ns_whatever_the_spacing(spacing):
+    scene = make_scene("flat", spacing=spacing, n_samples=160)
+    survey = survey_block(make_block(scene, 2500, seed=3)[0])
+    assert survey.system.sigma_ref == pytest.approx(2.0, rel=0.02) and survey.figures["spacing_ns"] == spacing
+
+
+@pytest.mark.parametrize(
+    ("pulse", "kind"), [("gaussian", "gaussian"), ("skewed", "skewed"), ("riegl", "learned"), ("leica", "learned")]
+)
+def test_the_simplest_pulse_that_serves_is_chosen(pulse, kind):
+    scene = make_scene("flat", pulse=find_pulse(pulse), n_samples=100)
+    survey = survey_block(make_block(scene, 4000, seed=4)[0])
+    system = survey.system
+    found = "learned" if system.components else "skewed" if system.kappa else "gaussian"
+    assert found == kind
+    if kind == "skewed":
+        assert system.kappa == pytest.approx(0.1, abs=0.005)
+    if pulse == "riegl":
+        delays = [(delay, weight) for weight, delay, _ in system.components]
+        after = min(delays, key=lambda pair: abs(pair[0] - 10.5))
+        assert after[0] == pytest.approx(10.5, abs=0.5) and after[1] == pytest.approx(0.04, abs=0.01)
+        assert system.ringing == pytest.approx(0.04, abs=0.01)
+    needed = {decision.part: decision.needed for decision in survey.decisions}
+    assert needed["learned pulse"] is (kind == "learned") and needed["skewed pulse"] is (kind == "skewed")
+
+
+def test_signal_dependent_noise_and_clipping_are_found():
+    scene = make_scene("urban", noise_gain=0.1, saturation=150)
+    survey = survey_block(make_block(scene, 6000, seed=5)[0])
+    assert survey.system.noise_gain == pytest.approx(0.1, rel=0.25)
+    assert survey.system.saturation == 150 and 0 < survey.figures["saturated_share"] < 0.1
+    assert survey.figures["largest_count"] == 150 and survey.figures["least_count"] >= 0
+    needed = {decision.part: decision.needed for decision in survey.decisions}
+    assert needed["censored fit"] and needed["signal-dependent weights"]
+
+
+def test_the_largest_group_of_one_length_decides():
+    flat, other = make_block("flat", 1000, seed=6)[0], make_block(make_scene("flat", n_samples=40), 1500, seed=6)[0]
+    ends = [(other, 0, 700), (flat, 0, 600), (other, 700, 1500), (flat, 600, 1000)]
+    parts = [block.rows(slice(start, stop)) for block, start, stop in ends]
+    joined = join_digitizers(parts)
+    assert len(joined) == 1 and np.array_equal(joined[0].samples, flat.samples)
+    assert survey_blocks(parts) == survey_blocks([flat])
+    assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])
+def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
+    scene = make_scene("flat", noise_gain=gain, pulse=find_pulse("leica"), n_samples=100)
+    assert survey_block(make_block(scene, 3000, seed=6)[0]).system.noise_gain == pytest.approx(gain, rel=0.2)
+
+
+def test_any_waveforms_can_be_surveyed(rng):
+    noise = rng.integers(0, 256, (50, 30)).astype(np.uint8)
+    for samples in (noise, noise[:1], noise[:, :3], np.full((FIRST_LOOK + 9, 12), 255, np.uint8)):
+        survey = survey_block(WaveformBlock.from_samples(samples))
+        assert np.isfinite([survey.system.sigma_ref, survey.system.noise_std]).all()
+        assert choose_chain(survey).steps
+
+
+def _survey_file(path):
+    with StripReader(path) as reader, reader.scan() as scan:
+        return survey_sample(read_sample(reader, scan))
+
+
+def test_riegl_is_what_is_known_of_it(riegl):
+    """R1, R3 and R4 of ALGORITHMS 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns, noise .97 to 1.31 DN."""
+    survey = _survey_file(riegl)
+    system = survey.system
+    assert len(system.components) >= 3 and system.kappa == 0
+    assert system.sigma_ref == pytest.approx(1.86, abs=0.05)
+    assert any(abs(delay - 10.5) < 0.5 and 0.02 < weight < 0.06 for weight, delay, _ in system.components)
+    assert system.ringing == pytest.approx(0.044, abs=0.01)
+    assert 0.9 < system.noise_std < 1.6
+    assert system.noise_by_kind["tail_smoothed"] == pytest.approx(1.31, abs=0.1)
+    misfits = survey.figures
+    assert misfits["misfit_5_gaussians"] < 0.5 * misfits["misfit_2_gaussians"] < 0.5 * misfits["misfit_1_gaussians"]
+    assert abs(misfits["kappa"]) < 0.19 and misfits["misfit_skewed"] > 0.8 * misfits["misfit_1_gaussians"]
+
+
+def test_leica_is_what_is_known_of_it(leica):
+    """A strong skew, which the skewed pulse halves and a learned one brings near the noise."""
+    survey = _survey_file(leica)
+    system, misfits = survey.system, survey.figures
+    assert len(system.components) >= 2 and 0.2 < misfits["kappa"] < 0.4
+    assert system.sigma_ref == pytest.approx(3.15, abs=0.1)
+    assert misfits["misfit_3_gaussians"] < 0.5 * misfits["misfit_skewed"] < 0.5 * misfits["misfit_1_gaussians"]
+    assert 0.9 < system.noise_std < 1.6 and misfits["empty_share"] == 0
+
+
+def test_a_survey_depends_on_the_samples_only():
+    block = make_block("urban", 3000, seed=7)[0]
+    moved = replace(block, origin=block.origin + 5, first=9, point=block.point[::-1])
+    assert survey_block(block) == survey_block(moved)

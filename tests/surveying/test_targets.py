@@ -1,0 +1,231 @@
+"""Calibration from targets: files of targets, what lies in them, and a constant that gives their reflectance back."""
+
+import json
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.surveying.calibration import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.targets import Target, fit_normal, load_targets
+from wavebatch.tools.simulate import find_scene, simulate_strip, strip
+from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+def test_what_lies_in_a_polygon():
+    corners = np.array([[0, 0], [10, 0], [10, 10], [5, 3], [0, 10.0]])
+    x, y = np.array([1.0, 9, 5, 5, -1, 5]), np.array([1.0, 8, 1, 8, 5, 20])
+    assert Target("w", 0.2, corners).contains(x, y).tolist() == [True, True, True, False, False, False]
+    many = np.random.default_rng(1).uniform(-2, 12, (2, 100_000))
+    assert Target("w", 0.2, corners).contains(*many).mean() * 14**2 == pytest.approx(65.0, rel=0.02)
+
+
+def test_circles_and_polygons_of_csv_and_geojson(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("name,reflectance,x,y,radius,incidence\ngrey,0.25,100,200,5,\nwhite,0.8,300,400,2,12.5\n")
+    grey, white = load_targets(path)
+    assert (grey.name, grey.reflectance, grey.incidence, white.incidence) == ("grey", 0.25, None, 12.5)
+    assert grey.contains(np.array([104.9, 105.1]), np.array([200.0, 200.0])).tolist() == [True, False]
+    path.write_text("reflectance,vertices\n0.5,0 0 10 0 10 10\n")
+    assert load_targets(path)[0].corners.shape == (3, 2)
+    ring = [[0, 0], [10, 0], [10, 10], [0, 0]]
+    feature = {"type": "Feature", "properties": {"reflectance": 0.4, "name": "a"},
+               "geometry": {"type": "Polygon", "coordinates": [ring]}}  # fmt: skip
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    assert load_targets(path)[0].contains(np.array([8.0, 2.0]), np.array([2.0, 8.0])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,x\n", "no target in it"),
+        ("reflectance,x,y\n0.2,1,2\n", "target 1: radius is missing"),
+        ("x,y,radius\n1,2,3\n", "target 1: reflectance is missing"),
+        ("reflectance,x,y,radius\nhalf,1,2,3\n", "target 1: not numbers"),
+        ("reflectance,x,y,radius\n20,1,2,3\n", "must lie in 0 to 1.5"),
+        ("reflectance,x,y,radius,incidence\n0.2,1,2,3,89\n", "incidence must lie in 0 to 85"),
+        ("reflectance,vertices\n0.2,1 2 3\n", "target 1: not numbers"),
+        ('{"features": 3}', "not GeoJSON"),
+        ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "is a Point"),
+        ("{", "not GeoJSON"),
+    ],
+)
+def test_wrong_targets_are_one_line(tmp_path, text, message):
+    path = tmp_path / "t.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_targets(path)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+
+
+def test_normals_are_not_bent_by_outliers():
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(0, 10, (300, 2))
+    z = 0.5 * xy[:, 0] + 0.01 * rng.standard_normal(300)
+    z[:30] += 3.0
+    normal = fit_normal(np.column_stack([xy, z]))
+    assert abs(normal @ np.array([-0.5, 0, 1]) / np.sqrt(1.25)) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    """Flat ground whose echoes all are of one target."""
+    path = tmp_path_factory.mktemp("ground") / "flat.las"
+    simulate_strip("flat", path, pulses=6000, seed=8)
+    return path
+
+
+def test_targets_get_their_reflectance_back(tmp_path, ground):
+    cloud = laspy.read(ground)
+    x, y = float(np.median(cloud.x)), float(np.median(cloud.y))
+    targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
+    targets.write_text(f"name,reflectance,x,y,radius\nnear,0.2,{x},{y},40\nnowhere,0.5,{x + 1e5},{y},40\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
+    assert done.exit_code == 0, done.output
+    assert "nowhere: reflectance 0.5, 0 echoes, too few, left out" in done.stderr and "note: " not in done.stderr
+    found = load_calibration(cal)
+    assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
+    assert found.strip == "flat.las" and "direction vectors" in found.conditions
+    done = call("run", ground, "-o", folder, "--profile", "balanced", "--calibration", cal)
+    assert done.exit_code == 0, done.output
+    cloud = laspy.read(next(folder.glob("*.laz")))
+    inside = np.hypot(cloud.x - x, cloud.y - y) < 40
+    rho = np.asarray(cloud["reflectance"])[inside]
+    assert np.median(rho[rho != -9999]) == pytest.approx(0.2, rel=0.03)
+    done = call("calibrate", ground, "--targets", targets, "-o", cal)
+    assert done.exit_code == 1 and "exists" in done.stderr
+    targets.write_text(f"reflectance,x,y,radius\n0.2,{x},{y + 30},20\n0.5,{x},{y - 30},20\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "two.toml")
+    assert done.exit_code == 0 and "note: constants of the targets differ by a factor of 2." in done.stderr
+
+
+def test_targets_off_the_strip(tmp_path, ground):
+    targets = tmp_path / "t.csv"
+    targets.write_text(f"reflectance,x,y,radius\n0.2,{EAST + 9e5},{NORTH},40\n")
+    done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1
+    assert "no target has 10 clean single echoes (target 1: 0 echoes)" in done.stderr
+    assert not (tmp_path / "cal.toml").exists()
+
+
+def test_a_lever_arm_leads_from_the_trajectory_to_the_scanner(tmp_path, ground):
+    flight = Flight()
+    seconds = np.arange(-1.0, 2.0, 0.05)
+    rays = trace_rays(flight, "flat", seconds * flight.pulse_rate)
+    sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
+    # Heading east, the trajectory's antenna is 30 m above the scanner and 2 m behind it.
+    antenna = sensor + [-2.0, 0.0, 30.0]
+    rows = np.column_stack([START_TIME + seconds, antenna, np.tile([0.0, 0.0, 90.0], (len(seconds), 1))])
+    text = "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows)
+    (tmp_path / "t.csv").write_text("time,x,y,z,roll,pitch,heading\n" + text)
+    cloud = laspy.read(ground)
+    target = f"reflectance,x,y,radius\n0.2,{np.median(cloud.x)},{np.median(cloud.y)},40\n"
+    (tmp_path / "g.csv").write_text(target)
+    constants = []
+    for number, options in enumerate([(), ("--trajectory", tmp_path / "t.csv"), ("--lever-arm", "2,0,30")]):
+        cal = tmp_path / f"{number}.toml"
+        options = ("--trajectory", tmp_path / "t.csv", *options) if number == 2 else options
+        done = call("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", cal, *options)
+        assert done.exit_code == 0, done.output
+        constants.append(load_calibration(cal).constant)
+    vectors, antenna, scanner = constants
+    assert scanner == pytest.approx(vectors, rel=1e-4)
+    assert antenna < 0.95 * vectors
+    done = call("calibrate", ground, "--targets", tmp_path / "g.csv", "-o", tmp_path / "x.toml", "--lever-arm", "1,2,3")
+    assert done.exit_code == 2 and "--lever-arm is of no use without --trajectory" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def two_channels(tmp_path_factory, edit_points):
+    """A village whose every third pulse was recorded by a second digitizer, with half the gain."""
+    folder = tmp_path_factory.mktemp("channels")
+    path, copy = folder / "one.las", folder / "two.las"
+    scene = find_scene("village")
+    open_writer = strip._open_writer
+
+    def open_with_two(target, scene, options, overwrite):
+        both = [scene.recording.digitizer, replace(scene.recording.digitizer, index=2)]
+        return FullwaveWriter(target, version="1.3", point_format=4, internal=True, digitizers=both,
+                              scales=(0.001,) * 3, offsets=(EAST, NORTH, 0.0), overwrite=overwrite)  # fmt: skip
+
+    strip._open_writer = open_with_two
+    try:
+        strip.simulate_strip(scene, path, pulses=9000, seed=5)
+    finally:
+        strip._open_writer = open_writer
+    with StripReader(path) as reader:
+        base = reader.facts.packet_base
+    length = scene.recording.n_samples
+    weak: set[int] = set()
+
+    def change(points):
+        second = (points["wavepacket_offset"] // length % 3 == 0) & (points["wavepacket_index"] > 0)
+        points["wavepacket_index"][second] = 2
+        weak.update(points["wavepacket_offset"][second].tolist())
+        return points
+
+    edit_points(path, copy, change)
+    content = bytearray(copy.read_bytes())
+    for offset in weak:
+        samples = np.frombuffer(content[base + offset : base + offset + length], np.uint8).astype(float)
+        content[base + offset : base + offset + length] = np.rint(12 + (samples - 12) / 2).astype(np.uint8).tobytes()
+    copy.write_bytes(content)
+    return copy
+
+
+def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_channels):
+    cloud = laspy.read(two_channels)
+    x, y = float(np.median(cloud.x)), NORTH
+    targets, cal, folder = tmp_path / "t.csv", tmp_path / "cal.toml", tmp_path / "out"
+    ground = f"{GROUND_REFLECTS},{x - 60} {y + 0.2} {x + 60} {y + 0.2} {x + 60} {y + 5.8} {x - 60} {y + 5.8}"
+    targets.write_text(f"reflectance,vertices\n{ground}\n")
+    done = call("calibrate", two_channels, "--targets", targets, "-o", cal)
+    assert done.exit_code == 0, done.output
+    assert "digitizer 1, scanner channel 0:" in done.stderr and "digitizer 2, scanner" in done.stderr
+    found = load_calibration(cal)
+    strong, weak = found.channels
+    assert (strong["digitizer"], weak["digitizer"]) == (1, 2)
+    true = 4 / find_scene("village").light
+    assert strong["constant"] == pytest.approx(true, rel=0.01)
+    assert weak["constant"] == pytest.approx(2 * true, rel=0.02)
+    assert 0 < strong["spread"] < 0.05 and strong["echoes"] > weak["echoes"] >= 10
+    assert found.relative_error > 0.2
+    assert parse_calibration(format_calibration(found), "cal").channels == found.channels
+    assert found.describe()["channels"] == [strong, weak]
+    assert call("run", two_channels, "-o", folder, "--profile", "fast", "--calibration", cal).exit_code == 0
+    cloud = laspy.read(next(folder.glob("*.laz")))
+    rho, index = np.asarray(cloud["reflectance"]), np.asarray(cloud.z) < GROUND + 0.5
+    assert np.median(rho[index & (rho != -9999)]) == pytest.approx(GROUND_REFLECTS, rel=0.02)
+    level = rho[index & (rho != -9999)]
+    assert MAD_TO_STD * np.median(np.abs(level / GROUND_REFLECTS - 1)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("digitizer = 1.5\nconstant = 1e-8\nrelative_error = 0.1", "digitizer must be a whole number"),
+        ("digitizer = 1\nscanner = 4\nconstant = 1e-8\nrelative_error = 0.1", "scanner must lie between 0 and 3"),
+        ("digitizer = 0\nconstant = 1e-8\nrelative_error = 0.1", "must lie between 1 and 255"),
+        ("digitizer = 1\nrelative_error = 0.1", "key 'constant' is missing"),
+        ("digitizer = 1\nconstant = 1e-8\nerror = 0.1", "unknown key 'error'"),
+        ("digitizer = 1\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\ndigitizer = 1\nconstant = 1e-8\n"
+         "relative_error = 0.1", "2: digitizer 1 with scanner channel 0 is there already"),
+    ],
+)  # fmt: skip
+def test_wrong_channels_are_one_line(table, message):
+    text = f'schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n[[channel]]\n{table}\n'
+    with pytest.raises(ConfigError, match=message) as caught:
+        parse_calibration(text, "cal")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,156 @@
+"""The whole way on a simulated village: targets, calibration, run; angles, cross sections and reflectances recovered,
+each with an error that holds."""
+
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from helpers_scenes import make_scene
+
+from wavebatch.cli import main
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.flat_ground import measure_level
+from wavebatch.tools.simulate import find_scene, simulate_strip
+from wavebatch.tools.simulate.blocks import simulate_seed_block
+from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays
+from wavebatch.tools.simulate.scenes import GROUND_REFLECTS, ROOFS_REFLECT
+
+SCENE = find_scene("village")
+
+
+def call(*arguments):
+    done = CliRunner().invoke(main, list(map(str, arguments)))
+    assert done.exit_code == 0, done.output
+    return done
+
+
+def write_targets(path, strip):
+    """Level ground between two rows of houses."""
+    x = float(np.median(laspy.read(strip).x))
+    corners = f"{x - 80} {NORTH + 0.2} {x + 80} {NORTH + 0.2} {x + 80} {NORTH + 5.8} {x - 80} {NORTH + 5.8}"
+    path.write_text(f"reflectance,vertices\n{GROUND_REFLECTS},{corners}\n")
+    return path
+
+
+def write_trajectory(path, stop):
+    time = START_TIME + np.arange(-1.0, stop + 1.0, 0.05)
+    rays = trace_rays(SCENE.flight, "flat", (time - START_TIME) * SCENE.flight.pulse_rate)
+    sensor = rays.ground - rays.direction / AIR_SPEED * rays.distance[:, None]
+    rows = np.column_stack([time, sensor])
+    path.write_text("time,x,y,z\n" + "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows))
+    return path
+
+
+def fly(folder, seed, pulses):
+    """Cloud and truth of echoes alone in their packet, by columns; the cloud's folder has the calibration beside."""
+    strip, truth = folder / f"v{seed}.las", folder / f"v{seed}.npz"
+    simulate_strip("village", strip, pulses=pulses, seed=seed, truth=truth)
+    targets, cal = write_targets(folder / "t.csv", strip), folder / f"cal{seed}.toml"
+    call("calibrate", strip, "--targets", targets, "-o", cal, "--divergence", SCENE.divergence)
+    call("run", strip, "-o", folder / "out", "--profile", "balanced", "--calibration", cal, "-q")
+    return match(folder / "out" / f"v{seed}.laz", truth)
+
+
+def match(cloud, truth):
+    cloud, true = laspy.read(cloud), np.load(truth, allow_pickle=False)
+    times, first = np.unique(true["gps_time"], return_index=True)
+    at = np.minimum(np.searchsorted(times, cloud.gps_time), len(times) - 1)
+    alone = (times[at] == cloud.gps_time) & (np.asarray(cloud.number_of_returns) == 1)
+    found = {name: np.asarray(cloud[name], np.float64)[alone] for name in cloud.point_format.extra_dimension_names}
+    found = {name: np.where(values == -9999, np.nan, values) for name, values in found.items()}
+    rows = first[at[alone]]
+    return found, {name: true[name][rows].astype(np.float64) for name in ("incidence_angle", "range", "z")}
+
+
+def check_angles(found, true, coverage):
+    known = np.isfinite(found["incidence_angle"])
+    assert known.mean() > 0.85
+    off = np.abs(found["incidence_angle"] - true["incidence_angle"])[known]
+    error = found["incidence_angle_err"][known]
+    assert np.mean(off <= error) == pytest.approx(0.683, abs=coverage)
+    assert np.median(off / error) == pytest.approx(0.6745, rel=0.2)
+    return off, error, true["incidence_angle"][known]
+
+
+def check_light(found, true):
+    roof = true["z"] > GROUND + 1
+    reflectance = np.where(roof, ROOFS_REFLECT, GROUND_REFLECTS)
+    facing = np.cos(np.radians(true["incidence_angle"]))
+    section = 4 * reflectance * facing * np.pi / 4 * (1e-3 * SCENE.divergence * true["range"]) ** 2
+    for rows in (roof, ~roof):
+        assert np.nanmedian((found["cross_section"] / section)[rows]) == pytest.approx(1.0, abs=0.03)
+    level = found["reflectance"][~roof] / GROUND_REFLECTS
+    assert np.nanmedian(level) == pytest.approx(1.0, abs=0.03)
+    assert 1.4826 * np.nanmedian(np.abs(level - 1)) < 0.03
+
+
+@pytest.fixture(scope="module")
+def village(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("village")
+    return folder, *fly(folder, 1, 9000)
+
+
+def test_angles_of_the_village_hold(village):
+    check_angles(*village[1:], coverage=0.05)
+
+
+def test_cross_sections_and_reflectances_are_recovered(village):
+    check_light(*village[1:])
+
+
+def test_a_trajectory_changes_cross_sections_by_a_fifth_of_a_percent_at_most(village):
+    folder, _, _ = village
+    given = write_trajectory(folder / "t.txt", 0.1)
+    call("run", folder / "v1.las", "-o", folder / "given", "--profile", "balanced", "--calibration",
+         folder / "cal1.toml", "--trajectory", given, "-q")  # fmt: skip
+    a, b = (laspy.read(folder / name / "v1.laz")["cross_section"] for name in ("out", "given"))
+    known = np.asarray((a != -9999) & (b != -9999))
+    assert known.mean() > 0.9
+    assert np.abs(np.asarray(b / a)[known] - 1).max() < 0.002
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_every_bin_of_angles_holds_on_longer_strips(tmp_path, seed):
+    found, true = fly(tmp_path, seed, 40_000)
+    check_light(found, true)
+    off, error, angle = check_angles(found, true, coverage=0.04)
+    for low in range(0, 60, 10):
+        inside = (angle >= low) & (angle < low + 10)
+        assert inside.sum() > 300
+        assert np.mean(off[inside] <= error[inside]) == pytest.approx(0.683, abs=0.08), low
+
+
+@pytest.mark.parametrize("half_angle", [10.0, 25.0])
+def test_level_ground_is_told_from_the_swath(half_angle):
+    """The survey's pulse holds the rays' own slopes; what is left without them is the true pulse."""
+    made = simulate_seed_block(replace(SCENE, flight=Flight(640.0, half_angle=half_angle, look_ahead=0.0)), 6, 0)
+    back = made.rays.direction / AIR_SPEED * made.rays.distance[:, None]
+    block = replace(made.block, sensor=made.rays.ground - back)
+    surveyed = replace(survey_block(block).system, divergence=SCENE.divergence)
+    true = SCENE.recording.pulse.sigma
+    assert surveyed.sigma_ref / true > 1.005
+    seen = measure_level([block], surveyed, block.spacing)
+    assert np.sqrt(seen.sigma_ref**2 + seen.level_variance) == pytest.approx(true, rel=0.002)
+    assert seen.width_scatter < 0.01 * true
+
+
+def test_level_ground_that_nobody_sees_changes_nothing():
+    block = simulate_seed_block(make_scene("empty"), 1, 0).block
+    system = SystemPulse(2.0, divergence=0.5)
+    assert measure_level([block], system, 1.0) is system
+    blind = replace(system, divergence=None)
+    assert measure_level([replace(block, sensor=block.origin)], blind, 1.0) is blind
+    assert measure_level([], system, 1.0) is system
+
+
+def test_survey_says_what_angles_the_beam_tells(village):
+    strip = village[0] / "v1.las"
+    wide = call("survey", strip, "--divergence", "1.1", "-o", village[0] / "s.toml").stdout
+    assert "needed    incidence angle" in wide and "a beam of 1.1 mrad on a slope of 30 degrees" in wide
+    assert "divergence_mrad = 1.1" in (village[0] / "s.toml").read_text()
+    narrow = call("survey", strip, "--divergence", "0.05").stdout
+    assert "left out  incidence angle" in narrow

@@ -1,0 +1,310 @@
+"""The benchmark command on small numbers: what its documents hold, its processes, peers, scenes and stiff cases."""
+
+import json
+import os
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, InputError, StageError
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying import Survey
+from wavebatch.tools.bench import command, peers, report
+from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
+from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.hazards import CASES, make_scene
+from wavebatch.tools.bench.report import format_document
+from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
+from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures, list_cases
+from wavebatch.tools.bench.worker import Worker, WorkerDied, peak_memory
+from wavebatch.tools.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
+
+SMALL = BenchOptions(
+    scenes=("flat",),
+    waveforms=1600,
+    repeats=1,
+    pulses=400,
+    peer_waveforms=60,
+    stability_waveforms=90,
+    hazards=("H10",),
+    tolerance_cm=50.0,
+)
+
+
+@pytest.fixture(scope="module")
+def document():
+    """A small benchmark with everything in it."""
+    return run_bench(SMALL)
+
+
+def find_row(document, name):
+    return next(row for row in document["scenes"][0]["rows"] if row["name"] == name)
+
+
+def test_document_has_a_row_per_chain_and_peer(document):
+    assert document["schema"] == command.SCHEMA
+    names = [row["name"] for row in document["scenes"][0]["rows"]]
+    assert names[:4] == ["fast", "balanced", "accurate", "auto"] and "scipy leastsq" in names
+    for row in document["scenes"][0]["rows"]:
+        assert row["kernels"]["median"] > 0
+        figures = row["figures"]
+        assert figures["completeness"]["value"] > 0.95 and 0 < figures["completeness"]["error"] < 0.1
+        assert figures["time_ratio_overlapped"] == {"value": None, "error": None}
+        if row["kind"] == "chain":
+            assert row["file"]["repeats"] == 1 and row["survey_seconds"]["median"] > 0
+            assert 2e7 < row["peak_bytes"] < 5e8
+    assert {row["kind"] for row in document["scenes"][0]["rows"] if row["pareto"]} == {"chain"}
+    assert document["scenes"][0]["cheapest"] in names
+
+
+def test_isolated_echoes_are_at_the_bound(document):
+    figures = find_row(document, "accurate")["figures"]
+    for name in ("time", "amplitude", "sigma"):
+        ratio = figures[f"{name}_ratio_isolated"]
+        assert abs(ratio["value"] - 1) < 3 * ratio["error"] + 0.05
+
+
+def test_document_is_plain_json_and_its_tables_show_all(document):
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    text = format_document(document)
+    for row in document["scenes"][0]["rows"]:
+        assert f"\n{row['name']}" in text
+    assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
+    assert f"{100 * find_row(document, 'fast')['figures']['exact_count']['value']:.2f} +-" in text
+
+
+def test_stiff_cases_count_failures_by_kind(document):
+    cases = document["stability"]
+    assert {row["case"] for row in cases} == {"constant 0, 12 or 255", "noise only"}
+    assert any(row["is_auto"] for row in cases)
+    for row in cases:
+        assert row["failures"] == dict.fromkeys(FAILURES, 0) and row["waveforms"] == 90
+        for name in ("completeness", "correctness", "wrong"):
+            assert row["figures"][name]["value"] is None
+        assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
+
+
+def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(timed_here):
+    small = replace(SMALL, peers=False, stability=False, pulses=0, waveforms=1200)
+    rows = [run_bench(replace(small, seed=seed))["scenes"][0]["rows"] for seed in (5, 5, 6)]
+    for first, again, other in zip(*rows, strict=True):
+        assert first["figures"] == again["figures"] != other["figures"]
+        for name, figure in first["figures"].items():
+            if figure["value"] is not None:
+                assert abs(figure["value"] - other["figures"][name]["value"]) <= 3 * figure["error"], name
+
+
+def test_nothing_to_measure():
+    with pytest.raises(ConfigError, match="--scene"):
+        run_bench(BenchOptions())
+    with pytest.raises(ConfigError, match="forest"):
+        run_bench(BenchOptions(scenes=("forrest",)))
+    with pytest.raises(ConfigError, match="H14"):
+        list_cases(["H14"])
+
+
+def test_command_writes_what_it_prints(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "can_plot", lambda: False)
+    options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability --json"
+    chain = tmp_path / "mine.toml"
+    chain.write_text(
+        "".join(f'[[chain]]\nstage = "{s}"\n' for s in ("noise.pooled", "detect.maximum", "decompose.none"))
+    )
+    result = CliRunner().invoke(main, ["bench", str(chain), "-o", str(tmp_path / "out"), *options.split()])
+    assert result.exit_code == 0, result.output
+    document = json.loads((tmp_path / "out" / "bench.json").read_text())
+    assert json.loads(result.stdout) == document
+    mine = find_row(document, "mine")
+    assert mine["figures"]["time_calibration_isolated"]["value"] is None and mine["file"]["median"] is None
+    assert "wavebatch[plot]" in result.stderr
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["bench.json", "bench.txt"]
+    assert "accurate" in (tmp_path / "out" / "bench.txt").read_text()
+
+
+def test_plot_is_written_where_matplotlib_is(tmp_path, document):
+    pytest.importorskip("matplotlib")
+    lines = report.write_outputs(document, "text", tmp_path)
+    assert lines == [f"{tmp_path}: bench.json, bench.txt, bench-flat.png"]
+    assert (tmp_path / "bench-flat.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a.las", "b.las"], "one strip at a time"),
+        (["--waveforms", "0"], "--waveforms': 0 is not in the range"),
+        (["--tolerance", "2"], "no length"),
+        (["missing.toml"], "cannot be read"),
+        (["--hazard", "H99"], "H99"),
+    ],
+)
+def test_wrong_usage(words, message):
+    result = CliRunner().invoke(main, ["bench", *words])
+    assert result.exit_code == 2 and message in result.stderr
+
+
+def test_strip_that_is_none(tmp_path):
+    result = CliRunner().invoke(main, ["bench", str(tmp_path / "none.las")])
+    assert result.exit_code == 1 and "none.las" in result.stderr
+
+
+def test_scene_is_shaped_like_the_strip(tmp_path):
+    recording = Recording(noise_std=1.6, baseline=30.0, bits=16, n_samples=64)
+    scene = replace(find_bench_scene("open"), recording=recording)
+    simulate_strip(scene, tmp_path / "a.las", pulses=3000, seed=1)
+    like = shape_scene(tmp_path / "a.las", load_profile("accurate"))
+    shaped = like.recording
+    assert (shaped.bits, shaped.n_samples, shaped.rho) == (16, 64, 0.0)
+    assert shaped.noise_std == pytest.approx(1.6, rel=0.05) and shaped.baseline == pytest.approx(30, abs=0.1)
+    assert shaped.pulse.sigma == pytest.approx(2.0, rel=0.06)
+    _, truth = simulate_block(scene, 4000, np.random.default_rng(1))
+    _, drawn = simulate_block(like, 4000, np.random.default_rng(2))
+    shares = [np.bincount(table.count(4000), minlength=8)[:8] / 4000 for table in (truth, drawn)]
+    assert np.abs(shares[0] - shares[1]).max() < 0.05
+    strong = [np.median(table.amplitude[table.amplitude > 15]) for table in (truth, drawn)]
+    assert strong[1] == pytest.approx(strong[0], rel=0.15)
+    again = simulate_block(like, 4000, np.random.default_rng(2))[1]
+    assert np.array_equal(drawn.time, again.time)
+
+
+def test_strip_too_short_to_resample(tmp_path):
+    simulate_strip("flat", tmp_path / "short.las", pulses=50)
+    with pytest.raises(InputError, match="too few"):
+        shape_scene(tmp_path / "short.las", load_profile("fast"))
+
+
+def test_groups_differ_and_are_surveyed():
+    groups = make_groups(find_bench_scene("flat"), 1600, 3)
+    assert [len(group.block) for group in groups] == [200] * 8
+    assert not np.array_equal(groups[0].block.samples, groups[1].block.samples)
+    assert all(group.system.sigma_ref == pytest.approx(2.0, rel=0.05) for group in groups)
+
+
+def known_group(n=300) -> Group:
+    scene = find_bench_scene("flat")
+    ((block, truth),) = simulate_blocks(scene, n, seed=2, size=n)
+    return make_group(scene, 0, block, truth, Survey(SystemPulse(2.0, noise_std=1.04), n, {}, ()))
+
+
+def test_tally_of_perfect_echoes_and_of_none():
+    group, perfect, empty = known_group(), Tally(), Tally()
+    perfect.add(group, group.truth)
+    empty.add(group, EchoTable.empty())
+    figures = perfect.figures()
+    assert figures["completeness"].value == figures["correctness"].value == figures["exact_count"].value == 1
+    assert figures["wrong"].value == figures["rmse_all_cm"].value == figures["false_splits"].value == 0
+    lost = empty.figures()
+    assert lost["completeness"].value == 0 and lost["wrong"].value == 1 and np.isnan(lost["rmse_all_cm"].value)
+
+
+def test_tally_measures_what_was_put_in():
+    group, tally = known_group(), Tally()
+    tally.add(group, replace(group.truth, time=group.truth.time + 2 * group.bounds[:, 0]))
+    figures = tally.figures()
+    assert figures["time_ratio_isolated"].value == pytest.approx(2, rel=1e-6)
+    assert figures["gross_isolated"].value == 0
+    gross = Tally()
+    gross.add(group, replace(group.truth, time=group.truth.time + 20 * group.bounds[:, 0]))
+    assert gross.figures()["gross_isolated"].value == 1
+
+
+def make_found(**columns) -> EchoTable:
+    good = {"waveform": [0, 0, 1], "time": [5.0, 9.0, 7.0], "amplitude": [9.0, 8.0, 7.0], "sigma": [2.0, 2.0, 2.0]}
+    given = {name: np.array(values) for name, values in {**good, **columns}.items()}
+    table = EchoTable.build(**{name: np.array(values) for name, values in good.items()})
+    return replace(table, **{name: given[name].astype(getattr(table, name).dtype) for name in columns})
+
+
+@pytest.mark.parametrize(
+    ("columns", "kind"),
+    [
+        ({"amplitude": [9.0, np.nan, 7.0]}, "not_finite"),
+        ({"sigma": [2.0, 1.3, 2.0]}, "too_narrow"),
+        ({"amplitude": [9.0, 0.0, 7.0]}, "negative"),
+        ({"time": [9.0, 5.0, 7.0]}, "unsorted"),
+        ({}, None),
+    ],
+)
+def test_every_failure_is_counted(columns, kind):
+    counted = count_failures(make_found(**columns), SystemPulse(2.0))
+    assert counted == {name: int(name == kind) for name in counted}
+
+
+def test_dependence_on_the_block_is_counted():
+    group = known_group(40)
+
+    def run(block, system):
+        time = np.full(len(block), float(len(block)))
+        return EchoTable.build(np.arange(len(block)), time, *np.ones((2, len(block))))
+
+    steady = load_profile("fast")
+    assert count_changes(steady, group, steady.run(group.block, group.system)) == 0
+    fickle = SimpleNamespace(run=run)
+    assert count_changes(fickle, group, fickle.run(group.block, None)) == 40
+
+
+def test_cases_are_what_they_say():
+    hazards = {case.hazard for case in CASES}
+    assert hazards == {"H1", "H2", "H3", "H4", "H5", "H6", "H7", "H8", "H9", "H10", "H11", "H12", "H16"}
+    assert len({(case.hazard, case.name) for case in CASES}) == len(CASES)
+    for case in CASES:
+        block, truth = simulate_block(make_scene(case), 20, np.random.default_rng(1))
+        assert len(block) == 20 and np.isfinite(truth.time).all()
+    pair = next(case for case in CASES if case.name.startswith("pair 1.5 s"))
+    _, truth = simulate_block(make_scene(pair), 20, np.random.default_rng(1))
+    assert np.diff(truth.time.reshape(20, 2), axis=1) == pytest.approx(3.0)
+    assert {case.hazard for case in list_cases(["H6", "H7"])} == {"H6", "H7"}
+
+
+def test_worker_answers_raises_and_dies():
+    with Worker() as worker:
+        assert worker.call(os.getenv, "OPENBLAS_NUM_THREADS") == "1"
+        assert worker.call(os.getpid) != os.getpid()
+        with pytest.raises(StageError, match="FileNotFoundError"):
+            worker.call(os.stat, "/no/such/file")
+        memory = worker.call(peak_memory)
+        assert memory is None or 5e6 < memory < 1e9
+        worker.submit(time.sleep, 60)
+        with pytest.raises(TimeoutError):
+            worker.take(0.05)
+    with Worker() as worker:
+        worker.submit(os._exit, 3)
+        with pytest.raises(WorkerDied):
+            worker.take(30)
+
+
+FAKE = """
+import os, time
+import numpy as np
+
+def GaussianDecomposition(y, thres):
+    if y.max() > 900:
+        os._exit(1)
+    if y.max() > 800:
+        time.sleep(60)
+    return np.array([y.max() * 2 * np.sqrt(2 * np.pi), float(np.argmax(y)), 2.0])
+"""
+
+
+def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
+    (tmp_path / "gdecomp.py").write_text(FAKE)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(peers, "PATIENCE", 1.5)
+    scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
+    ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
+    samples = block.samples.copy()
+    samples[7, 40], samples[20, 40] = 950, 850
+    result = peers.run_peer("gdecomp", replace(block, samples=samples), SystemPulse(2.0, baseline=12.0, noise_std=1.04))
+    assert result.failures == 2 and result.waveforms == 38
+    assert sorted(set(range(40)) - set(result.found.waveform.tolist())) == [7, 20]
+    group = make_group(scene, 0, block, truth, Survey(SystemPulse(2.0), 40, {}, ()))
+    tally = Tally()
+    tally.add(group, result.found)
+    assert tally.figures()["completeness"].value == pytest.approx(38 / 40)

@@ -1,0 +1,374 @@
+"""Clouds against clouds and truth: pairs, shares and differences that are known by construction."""
+
+import tracemalloc
+
+import laspy
+import numpy as np
+import pytest
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.disk import buckets
+from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.tools.compare import pairing
+from wavebatch.tools.compare.clouds import compare_clouds, compare_truth
+from wavebatch.tools.compare.differences import SPEED, Differences, measure_lag
+from wavebatch.tools.simulate import StripOptions, TruthReader, simulate_strip
+
+
+def write_cloud(path, gps_time, xyz, *, scale=1e-4, point_format=6, names=None, **columns):
+    """A plain cloud with float extra bytes, NaN for no data, and echo_flags where given."""
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales, header.offsets = np.full(3, scale), np.array([500_000.0, 5_400_000.0, 0.0])
+    for name, values in columns.items():
+        header.add_extra_dim(laspy.ExtraBytesParams((names or {}).get(name, name), np.asarray(values).dtype))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = xyz.T
+    if gps_time is not None:
+        cloud.gps_time = gps_time
+    for name, values in columns.items():
+        cloud[(names or {}).get(name, name)] = values
+    cloud.write(path)
+
+
+def make_pulses(n=300, seed=0):
+    """Pulses with 1 to 3 echoes 2 m and more apart along slanted rays: times, positions, unit vectors."""
+    rng = np.random.default_rng(seed)
+    count = rng.integers(1, 4, n)
+    pulse = np.repeat(np.arange(n), count)
+    ray = np.stack([rng.uniform(-0.3, 0.3, n), rng.uniform(-0.3, 0.3, n), -np.ones(n)], axis=1)
+    ray /= np.linalg.norm(ray, axis=1)[:, None]
+    place = np.arange(len(pulse)) - np.repeat(np.cumsum(count) - count, count)
+    start = np.array([500_100.0, 5_400_100.0, 150.0]) + np.stack([np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
+    along = 2.5 * place + rng.uniform(0, 0.4, len(pulse))
+    return pulse, 3e8 + 1e-5 * pulse, start[pulse] + along[:, None] * ray[pulse], ray[pulse]
+
+
+def test_a_cloud_equals_itself_in_any_order(tmp_path):
+    pulse, times, xyz, _ = make_pulses()
+    order = np.random.default_rng(1).permutation(len(times))
+    write_cloud(tmp_path / "a.las", times, xyz, amplitude=np.arange(len(times), dtype="f4"))
+    write_cloud(tmp_path / "b.las", times[order], xyz[order], amplitude=np.arange(len(times), dtype="f4")[order])
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.matched_by == "gps_time"
+    assert (result.missed, result.extra) == (0, 0)
+    assert result.completeness == result.correctness == result.exact_count == 1
+    assert result.pulses == 300
+    assert result.counts_a == result.counts_b == dict(enumerate(np.bincount(np.bincount(pulse)).tolist()[1:], 1))
+    assert result.differences["time"].rms == 0
+    assert result.differences["amplitude"].rms == 0
+    assert "echo_width" not in result.differences
+
+
+def test_many_points_without_a_time_are_matched_in_bounded_memory(tmp_path, monkeypatch):
+    _, times, xyz, _ = make_pulses(2000)
+    rng = np.random.default_rng(2)
+    loose = xyz[0] + rng.uniform(0, [2000, 2000, 0.01], (20_000, 3))
+    every, place = np.append(times, np.zeros(20_000)), np.concatenate([xyz, loose])
+    write_cloud(tmp_path / "a.las", every, place)
+    write_cloud(tmp_path / "b.las", every[:-500], place[:-500])
+    tracemalloc.start()
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
+    assert result.matched_by == "gps_time" and (result.missed, result.extra) == (0, 500)
+    monkeypatch.setattr(pairing, "MOST_PAIRS", 15_000)
+    with pytest.raises(InputError, match="without a time of their own"):
+        compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+
+
+@pytest.mark.parametrize("rows", [400_000, 100])
+def test_time_zero_is_one_pulse_whatever_its_sign(tmp_path, monkeypatch, rows):
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", rows)
+    _, times, xyz, _ = make_pulses()
+    times -= times[0]
+    write_cloud(tmp_path / "a.las", times, xyz)
+    write_cloud(tmp_path / "b.las", np.where(times == 0, -0.0, times), xyz)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.matched_by == "gps_time" and result.missed == result.extra == 0
+
+
+def test_shifts_along_the_ray_are_measured_with_their_sign(tmp_path):
+    _, times, xyz, ray = make_pulses()
+    rng = np.random.default_rng(2)
+    lag = 0.25 + 0.05 * rng.standard_normal(len(times))
+    moved = xyz + (lag * SPEED)[:, None] * ray
+    width = np.full(len(times), 4.0, "f4")
+    write_cloud(tmp_path / "a.las", times, moved, echo_width=width + np.float32(0.5))
+    write_cloud(tmp_path / "b.las", times, xyz, echo_width=width)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    spread = result.differences["time"]
+    assert spread.median == pytest.approx(np.median(lag), abs=1e-3)
+    assert spread.mean == pytest.approx(lag.mean(), abs=1e-3)
+    assert spread.rms == pytest.approx(np.sqrt((lag**2).mean()), abs=1e-3)
+    assert spread.nmad == pytest.approx(1.4826 * np.median(np.abs(lag - np.median(lag))), abs=2e-3)
+    assert result.differences["echo_width"].median == pytest.approx(0.5)
+    back = compare_clouds(tmp_path / "b.las", tmp_path / "a.las")
+    assert back.differences["time"].median == pytest.approx(-spread.median)
+
+
+def test_missed_extra_and_far_echoes_are_counted(tmp_path):
+    _, times, xyz, ray = make_pulses()
+    far = xyz.copy()
+    far[:40] += 1.2 * SPEED * ray[:40]
+    write_cloud(tmp_path / "a.las", times[:-30], far[:-30])
+    write_cloud(tmp_path / "b.las", times, xyz)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.matched == len(times) - 70
+    assert (result.missed, result.extra) == (70, 40)
+    wide = compare_clouds(tmp_path / "a.las", tmp_path / "b.las", tolerance_ns=1.3)
+    assert (wide.missed, wide.extra) == (30, 0)
+    assert wide.exact_count < 1
+
+
+def test_points_passed_through_are_no_echoes(tmp_path):
+    _, times, xyz, _ = make_pulses()
+    flags = np.zeros(len(times), "u2")
+    flags[:3] = [EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET | EchoFlag.WEAK, EchoFlag.NO_ECHO]
+    flags[3] = EchoFlag.WEAK
+    write_cloud(tmp_path / "a.las", times, xyz, echo_flags=flags)
+    write_cloud(tmp_path / "b.las", times, xyz)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.echoes_a == len(times) - 3
+    assert result.missed == 3
+
+
+@pytest.mark.parametrize("times_are", ["missing", "zero", "of another day"])
+def test_without_useful_times_nearest_neighbours_are_matched(tmp_path, times_are, monkeypatch):
+    _, times, xyz, ray = make_pulses(3000)
+    given = {"missing": None, "zero": np.zeros(len(times)), "of another day": times + 86400}[times_are]
+    form = 0 if times_are == "missing" else 6
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 1500)
+    write_cloud(tmp_path / "a.las", given, xyz + 0.3 * SPEED * ray, point_format=form)
+    write_cloud(tmp_path / "b.las", times[:-20], xyz[:-20])
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert result.matched_by == "position"
+    # Rays cross here and there: a handful of points have a stranger as their nearest neighbour.
+    assert len(times) - 20 >= result.matched > len(times) - 25
+    assert (result.echoes_a, result.echoes_b) == (len(times), len(times) - 20)
+    assert result.differences["time"].median == pytest.approx(0.3, abs=1e-3)
+    assert result.pulses == 0
+    assert np.isnan(result.exact_count)
+
+
+@pytest.mark.parametrize("by", ["time", "place"])
+def test_buckets_do_not_change_the_result(tmp_path, monkeypatch, by):
+    _, times, xyz, ray = make_pulses(4000)
+    rng = np.random.default_rng(3)
+    keep = rng.random(len(times)) < 0.9
+    times = times if by == "time" else np.zeros(len(times))
+    jitter = 0.4 * rng.standard_normal(len(times))
+    write_cloud(tmp_path / "a.las", times, xyz + (jitter * SPEED)[:, None] * ray)
+    write_cloud(tmp_path / "b.las", times[keep], xyz[keep])
+    whole = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 700)
+    parts = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert parts.differences["time"].rms == pytest.approx(whole.differences["time"].rms)
+    assert parts.differences["time"].median == pytest.approx(whole.differences["time"].median)
+    for name in ("matched", "missed", "extra", "echoes_a", "echoes_b", "pulses", "counts_a", "counts_b"):
+        assert getattr(parts, name) == getattr(whole, name), name
+    assert whole.matched > 0.8 * len(times)
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    """A strip, its truth, and a cloud made of the truth with errors at the bound, all reported rightly."""
+    folder = tmp_path_factory.mktemp("strip")
+    options = StripOptions(point_format=9, without_waveform=0.02)
+    simulate_strip("mixed", folder / "s.laz", pulses=4000, seed=3, truth=folder / "t.npz", options=options)
+    with TruthReader(folder / "t.npz") as reader:
+        noise = reader.meta["noise_std"]
+        truth = reader.read("gps_time", "time", "x", "y", "z", "amplitude", "sigma", "isolated", "overlapped")
+    rng = np.random.default_rng(4)
+    sigma = truth["sigma"].astype(float)
+    bounds = crlb(truth["amplitude"], sigma, noise, 1.0)
+    error = [bound * rng.standard_normal(len(sigma)) for bound in bounds]
+    xyz = np.stack([truth[k] for k in "xyz"], axis=1)
+    xyz[:, 2] -= error[0] * SPEED
+    write_cloud(
+        folder / "a.las",
+        truth["gps_time"],
+        xyz,
+        echo_time=(truth["time"] + error[0]).astype("f4"),
+        amplitude=(truth["amplitude"] + error[1]).astype("f4"),
+        echo_width=(2.3548 * (sigma + error[2])).astype("f4"),
+        amplitude_err=bounds[1].astype("f4"),
+        echo_width_err=(2.3548 * bounds[2]).astype("f4"),
+        range_err=(SPEED * bounds[0]).astype("f4"),
+    )
+    return folder, truth
+
+
+def test_errors_against_truth_are_in_units_of_the_bound(strip):
+    folder, truth = strip
+    result = compare_truth(folder / "a.las", folder / "t.npz")
+    assert result.completeness > 0.999
+    assert result.exact_count == 1.0
+    isolated = result.errors["isolated"]
+    assert isolated["time"].number == truth["isolated"].sum()
+    assert result.errors["overlapped"]["time"].number == pytest.approx(truth["overlapped"].sum(), abs=5)
+    for name in ("time", "echo_time", "amplitude", "sigma"):
+        assert isolated[name].rms_per_bound == pytest.approx(1.0, abs=0.05)
+        assert isolated[name].calibration == pytest.approx(1.0, abs=0.05)
+        assert abs(isolated[name].bias) < 0.1 * isolated[name].rmse
+
+
+def test_vendor_returns_against_truth_and_against_the_result(strip, monkeypatch):
+    folder, truth = strip
+    vendor = compare_truth(folder / "s.laz", folder / "t.npz")
+    assert vendor.correctness == 1.0
+    assert 0.8 < vendor.completeness < 0.95
+    assert vendor.differences["time"].rms < 0.005
+    assert set(vendor.differences) == {"time"}
+    assert vendor.errors["all"]["echo_time"].number == 0
+    both = compare_clouds(folder / "a.las", folder / "s.laz")
+    assert both.missed <= 3
+    assert both.extra == pytest.approx(vendor.missed, abs=5)
+    assert abs(both.differences["time"].median) < 0.01
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 500)
+    assert compare_truth(folder / "s.laz", folder / "t.npz").matched == vendor.matched
+
+
+def test_empty_packets_count_as_pulses(tmp_path):
+    simulate_strip("empty", tmp_path / "s.las", pulses=1000, seed=3, truth=tmp_path / "t.npz")
+    write_cloud(tmp_path / "none.las", np.zeros(0), np.zeros((0, 3)))
+    result = compare_truth(tmp_path / "none.las", tmp_path / "t.npz")
+    with TruthReader(tmp_path / "t.npz") as reader:
+        assert result.pulses == reader.meta["packets"]
+    assert result.exact_count == pytest.approx(0.8, abs=0.04)
+    assert result.counts_a == {0: result.pulses}
+    assert result.completeness == 0
+    assert np.isnan(result.correctness)
+    vendor = compare_truth(tmp_path / "s.las", tmp_path / "t.npz")
+    assert vendor.extra == pytest.approx(result.counts_b[0], abs=10)
+
+
+def test_lag_follows_the_stored_vector_of_either_sign():
+    a, b = np.zeros(3, CLOUD_DTYPE), np.zeros(3, CLOUD_DTYPE)
+    a["xyz"] = [[0, 3, -4], [0, 3, -4], [0, 0, 2]]
+    b["ray"][:2] = [[0, -0.6e-4, 0.8e-4], [0, 0.6e-4, -0.8e-4]]
+    assert measure_lag(a, b) == pytest.approx([5, 5, -2])
+    assert measure_lag(b, a)[2] == 2
+
+
+def test_many_pairs_are_thinned_evenly():
+    rng = np.random.default_rng(5)
+    whole = Differences(1000)
+    heights = rng.standard_normal(20_000)
+    for part in np.array_split(heights, 37):
+        a, b = np.zeros(len(part), CLOUD_DTYPE), np.zeros(len(part), CLOUD_DTYPE)
+        a["xyz"][:, 2] = -part
+        a["amplitude"] = np.nan
+        whole.add(a, b)
+    spread = whole.spreads()["time"]
+    assert spread.number == 20_000
+    assert spread.rms == pytest.approx(np.sqrt((heights**2).mean()) / SPEED)
+    assert spread.median == pytest.approx(0, abs=0.15 / SPEED)
+    assert spread.nmad == pytest.approx(1 / SPEED, rel=0.12)
+    assert "amplitude" not in whole.spreads()
+
+
+def test_columns_of_other_styles_and_collisions_are_understood(tmp_path):
+    _, times, xyz, _ = make_pulses(20)
+    values = np.full(len(times), 4.25, "f4")
+    for name in ("EchoWidth", "wb echo_width"):
+        write_cloud(tmp_path / "a.las", times, xyz, names={"echo_width": name}, echo_width=values)
+        with CloudReader(tmp_path / "a.las") as reader:
+            assert reader.columns == ("echo_width",)
+            assert next(reader.read_pieces())["echo_width"] == pytest.approx(values)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    scale = {"scales": np.array([0.1]), "offsets": np.array([0.0])}
+    header.add_extra_dim(laspy.ExtraBytesParams("pulse width", "u2", no_data=np.array([0]), **scale))
+    header.add_extra_dim(
+        laspy.ExtraBytesParams("Amplitude", "u2", "dB", scales=np.array([0.01]), offsets=np.array([0.0]))
+    )
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = xyz[:2].T - np.array([[500_000], [5_400_000], [0]])
+    cloud["pulse width"] = [4.2, 0.0]
+    cloud.write(tmp_path / "b.las")
+    with CloudReader(tmp_path / "b.las") as reader:
+        assert reader.columns == ("echo_width",)
+        rows = next(reader.read_pieces())
+    assert rows["echo_width"][0] == pytest.approx(4.2)
+    assert np.isnan(rows["echo_width"][1])
+    assert np.isnan(rows["amplitude"]).all()
+
+
+def test_clouds_are_read_in_pieces_and_twice(tmp_path):
+    _, times, xyz, _ = make_pulses(100)
+    write_cloud(tmp_path / "a.laz", times, xyz)
+    with CloudReader(tmp_path / "a.laz") as reader:
+        for _ in range(2):
+            pieces = list(reader.read_pieces(33))
+            assert max(map(len, pieces)) == 33
+            assert np.array_equal(np.concatenate(pieces)["gps_time"], times)
+            assert np.allclose(np.concatenate(pieces)["xyz"], xyz, atol=1e-4)
+
+
+def test_bad_files_and_values_give_one_line(tmp_path):
+    _, times, xyz, _ = make_pulses(50)
+    good = tmp_path / "a.las"
+    write_cloud(good, times, xyz)
+    (tmp_path / "cut.las").write_bytes(good.read_bytes()[:-600])
+    (tmp_path / "text.las").write_text("no cloud")
+    for bad in ("cut.las", "text.las", "missing.las"):
+        with pytest.raises(InputError, match=bad) as caught:
+            compare_clouds(good, tmp_path / bad)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError, match="tolerance"):
+        compare_clouds(good, good, tolerance_ns=0)
+
+
+@pytest.mark.parametrize("by", ["time", "place"])
+def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatch, by):
+    pulse, times, xyz, ray = make_pulses(2000, seed=6)
+    rng = np.random.default_rng(7)
+    total = np.bincount(pulse)[pulse]
+    number = np.arange(len(pulse)) - np.searchsorted(pulse, pulse) + 1
+    times = times if by == "time" else np.zeros(len(times))
+    keep = rng.random(len(times)) < 0.8
+    moved = xyz.copy()
+    far = rng.random(len(times)) < 0.05
+    moved[far] += 1.5 * SPEED * ray[far]
+    flags = np.where(far, EchoFlag.WEAK | EchoFlag.OVERLAPPED, np.where(rng.random(len(times)) < 0.3, 32, 0))
+    amplitude = np.exp(rng.uniform(-1, 6, len(times))).astype("f4")
+    amplitude[:9] = np.nan
+    write_cloud(tmp_path / "a.las", times[keep], moved[keep], echo_flags=flags[keep].astype("u2"))
+    write_cloud(tmp_path / "b.las", times, xyz, amplitude=amplitude)
+    for name, these in (("a.las", keep), ("b.las", np.ones(len(keep), bool))):
+        cloud = laspy.read(tmp_path / name)
+        cloud.return_number, cloud.number_of_returns = number[these], total[these]
+        cloud.intensity = np.full(these.sum(), 9)
+        cloud.write(tmp_path / name)
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 900)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    missed, extra = far | ~keep, far & keep
+    naive = {"return": {}, "amplitude": {}, "flag": {}}
+    for echo in range(len(times)):
+        classes = {"return": f"{number[echo]} of {total[echo]}"}
+        if not np.isnan(amplitude[echo]):
+            n = int(np.floor(np.log2(amplitude[echo])))
+            classes["amplitude"] = "below 1" if n < 0 else f"{2**n}-{2 ** (n + 1)}"
+        for kind, name in classes.items():
+            old = naive[kind].get(name, (0, 0))
+            naive[kind][name] = (old[0] + int(missed[echo]), old[1] + 1)
+    assert (result.missed, result.extra) == (missed.sum(), extra.sum())
+    assert result.missed_by["return"] == naive["return"]
+    assert result.missed_by["amplitude"] == naive["amplitude"]
+    assert set(result.missed_by) == {"return", "amplitude", *(["pulse"] if by == "time" else [])}
+    of = keep & ~far & (flags == 32)
+    weak = {"WEAK": (extra.sum(), extra.sum() + of.sum()), "OVERLAPPED": (extra.sum(), extra.sum())}
+    assert result.extra_by["flag"] == {**weak, "none": (0, (keep & (flags == 0)).sum())}
+    assert result.extra_by["intensity"] == {"8-16": (extra.sum(), keep.sum())}
+    if by == "time":
+        found = np.bincount(pulse[keep], minlength=2000)[pulse] > 0
+        assert result.missed_by["pulse"] == {
+            "nothing of the other side": ((missed & ~found).sum(), (~found).sum()),
+            "other echoes of the other side": ((missed & found).sum(), found.sum()),
+        }
+    back = compare_clouds(tmp_path / "b.las", tmp_path / "a.las")
+    assert (back.extra_by, back.missed_by) == (result.missed_by, result.extra_by)
+    both = 2 * result.matched / (result.echoes_a + result.echoes_b)
+    assert result.identical == pytest.approx(both) and result.to_json()["identical"] == result.identical
+    assert result.gain == pytest.approx(keep.sum() / len(times) - 1)

@@ -1,0 +1,461 @@
+"""`wavebatch plot histogram` and `map`: what is drawn equals a plain count, whatever the cloud, and says so."""
+
+import os
+import subprocess
+import sys
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from wavebatch.cli import main
+from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.even_sample import EvenSample
+from wavebatch.files.cloud import echo_reader as io_cloud
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.tools.plots import raster, values
+from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
+from wavebatch.tools.plots.raster import grid_values
+from wavebatch.tools.plots.values import Selection, read_flags, robust_limits
+
+POINTS = 5000
+
+
+def write_cloud(path, *, seed=1, n=POINTS, point_format=6, **columns):
+    """A cloud of n points over 40 m x 25 m with the given extra columns: (values, no-data, scale) each."""
+    rng = np.random.default_rng(seed)
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format >= 6 else "1.2")
+    header.scales, header.offsets = (0.001,) * 3, (500_000.0, 5_400_000.0, 0.0)
+    for name, (stored, no_data, scale, description) in columns.items():
+        scaling = {} if scale is None else {"scales": np.array([scale]), "offsets": np.array([0.0])}
+        header.add_extra_dim(laspy.ExtraBytesParams(name, stored.dtype, description, no_data=no_data, **scaling))
+    las = laspy.LasData(header)
+    las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+    las.x, las.y, las.z = 500_000 + rng.uniform(0, 40, n), 5_400_000 + rng.uniform(0, 25, n), rng.normal(100, 5, n)
+    las.intensity = rng.integers(0, 3000, n)
+    las.return_number = rng.integers(1, 4, n)
+    if point_format >= 6:
+        las.scan_angle = rng.integers(-3000, 3000, n)
+    for name, (stored, *_) in columns.items():
+        las.points.array[name] = stored
+    las.write(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    """A cloud with columns of ours, of which some values are no data, flags, and a scaled one of a vendor."""
+    rng = np.random.default_rng(5)
+    amplitude = rng.gamma(2.0, 30.0, POINTS).astype("f4")
+    amplitude[rng.random(POINTS) < 0.1] = -9999.0
+    flags = rng.choice([0, 0, 8, 16, 24], POINTS).astype("u2")
+    width = rng.integers(38, 60, POINTS).astype("u2")
+    path = tmp_path_factory.mktemp("plot") / "cloud.laz"
+    return write_cloud(
+        path,
+        amplitude=(amplitude, np.array([-9999.0]), None, "peak above the baseline [DN]"),
+        echo_flags=(flags, None, None, "see the table of flags [bits]"),
+        **{"Pulse width": (width, None, 0.1, "Full width at half maximum [ns]")},
+        comment=(rng.normal(size=POINTS).astype("f8"), None, None, "no unit here"),
+    )
+
+
+def read_plainly(path):
+    """x, y and columns of a cloud, no-data as NaN."""
+    las = laspy.read(path)
+    amplitude = np.array(las.points.array["amplitude"], np.float64)
+    amplitude[amplitude == -9999.0] = np.nan
+    return np.array(las.x), np.array(las.y), amplitude, np.array(las["echo_flags"])
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["plot", *map(str, words)])
+
+
+def test_histogram_is_that_of_numpy(cloud):
+    found = count_values([cloud], Selection("amplitude"), bins=37, limits=(5.0, 120.0))
+    _, _, amplitude, _ = read_plainly(cloud)
+    good = amplitude[~np.isnan(amplitude)]
+    counts, edges = np.histogram(good, 37, (5.0, 120.0))
+    assert np.array_equal(found.counts, counts[None]) and np.allclose(found.edges, edges, rtol=1e-12)
+    assert (found.below[0], found.above[0]) == (np.sum(good < 5), np.sum(good > 120))
+    assert (found.total.points, found.total.no_data, found.total.values) == (POINTS, POINTS - len(good), len(good))
+    assert np.array_equal(found.percentiles[0], np.percentile(good, (5, 50, 95)))
+    assert found.facts.label == "amplitude: peak of the echo above the baseline [DN]"
+    assert found.facts.unit == COLUMNS["amplitude"].unit
+
+
+def test_chosen_bins_hold_all_but_far_outliers(cloud):
+    found = count_values([cloud], Selection("amplitude"))
+    assert found.counts.sum() + found.below[0] + found.above[0] == found.total.values
+    assert found.above[0] < 0.002 * POINTS and 20 <= found.counts.shape[1] <= 300
+    width = found.edges[1] - found.edges[0]
+    assert f"{width:.6e}"[0] in "125" and np.allclose(found.edges / width, np.rint(found.edges / width))
+
+
+@pytest.mark.parametrize("size", [1, 7, 999, 250_000])
+def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
+    if size == 1:
+        size = POINTS // 3
+    monkeypatch.setattr(io_cloud.CloudReader.read_pieces, "__defaults__", (size,))
+    monkeypatch.setattr(EvenSample, "LIMIT", 600)
+    with ColumnReader(cloud, "amplitude") as reader:
+        assert max(len(rows) for rows in reader.read_pieces()) == min(size, POINTS)
+    found = count_values([cloud], Selection("amplitude"), bins=20)
+    again = grid_values([cloud], Selection("amplitude"), "mean", size=1.7)
+    _, _, amplitude, _ = read_plainly(cloud)
+    good = amplitude[~np.isnan(amplitude)]
+    step = 8
+    assert np.array_equal(found.percentiles[0], np.percentile(good[::step], (5, 50, 95)))
+    total = np.zeros(again.values.size)
+    x, y, _, _ = read_plainly(cloud)
+    known = ~np.isnan(amplitude)
+    cell = again.grid.place(x[known], y[known])
+    for at, value in zip(cell, good, strict=True):
+        total[at] += value
+    count = np.bincount(cell, minlength=len(total))
+    assert np.array_equal(again.values.ravel()[count > 0], total[count > 0] / count[count > 0])
+
+
+@settings(max_examples=200, deadline=None)
+@example(low=0.0, span=5e-324, step=0.0, bins=None, exact=False)
+@example(low=1e-310, span=9e-301, step=0.0, bins=None, exact=False)
+@example(low=0.0, span=1e-299, step=0.0, bins=None, exact=False)
+@given(
+    low=st.floats(-1e9, 1e9),
+    span=st.floats(0, 1e9),
+    step=st.sampled_from([0.0, 0.001, 0.006, 0.1, 1.0]),
+    bins=st.sampled_from([None, 1, 7, 1000]),
+    exact=st.booleans(),
+)
+def test_edges_rise_and_hold_the_range(low, span, step, bins, exact):
+    high = low + span
+    sample = np.linspace(low, high, 11)
+    edges = place_edges(sample, low, high, step, bins, exact=exact)
+    assert np.all(np.diff(edges) > 0) and len(edges) >= 2
+    slack = 1e-9 * max(abs(low), abs(high), step)
+    assert edges[0] <= low + 0.5 * step + slack and edges[-1] >= high - 0.5 * step - slack
+    if bins:
+        assert len(edges) - 1 <= bins
+
+
+def test_bins_of_stepped_columns_hold_whole_steps(cloud):
+    found = count_values([cloud], Selection("echo_width"))
+    assert found.facts.name == "Pulse width" and found.facts.step == pytest.approx(0.1)
+    stride = np.diff(found.edges) / 0.1
+    assert np.allclose(stride, round(stride[0])) and np.allclose(found.edges[0] / 0.1 % 1, 0.5)
+    values = np.rint(np.array(laspy.read(cloud)["Pulse width"]) / 0.1).astype(int)
+    assert np.array_equal(found.counts[0], np.bincount(values - 38, minlength=len(found.counts[0])))
+    wide = count_values([cloud], Selection("Pulse width"), bins=5)
+    assert len(wide.counts[0]) <= 5 and wide.counts.sum() == POINTS
+    number = count_values([cloud], Selection("return_number"))
+    assert number.edges.tolist() == [0.5, 1.5, 2.5, 3.5]
+
+
+@pytest.mark.parametrize(
+    ("asked", "name", "unit"),
+    [
+        ("amplitude", "amplitude", "DN"),
+        ("AMPLITUDE", "amplitude", "DN"),
+        ("pulse_width", "Pulse width", "ns"),
+        ("echo_width", "Pulse width", "ns"),
+        ("comment", "comment", "-"),
+        ("z", "z", "m"),
+        ("gps time", "gps_time", "s"),
+        ("scan_angle", "scan_angle", "deg"),
+        ("classification", "classification", "-"),
+    ],
+)
+def test_columns_are_found_by_any_of_their_names(cloud, asked, name, unit):
+    with ColumnReader(cloud, asked) as reader:
+        assert (reader.facts.name, reader.facts.unit) == (name, unit)
+
+
+def test_standard_fields_have_their_values(cloud, tmp_path):
+    las = laspy.read(cloud)
+    for name, expected in (("x", las.x), ("z", las.z), ("scan_angle", las.scan_angle * 0.006), ("intensity", None)):
+        with ColumnReader(cloud, name) as reader:
+            found = np.concatenate(list(reader.read_pieces()))
+        assert np.array_equal(found["value"], las.intensity if expected is None else expected)
+        assert np.array_equal(found["x"], las.x) and np.array_equal(found["flags"], las["echo_flags"])
+    old = write_cloud(tmp_path / "old.las", n=20, point_format=1)
+    with ColumnReader(old, "scan_angle") as reader:
+        assert reader.facts.name == "scan_angle_rank"
+
+
+def test_ours_comes_before_the_vendors_but_the_vendors_own_name_wins(tmp_path):
+    stored = np.arange(30)
+    path = write_cloud(
+        tmp_path / "both.las", n=30,
+        Amplitude=(stored.astype("u2"), None, 0.01, "Echo signal amplitude [dB]"),
+        **{"wb amplitude": (stored.astype("f4"), None, None, "peak above the baseline [DN]")},
+    )  # fmt: skip
+    for asked, unit in (("amplitude", "DN"), ("Amplitude", "dB")):
+        with ColumnReader(path, asked) as reader:
+            assert reader.facts.unit == unit
+    with ColumnReader(path, "Amplitude") as reader:
+        assert next(reader.read_pieces())["value"] == pytest.approx(stored * 0.01)
+
+
+def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_path):
+    other = write_cloud(tmp_path / "other.las", seed=9, amplitude=(np.full(POINTS, 50, "f4"), None, None, "[DN]"))
+    both = count_values([cloud, other], Selection("amplitude"), each=True, bins=30, limits=(0.0, 200.0))
+    assert both.names == ("cloud.laz", "other.las") and both.counts.shape == (2, 30)
+    one = count_values([cloud, other], Selection("amplitude"), bins=30, limits=(0.0, 200.0))
+    assert np.array_equal(one.counts[0], both.counts.sum(axis=0)) and one.total == both.total
+    assert both.percentiles[1].tolist() == [50.0, 50.0, 50.0]
+    wrong = write_cloud(tmp_path / "dB.las", amplitude=(np.ones(POINTS, "f4"), None, None, "of the echo [dB]"))
+    with pytest.raises(ConfigError, match=r"dB.las.*\[dB\].*cloud.laz.*\[DN\]"):
+        count_values([cloud, wrong], Selection("amplitude"))
+
+
+def test_flags_select_and_are_counted(cloud):
+    _, _, amplitude, flags = read_plainly(cloud)
+    counted = count_flags([cloud], Selection("echo_flags"))
+    for name, count in zip(counted.names, counted.counts, strict=True):
+        assert count == np.sum((flags & int(EchoFlag[name])) != 0)
+    assert counted.clean == np.sum(flags == 0)
+    bits = read_flags(["saturated, OVERLAPPED"])
+    assert bits == 24
+    chosen = count_values([cloud], Selection("amplitude", flags_with=8, flags_without=16), bins=4)
+    keep = ((flags & 8) != 0) & ((flags & 16) == 0)
+    assert chosen.total.values == np.sum(keep & ~np.isnan(amplitude)) and chosen.total.left_out == np.sum(~keep)
+    with pytest.raises(ConfigError, match="SATURATED"):
+        read_flags(["SATURATD"])
+    with pytest.raises(ConfigError, match="bits"):
+        count_values([cloud], Selection("echo_flags"))
+
+
+@pytest.mark.parametrize("statistic", raster.STATISTICS)
+def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
+    monkeypatch.setattr(raster, "_BUCKET_POINTS", 700)
+    found = grid_values([cloud], Selection("amplitude"), statistic, size=2.5)
+    x, y, amplitude, _ = read_plainly(cloud)
+    grid = found.grid
+    assert (grid.x % 2.5, grid.y % 2.5) == (0, 0) and found.values.shape == (grid.rows, grid.columns)
+    known = ~np.isnan(amplitude)
+    row, column = np.floor((y - grid.y) / 2.5).astype(int), np.floor((x - grid.x) / 2.5).astype(int)
+    whole = {"mean": np.mean, "median": np.median, "min": np.min, "max": np.max}
+    for r in range(grid.rows):
+        for c in range(grid.columns):
+            cell = amplitude[known & (row == r) & (column == c)]
+            if not len(cell):
+                assert np.isnan(found.values[r, c])
+            elif statistic in whole:
+                assert found.values[r, c] == pytest.approx(whole[statistic](cell), rel=1e-12)
+            else:
+                assert found.values[r, c] == len(cell) / (6.25 if statistic == "density" else 1)
+    assert found.outside == 0
+    assert found.shown == tuple(np.percentile(found.values[~np.isnan(found.values)], (2, 98)))
+
+
+def test_chosen_cells_hold_a_few_points_each(cloud):
+    found = grid_values([cloud], Selection(None), "count")
+    assert 2 < np.nanmean(found.values) < 4 * raster.POINTS_PER_CELL
+    assert np.nansum(found.values) == POINTS and found.label == "points per cell [-]"
+
+
+def test_a_far_point_does_not_squeeze_the_map(tmp_path):
+    path = write_cloud(tmp_path / "far.las")
+    las = laspy.read(path)
+    las.points.array["X"][7] = 2_000_000_000
+    las.write(path)
+    found = grid_values([path], Selection("z"))
+    assert found.outside == 1 and found.grid.columns * found.grid.size < 100
+    part = grid_values([path], Selection("z"), bounds=(500_010.0, 5_400_005.0, 500_020.0, 5_400_010.0), size=1.0)
+    assert part.grid.extent == (500_010.0, 500_021.0, 5_400_005.0, 5_400_011.0)
+    x, y = np.array(las.x), np.array(las.y)
+    inside = (x >= 500_010) & (x < 500_021) & (y >= 5_400_005) & (y < 5_400_011)
+    assert part.total.values - part.outside == inside.sum()
+
+
+def test_limits_ignore_outliers_only():
+    plain = np.linspace(0, 1, 1001)
+    assert robust_limits(plain, 0.0, 1.0) == (0.0, 1.0)
+    low, high = robust_limits(np.append(plain, 1e9), 0.0, 1e9)
+    assert low == 0.0 and 1.0 <= high < 1.3
+    assert robust_limits(np.full(10, 3.0), 3.0, 3.0) == (3.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"size": 1e-4}, "too many to draw; cells of 0.02 m will do"),
+        ({"size": 0.0}, "at least"),
+        ({"statistic": "mode"}, "mean, median"),
+        ({"bounds": (1.0, 0.0, 0.0, 1.0)}, "WEST"),
+    ],
+)
+def test_wrong_options_of_a_map(cloud, change, message):
+    with pytest.raises(ConfigError, match=message):
+        grid_values([cloud], Selection("amplitude"), **{"statistic": "mean", **change})
+
+
+def test_the_size_that_is_proposed_does(cloud):
+    found = grid_values([cloud], Selection("amplitude"), size=0.02)
+    assert found.grid.rows * found.grid.columns <= raster.MOST_CELLS
+
+
+@pytest.mark.parametrize("kind", ["histogram", "map"])
+def test_what_cannot_be_drawn_is_one_line(tmp_path, cloud, kind):
+    empty = write_cloud(tmp_path / "empty.las", n=0)
+    nothing = write_cloud(
+        tmp_path / "nothing.las", n=9, amplitude=(np.full(9, -1, "f4"), np.array([-1.0]), None, "peak [DN]")
+    )
+    broken = tmp_path / "broken.las"
+    broken.write_bytes(cloud.read_bytes()[:3000])
+    cases = [
+        (empty, "z", 1, "holds no points"),
+        (nothing, "amplitude", 1, "9 have no data in amplitude"),
+        (broken, "z", 1, "broken.las"),
+        (tmp_path / "none.las", "z", 1, "none.las"),
+        (cloud, "amplitud", 2, "did you mean 'amplitude'? It has amplitude, echo_flags, Pulse width, comment, x"),
+        (cloud, "qqqqqq", 2, "known are amplitude"),
+        (nothing, "intensity --flags-with WEAK", 2, "no column echo_flags"),
+        (cloud, "intensity --flags-with WEEK", 2, "did you mean 'WEAK'"),
+        (cloud, "intensity --flags-with NO_WAVEFORM", 1, "5000 of 5000 points are left out by their flags"),
+    ]
+    for path, column, code, message in cases:
+        result = run(kind, path, "-o", tmp_path / "p.png", "--column", *column.split())
+        assert (result.exit_code, result.stdout) == (code, ""), result.output
+        assert message in result.stderr and result.stderr.count("\n") == 1, result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.las", "empty.las", "nothing.las"]
+
+
+def test_one_point_and_one_value_can_be_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    one = write_cloud(tmp_path / "one.las", n=1, amplitude=(np.array([7.0], "f4"), None, None, "peak [DN]"))
+    for kind in ("histogram", "map"):
+        assert run(kind, one, "--column", "amplitude", "-o", tmp_path / f"{kind}.png").exit_code == 0
+    assert grid_values([one], Selection("amplitude")).values.tolist() == [[7.0]]
+
+
+COMMANDS = {
+    "histogram": ["histogram", "--column", "amplitude", "--log"],
+    "flags": ["histogram", "--column", "echo_flags"],
+    "map": ["map", "--column", "amplitude", "--statistic", "median"],
+    "density": ["map", "--statistic", "density"],
+}
+
+
+STARTS = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
+QUICK = {("histogram", ".svg"), ("flags", ".pdf"), ("map", ".png")}
+
+
+@pytest.mark.parametrize(
+    ("name", "suffix"),
+    [
+        pytest.param(name, suffix, marks=() if (name, suffix) in QUICK else pytest.mark.slow)
+        for name in COMMANDS
+        for suffix in STARTS
+    ],
+)
+def test_pictures_have_the_same_bytes_each_time(tmp_path, cloud, name, suffix):
+    pytest.importorskip("matplotlib")
+    target = tmp_path / f"a{suffix}"
+    words = [*COMMANDS[name], cloud, "-o", target]
+    result = run(*words)
+    assert result.exit_code == 0 and str(target) in result.stderr, result.output
+    first = target.read_bytes()
+    assert first.startswith(STARTS[suffix])
+    refused = run(*words)
+    assert refused.exit_code == 1 and "--overwrite" in refused.stderr and target.read_bytes() == first
+    assert run(*words, "--overwrite", "-q").output == "" and target.read_bytes() == first
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_pictures_say_what_they_show(tmp_path, cloud):
+    pytest.importorskip("matplotlib")
+    expected = {
+        "histogram": ["cloud.laz", "amplitude: peak of the echo above the baseline [DN]", "without data", "median"],
+        "flags": ["cloud.laz", "SATURATED", "no flag", "5,000 points"],
+        "map": ["x [m]", "y [m]", "median of amplitude: peak of the echo above the baseline [DN]"],
+        "density": ["points per area [1/m2]"],
+    }
+    for name, words in COMMANDS.items():
+        target = tmp_path / f"{name}.svg"
+        assert run(*words, cloud, "-o", target).exit_code == 0
+        for text in expected[name]:
+            assert text in target.read_text("utf-8"), (name, text)
+
+
+def test_names_from_files_are_text_and_no_formulas(tmp_path):
+    pytest.importorskip("matplotlib")
+    path = write_cloud(
+        tmp_path / "a$\\frac{b$\u4e2d.las", n=40, odd=(np.arange(40.0), None, None, "$\\x$ \x01<b> & \u4e2d")
+    )
+    assert run("histogram", path, "--column", "odd", "-o", tmp_path / "p.svg").exit_code == 0
+    text = (tmp_path / "p.svg").read_text("utf-8")
+    assert "a$\\frac{b$" in text and "&lt;b&gt; &amp;" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["histogram", "--column", "z", "-o", "p.gif"], ".png, .svg, .pdf"),
+        (["histogram", "--column", "z", "-o", "p.png", "--range", "5:1"], "does not go up"),
+        (["histogram", "--column", "z", "-o", "p.png", "--range", "nan:1"], "does not go up"),
+        (["histogram", "--column", "echo_flags", "-o", "p.png", "--bins", "3"], "--bins"),
+        (["map", "--column", "echo_flags", "-o", "p.png"], "--statistic count --flags-with"),
+        (["map", "-o", "p.png"], "needs a --column"),
+        (["map", "--column", "z", "-o", "p.png", "--bounds", "1,2,3"], "WEST,SOUTH,EAST,NORTH"),
+        (["histgram"], "did you mean 'histogram'?"),
+    ],
+)
+def test_wrong_usage(cloud, tmp_path, monkeypatch, words, message):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    result = run(words[0], cloud, *words[1:])
+    assert result.exit_code == 2 and message in result.stderr and not list(tmp_path.iterdir())
+
+
+def test_without_matplotlib_a_line_says_what_to_install(cloud, tmp_path, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
+    assert result.exit_code == 2 and "pip install 'wavebatch[plot]'" in result.stderr
+
+
+def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
+    result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
+    assert result.exit_code == 2 and "matplotlib cannot be imported" in result.stderr
+    assert len(result.stderr.splitlines()) == 1 and not list(tmp_path.iterdir())
+
+
+def test_matplotlib_is_not_imported_before_something_is_drawn(cloud, tmp_path):
+    code = (
+        "import sys\nfrom click.testing import CliRunner\nfrom wavebatch.cli import main\n"
+        "for words in (['--help'], ['plot', '--help'], ['plot', 'map', '--help'],"
+        f" ['plot', 'map', {str(cloud)!r}, '--column', 'nope', '-o', 'p.png']):\n"
+        "    CliRunner().invoke(main, words)\n"
+        "print([name for name in sys.modules if name.startswith('matplotlib')])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_unreadable_values_do_not_count(tmp_path):
+    stored = np.array([1.0, np.nan, np.inf, -np.inf, 1e300, 2.0])
+    path = write_cloud(tmp_path / "odd.las", n=6, odd=(stored, None, None, "odd"))
+    found = count_values([path], Selection("odd"))
+    assert (found.total.values, found.total.no_data) == (2, 4)
+    with pytest.raises(InputError, match="left out"):
+        grid_values([write_cloud(tmp_path / "f.las", n=3, echo_flags=(np.zeros(3, "u2"), None, None, ""))],
+                    Selection("z", flags_with=1))  # fmt: skip
+
+
+def test_real_clouds(riegl, leica, tmp_path):
+    pytest.importorskip("matplotlib")
+    found = count_values([riegl], Selection("Pulse width"))
+    assert found.total.values == 2535 and found.percentiles[0][1] == pytest.approx(4.4)
+    assert values.Clouds([riegl], Selection("amplitude")).facts.unit == "dB"
+    assert run("map", riegl, "--column", "z", "--statistic", "max", "-o", tmp_path / "r.png").exit_code == 0
+    assert grid_values([leica], Selection("intensity")).total.values == 999

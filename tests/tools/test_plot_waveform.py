@@ -1,0 +1,307 @@
+"""`wavebatch plot waveform`: the views hold what the strip and its run hold, and the pictures say it."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from strips import make_raw
+
+from wavebatch.cli import main
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.files.strip import reader as io_strip
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.tools.bench.plot import _draw_panel, _place_labels
+from wavebatch.tools.plots.packets import MOST, Wanted, find_places
+from wavebatch.tools.plots.waveform import build_views, read_views
+
+PULSE = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0)
+KAPPA = 0.15
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
+
+
+def simulate(shape, echoes, *, n=20, s=80, seed=1, top=255):
+    """A block of n waveforms of the echoes (amplitude, time, width), noise 1, baseline 12."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(float(s))
+    signal = sum(a * evaluate_pulse(shape, x - 0.0, np.array([t]), np.array([w]))[0] for a, t, w in echoes)
+    counts = np.clip(np.rint(12 + signal + rng.normal(0, 1, (n, s))), 0, top)
+    return WaveformBlock.from_samples(counts.astype(np.uint8), bits=8)
+
+
+def make_chain(decomposer, **parameters):
+    attributes = [STAGES[f"attribute.{name}"] for name in ("amplitude", "echo_width")]
+    steps = [Step(STAGES["noise.pooled"]), Step(STAGES["detect.maximum"]), Step(STAGES[decomposer], parameters)]
+    return Chain((*steps, *map(Step, attributes)), "test")
+
+
+@pytest.mark.parametrize("name", [name for name, shape in MODELS.items() if shape is not None])
+def test_curves_are_the_fit_of_every_decomposer(name):
+    shape, system, parameters = PulseShape(), PULSE, {}
+    if name == "decompose.skewed":
+        shape, system = PulseShape(kappa=KAPPA), replace(PULSE, kappa=KAPPA)
+    elif name == "decompose.reference":
+        system, parameters = replace(PULSE, components=((1.0, 0.0, 2.0), (0.03, 8.0, 2.0))), {"model": "stretched"}
+        shape = PulseShape(components=((0.03, 8.0, 0.0),))
+    elif name == "decompose.asdf_only":
+        parameters = {"refine": True} if "refine" in STAGES[name].parameters else {}
+    block = simulate(shape, [(100.0, 30.3, 2.0)])
+    views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
+    assert len(views) == 20
+    worst = 4.0 if name == "decompose.asdf_only" else 1.25
+    for view in views:
+        assert len(view.echoes) == 1 and view.curves.shape == (1, len(view.fine))
+        near = np.abs(view.time - 30) <= 5
+        assert np.sqrt(np.mean(view.residual[near] ** 2)) < worst + 0.6
+        top = view.curves[0].max()
+        assert top == pytest.approx(float(view.echoes.amplitude[0]), rel=0.01)
+        assert view.fine[np.argmax(view.curves[0])] == pytest.approx(float(view.echoes.time[0]), abs=0.1)
+    rms = np.sqrt(np.mean([np.mean(view.residual[np.abs(view.time - 30) <= 5] ** 2) for view in views]))
+    assert rms < worst
+
+
+@pytest.mark.parametrize("name", [name for name, shape in MODELS.items() if shape is None])
+def test_where_nothing_says_what_was_fitted_nothing_is_drawn(name):
+    (view,) = build_views(simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1), make_chain(name), PULSE, [7])
+    assert view.residual is None and view.fit is None and len(view.curves) == 0
+    assert len(view.echoes) == 1 and view.packet == 7
+
+
+def test_view_against_a_plain_sum_of_gaussians():
+    block = simulate(PulseShape(), [(100.0, 30.3, 2.0), (60.0, 37.0, 2.5)])
+    system = replace(PULSE, noise_gain=0.05)
+    chain = make_chain("decompose.gaussian")
+    whole = chain.run(block, system)
+    for row, view in enumerate(build_views(block, chain, system, range(len(block)))):
+        mine = whole.take(np.flatnonzero(whole.waveform == row))
+        for name in ("time", "amplitude", "sigma", "flags", "time_err"):
+            assert np.array_equal(getattr(view.echoes, name), getattr(mine, name))
+        assert np.array_equal(view.samples, block.samples[row]) and view.std == 1.0
+        model = np.zeros(80)
+        for a, t, w in zip(mine.amplitude, mine.time, mine.sigma, strict=True):
+            model += float(a) * np.exp(-0.5 * ((view.time - t) / float(w)) ** 2)
+        noise = np.sqrt(1.0 + 0.05 * model)
+        assert view.residual == pytest.approx((view.samples - view.baseline - model) / noise, abs=1e-4)
+        assert view.fit[::8] == pytest.approx(view.baseline + model, abs=1e-4)
+        assert np.array_equal(view.fine[::8], view.time)
+
+
+def test_clipped_samples_count_only_where_the_fit_lies_below():
+    block = simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=1)
+    (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
+    assert view.clipped.sum() >= 3 and np.array_equal(view.clipped, block.samples[0] == 255)
+    assert np.isnan(view.residual[view.clipped]).any()
+    assert np.isfinite(view.residual[~view.clipped]).all()
+    assert view.echoes.flags[0] & EchoFlag.SATURATED
+
+
+def test_views_of_a_strip_are_what_a_run_gives(tiny_strip, monkeypatch):
+    chain = load_profile("balanced")
+    wanted = Wanted(packets=((5, 8), (300, 301), (6, 7)), points=(0, 400), times=())
+    found = {}
+    for points in (io_strip.UNIT_POINTS, 37):
+        monkeypatch.setattr(io_strip, "UNIT_POINTS", points)
+        with StripReader(tiny_strip) as reader, reader.scan() as scan:
+            places = find_places(reader, scan, wanted, None)
+            found[points] = read_views(reader, scan, places, chain, PULSE)
+            blocks = [
+                (block.rows(slice(row, row + 1)), int(block.point[row]))
+                for number in range(reader.unit_count())
+                for block, _ in reader.read_blocks(reader.read_unit(number, scan), 64, True)
+                for row in range(len(block))
+            ]
+    blocks.sort(key=lambda pair: pair[1])
+    one, other = found.values()
+    assert [view.packet for view in one][:4] == [5, 6, 7, 300]
+    assert [view.point for view in one] == [view.point for view in other]
+    assert one[4].point == 0 and 400 in one[5].return_points
+    for view, twin in zip(one, other, strict=True):
+        block, point = blocks[view.packet]
+        assert point == view.point == twin.point and view.gps_time == block.gps_time[0]
+        assert np.array_equal(view.samples, block.samples[0]) and np.array_equal(twin.samples, view.samples)
+        assert np.array_equal(view.returns, block.returns.time)
+        table = chain.run(block, PULSE)
+        assert np.array_equal(view.echoes.time, table.time) and np.array_equal(twin.echoes.time, table.time)
+
+
+def test_pulses_are_found_by_time_and_flag(tiny_strip):
+    chain = load_profile("fast")
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        tables = []
+        for block, _ in reader.read_blocks(reader.read_unit(0, scan), 64, True):
+            tables.append((block, chain.run(block, PULSE)))
+        times = np.concatenate([block.gps_time for block, _ in tables])
+        asked = float(times[17] + 0.3 * np.diff(np.sort(times)).min())
+        (place,) = find_places(reader, scan, Wanted(times=(asked,)), None)
+        (view,) = read_views(reader, scan, [place], chain, PULSE)
+        assert view.gps_time == times[17]
+        with pytest.raises(ConfigError, match="nearest is"):
+            find_places(reader, scan, Wanted(times=(5.0,)), None)
+        bits = np.bitwise_or.reduce(np.concatenate([table.flags for _, table in tables]))
+        assert bits
+        flagged = sorted(
+            int(block.point[row])
+            for block, table in tables
+            for row in np.unique(table.waveform[(table.flags & bits) != 0])
+        )
+        wanted = Wanted(flags=int(bits), most=4)
+        places = find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE))
+        assert [view.point for view in read_views(reader, scan, places, chain, PULSE)] == flagged[:4]
+        with pytest.raises(InputError, match="no echo"):
+            find_places(reader, scan, wanted, lambda block: chain.run(block, PULSE).take(np.empty(0, int)))
+
+
+def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        places = find_places(reader, scan, Wanted(most=5), None)
+        assert [place.packet for place in places] == np.linspace(0, scan.packets - 1, 5).round().astype(int).tolist()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("--packet 99999", 2, "there is no packet 99999; packets are 0 to"),
+        ("--packet 5:3", 2, "there is no packet 5:3"),
+        ("--packet x", 2, "neither a number nor FIRST:BEHIND"),
+        (f"--packet 0:{MOST + 1}", 2, f"{MOST} fit"),
+        ("--point 99999", 2, "there is no point 99999"),
+        ("--gps-time 3", 2, "no pulse lies within"),
+        ("--flags-with SATURATED --packet 3", 2, "--flags-with"),
+        ("--flags-with SATURATD", 2, "did you mean 'SATURATED'"),
+        ("--profile fastt", 2, "did you mean 'fast'"),
+        ("--times 5", 2, "LOW:HIGH"),
+        ("--chain none.toml", 2, "none.toml"),
+    ],
+)
+def test_wrong_usage_is_one_line(tiny_strip, tmp_path, words, code, message):
+    pytest.importorskip("matplotlib")
+    result = run(tiny_strip, "-o", tmp_path / "p.png", *words.split())
+    assert result.exit_code == code and message in result.stderr, result.output
+    assert "Traceback" not in result.stderr and not list(tmp_path.iterdir())
+
+
+def test_strips_without_waveforms(tmp_path, riegl, data):
+    pytest.importorskip("matplotlib")
+    raw = make_raw(4)
+    raw.points["wavepacket_index"] = 0
+    nothing = raw.write(tmp_path / "nothing.las")
+    mixed = make_raw(4)
+    mixed.points["wavepacket_index"][0] = 0
+    mixed = mixed.write(tmp_path / "mixed.las")
+    for path, words in (
+        (nothing, ()), (mixed, ("--point", 0)), (tmp_path / "none.las", ()), (data / "no-packets/simple1_3.las", ()),
+    ):  # fmt: skip
+        result = run(path, "-o", tmp_path / "p.png", *words)
+        assert result.exit_code in (1, 2) and result.stderr.count("\n") == 1, result.output
+        assert "wave" in result.stderr or "packet" in result.stderr or "none.las" in result.stderr
+        assert not (tmp_path / "p.png").exists()
+
+
+@pytest.mark.parametrize("samples", [1, 2, 8])
+def test_short_waveforms_can_be_drawn(tmp_path, samples):
+    pytest.importorskip("matplotlib")
+    strip = make_raw(5, n_samples=samples).write(tmp_path / "short.las")
+    result = run(strip, "-o", tmp_path / "p.png", "--packet", 2, "--profile", "fast")
+    assert result.exit_code == 0, result.output
+
+
+def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, tmp_path):
+    pytest.importorskip("matplotlib")
+    words = (tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--overwrite")
+    assert run(*words).exit_code == 0
+    first = (tmp_path / "p.svg").read_bytes()
+    assert run(*words, "-q").output == "" and (tmp_path / "p.svg").read_bytes() == first
+    text = first.decode()
+    for part in ("tiny.las", "profile auto", "packet 3", "GPS time", "signal [DN]", "[noise std]", "amplitude [DN]"):
+        assert part in text, part
+    assert "time after the first sample [ns]" in text and "returns of the file" in text
+
+
+@pytest.mark.parametrize(
+    ("suffix", "start"), [(".png", b"\x89PNG"), pytest.param(".pdf", b"%PDF", marks=pytest.mark.slow)]
+)
+def test_several_waveforms_and_other_kinds_of_file(tiny_strip, tmp_path, suffix, start):
+    pytest.importorskip("matplotlib")
+    target = tmp_path / f"p{suffix}"
+    result = run(tiny_strip, "-o", target, "--packet", "0:2", "--point", 20, "--profile", "fast", "--times", "0:40")
+    assert result.exit_code == 0 and "3 waveforms" in result.stderr, result.output
+    assert target.read_bytes().startswith(start)
+
+
+def test_a_chain_that_fits_nothing_is_drawn_without_a_fit(tiny_strip, tmp_path):
+    pytest.importorskip("matplotlib")
+    chain = tmp_path / "none.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.none", "attribute.amplitude", "attribute.position")
+    chain.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
+    parse_chain(chain.read_text(), "none")
+    result = run(tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--chain", chain)
+    assert result.exit_code == 0, result.output
+    assert "this chain fits no pulse" in (tmp_path / "p.svg").read_text("utf-8")
+
+
+@pytest.mark.slow
+def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
+    pytest.importorskip("matplotlib")
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "MPLCONFIGDIR")}
+    environment |= {"HOME": str(tmp_path / "nowhere"), "MPLBACKEND": "TkAgg"}
+    command = [sys.executable, "-m", "wavebatch", "plot", "waveform", str(tiny_strip), "-o", "p.png", "-q"]
+    command += ["--packet", "3", "--profile", "fast"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_real_waveforms(riegl, leica, tmp_path):
+    chain = load_profile("accurate")
+    with StripReader(riegl) as reader, reader.scan() as scan:
+        views = read_views(reader, scan, find_places(reader, scan, Wanted(points=(514,)), None), chain, PULSE)
+        assert views[0].packet == 475 and 514 in views[0].return_points
+        assert views[0].samples.max() == pytest.approx(183, abs=20)
+    pytest.importorskip("matplotlib")
+    assert run(leica, "-o", tmp_path / "l.png", "--most", 1).exit_code == 0
+
+
+def test_long_texts_lose_their_middle():
+    assert plain_text("a" * 100, 21) == "a" * 9 + "..." + "a" * 9
+    assert plain_text(" a\n\x00 b\t") == "a b" and plain_text("abc", 3) == "abc"
+
+
+def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
+    pytest.importorskip("matplotlib")
+    points = {
+        "fast": (8.0, 0.1),
+        "balanced": (10.0, 0.0701),
+        "accurate": (10.3, 0.07),
+        "gdecomp 1.0.6": (105.0, 0.082),
+        "scipy leastsq": (150.0, 0.0821),
+    }
+    rows = [
+        {"name": name, "kind": "peer" if " " in name else "chain", "kernels": {"median": time},
+         "figures": {"wrong": {"value": value, "error": 0.001}}}
+        for name, (time, value) in points.items()
+    ]  # fmt: skip
+    with open_picture(tmp_path / "b.png", (5.5, 4.6)) as figure:
+        axes = figure.subplots()
+        labels = _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
+        figure.draw_without_rendering()
+        _place_labels(axes, labels)
+        boxes = [text.get_window_extent() for text in axes.texts]
+        frame = axes.get_window_extent()
+    assert len(boxes) == 5
+    for number, box in enumerate(boxes):
+        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
+        for other in boxes[number + 1 :]:
+            assert not box.overlaps(other)

@@ -1,0 +1,161 @@
+"""`wavebatch stats`: return numbers, separations and flags against hand counts, whatever the order of the points."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli.stats import stats
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.errors import InputError
+from wavebatch.files.disk import buckets
+from wavebatch.files.disk.publish import publish_together
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
+from wavebatch.files.las.header import LasHeader
+from wavebatch.files.las.write_points import PointFile
+from wavebatch.tools.return_stats import returns
+from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
+
+
+def write_cloud(path, time, z, number, total, *, flags=None, point_format=1):
+    """A LAS file of points above each other, 1 mm units."""
+    records = [] if flags is None else [ExtraRecord.build("echo_flags", "u2", "bits")]
+    dtype = build_dtype(point_format, records)
+    rows = np.zeros(len(z), dtype)
+    rows["Z"] = np.rint(np.multiply(z, 1000))
+    rows["bit_fields"] = np.asarray(number) | np.asarray(total) << 3
+    if "gps_time" in dtype.names:
+        rows["gps_time"] = time
+    if flags is not None:
+        rows["echo_flags"] = flags
+    header = LasHeader((1, 2), point_format, 0, (0.001,) * 3, (0.0,) * 3)
+    file = PointFile(path, header, dtype, records, overwrite=True)
+    file.write(rows)
+    file.finish_points()
+    file.finish()
+    publish_together([file.draft])
+    return path
+
+
+SMALL = {
+    "time": np.array([1, 1, 1, 2, 3, 3, 4.0]),
+    "z": np.array([9, 8.2, 7, 5, 9, 6, 1]),
+    "number": np.array([1, 2, 3, 1, 1, 2, 1]),
+    "total": np.array([3, 3, 3, 1, 2, 2, 2]),
+}
+
+
+def check_small(found, by):
+    assert (found.points, found.pulses, found.incomplete, found.pulses_by) == (7, 4, 1, by)
+    assert found.by_number == pytest.approx({1: 4 / 7, 2: 2 / 7, 3: 1 / 7})
+    assert found.by_count == pytest.approx({1: 0.5, 2: 0.25, 3: 0.25})
+    assert found.separations["1-2"] == returns.Separation(2, pytest.approx(1.9), pytest.approx(0.8))
+    assert found.separations["2-3"] == returns.Separation(1, pytest.approx(1.2), pytest.approx(1.2))
+    assert found.separations["all"] == returns.Separation(3, pytest.approx(5.0 / 3), pytest.approx(0.8))
+    assert math.isnan(found.dead_zone)
+
+
+def test_small_cloud_is_counted(tmp_path):
+    each, total = count_returns([write_cloud(tmp_path / "c.las", **SMALL)])
+    check_small(each[0], "gps_time")
+    check_small(total, "gps_time")
+    assert each[0].flags is None
+
+
+def test_order_of_points_does_not_matter(tmp_path, rng):
+    order = rng.permutation(7)
+    shuffled = {name: values[order] for name, values in SMALL.items()}
+    check_small(count_returns([write_cloud(tmp_path / "c.laz", **shuffled)])[1], "gps_time")
+
+
+def test_without_times_rising_numbers_make_a_pulse(tmp_path, monkeypatch):
+    path = write_cloud(tmp_path / "c.las", **SMALL, point_format=0)
+    check_small(count_returns([path])[1], "return_number")
+    pieces = returns.ReturnReader.read_pieces
+    monkeypatch.setattr(returns.ReturnReader, "read_pieces", lambda self, size=2: pieces(self, 2))
+    check_small(count_returns([path])[1], "return_number")
+
+
+def test_times_that_are_all_alike_are_not_used(tmp_path):
+    many = {name: np.tile(values, 60) for name, values in SMALL.items()} | {"time": np.zeros(420)}
+    found = count_returns([write_cloud(tmp_path / "c.las", **many)])[1]
+    assert (found.pulses, found.pulses_by) == (240, "return_number")
+
+
+def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
+    receiver = DiscreteReceiver(most=3)
+    simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)
+    whole = count_returns([tmp_path / "c.laz"])[1]
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 500)
+    parts = count_returns([tmp_path / "c.laz"])[1]
+    assert parts.by_count == whole.by_count and parts.incomplete == whole.incomplete == 0
+    assert parts.separations["1-2"].least == whole.separations["1-2"].least
+    assert parts.separations["1-2"].mean == pytest.approx(whole.separations["1-2"].mean, rel=1e-12)
+    assert any(line.startswith("limit") for line in whole.warnings)
+
+
+@pytest.mark.parametrize(("deep", "limited"), [(1, False), (40, True)])
+def test_a_few_deep_pulses_are_no_limit_of_the_sensor(tmp_path, deep, limited):
+    count = np.r_[np.ones(50, int), np.full(deep, 4)]
+    number = np.concatenate([np.arange(1, n + 1) for n in count])
+    total, time = np.repeat(count, count), np.repeat(1.0 + np.arange(len(count)), count)
+    found = count_returns([write_cloud(tmp_path / "c.las", time, -2.0 * number, number, total)])[1]
+    assert any(line.startswith("limit") for line in found.warnings) == limited
+
+
+def test_flags_are_counted_and_points_without_echo_are_no_pair(tmp_path):
+    flags = [0, EchoFlag.NO_ECHO, 0, EchoFlag.WEAK | EchoFlag.OVERLAPPED, EchoFlag.OVERLAPPED, 0, 0]
+    found = count_returns([write_cloud(tmp_path / "c.las", **SMALL, flags=flags)])[1]
+    assert {name: n for name, n in found.flags.items() if n} == {"NO_ECHO": 1, "WEAK": 1, "OVERLAPPED": 2}
+    assert found.separations["all"].pairs == 1
+
+
+def test_total_is_the_sum_of_the_files(tmp_path):
+    path = write_cloud(tmp_path / "a.las", **SMALL)
+    other = write_cloud(tmp_path / "b.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
+    total = count_returns([path, other])[1]
+    assert (total.points, total.pulses, total.incomplete) == (14, 8, 2)
+    assert total.flags["WEAK"] == 7
+    assert total.separations["1-2"].pairs == 4
+
+
+def test_clouds_without_pairs_and_without_points(tmp_path):
+    single = {name: values[3:4] for name, values in SMALL.items()}
+    found = count_returns([write_cloud(tmp_path / "c.las", **single)])[1]
+    assert found.separations["all"].pairs == 0 and found.warnings == ()
+    none = {name: values[:0] for name, values in SMALL.items()}
+    found = count_returns([write_cloud(tmp_path / "d.las", **none)])[1]
+    assert (found.points, found.pulses) == (0, 0) and math.isnan(found.returns_per_pulse)
+
+
+def test_real_file(riegl):
+    found = count_returns([riegl])[1]
+    assert (found.points, found.pulses) == (2535, 2368)
+    assert found.by_number[1] == pytest.approx(0.9329, abs=1e-4)
+
+
+def test_a_cloud_that_cannot_be_read_is_named_and_the_others_are_counted(tmp_path):
+    good, bad = write_cloud(tmp_path / "good.las", **SMALL), tmp_path / "bad.las"
+    bad.write_bytes(b"LASF" + bytes(300))
+    with pytest.raises(InputError, match="bad.las"):
+        count_returns([bad])
+    result = CliRunner().invoke(stats, [str(bad), str(good), "--json"])
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"error: {bad}") and result.stderr.count("\n") == 1
+    document = json.loads(result.stdout)
+    assert [one["cloud"] for one in document["files"]] == [str(good)]
+    assert document["total"]["pulses"] == 4 and document["total"]["dead_zone"] is None
+
+
+def test_text_has_every_figure(tmp_path):
+    path = write_cloud(tmp_path / "c.las", **SMALL, flags=[EchoFlag.WEAK] * 7)
+    result = CliRunner().invoke(stats, [str(path)])
+    assert result.exit_code == 0
+    for text in ("pulses         4", "57.14%", "1-2", "1.900", "0.800", "WEAK", "warning        incomplete: 1 of 4"):
+        assert text in result.stdout
+    other = write_cloud(tmp_path / "d.las", **SMALL)
+    assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
+    assert "total" not in CliRunner().invoke(stats, [str(path), str(path)]).stdout  # one file counts once

@@ -1,0 +1,176 @@
+"""`wavebatch slice`: scan lines of a strip, surfaces in them, and the files they are written to."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli.slice import slice_
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
+from wavebatch.tools.slices import ScanLine, SliceOptions, cut_slice, find_segments, lines, read_scan_lines
+
+FLIGHT = Flight(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
+PULSES = 4000
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    """Four scan lines of 1000 pulses over facets of 0 to 40 degrees, 40 m wide."""
+    path = tmp_path_factory.mktemp("slices") / "slope.las"
+    simulate_strip("slope", path, pulses=PULSES, seed=6, flight=FLIGHT)
+    return path
+
+
+def read_all(path):
+    with StripReader(path) as reader:
+        return list(read_scan_lines(reader, reader.scan()))
+
+
+def test_scan_lines_are_those_of_the_flight(strip):
+    found = read_all(strip)
+    assert [line.number for line in found] == [0, 1, 2, 3]
+    for line in found:
+        number = np.rint((line.gps_time - 300_000_000.0) * FLIGHT.pulse_rate).astype(int)
+        assert set(number // 1000) == {line.number}
+        assert len(line) > 970
+        assert line.row[-1] == len(line) - 1 and len(line.value) == len(line.row) == len(line.time)
+        assert line.time.max() == 79.0
+
+
+def test_lines_do_not_depend_on_units_and_samples_are_those_of_the_strip(strip, monkeypatch):
+    whole = read_all(strip)
+    monkeypatch.setattr("wavebatch.files.strip.reader.UNIT_POINTS", 700)
+    parts = read_all(strip)
+    assert len(parts) == len(whole)
+    for one, other in zip(whole, parts, strict=True):
+        for name in ("point", "gps_time", "origin", "direction", "row", "time", "value"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)), name
+    with StripReader(strip) as reader:
+        unit = reader.read_unit(0, reader.scan())
+        block, _ = next(reader.read_blocks(unit, 5, True))
+    first = whole[0].value[whole[0].row == 0]
+    assert np.diff(first) == pytest.approx(np.diff(block.samples[0].astype(float)))
+
+
+def test_long_lines_are_cut_and_short_ones_left_out(strip, monkeypatch):
+    monkeypatch.setattr(lines, "MOST_PULSES", 300)
+    found = read_all(strip)
+    assert max(len(line) for line in found) == 300
+    monkeypatch.setattr(lines, "LEAST_PULSES", 250)
+    assert min(len(line) for line in read_all(strip)) >= 250
+
+
+def facet_slopes(y):
+    """Slope [deg] of the ground along y where it lies."""
+    number = np.floor((y - NORTH) / 80.0)
+    return 10.0 * (number % 5) * np.where((y - NORTH) - 80.0 * number < 40.0, 1, -1)
+
+
+def test_facets_are_found_with_their_slope_and_place(strip):
+    options = SliceOptions()
+    line = read_all(strip)[1]
+    segments = find_segments(cut_slice(line, options), options)
+    long = [segment for segment in segments if segment.length > 30]
+    assert len(long) >= 5
+    for segment in long:
+        middle = np.add(segment.start, segment.end) / 2
+        rising = segment.slope if segment.end[1] > segment.start[1] else -segment.slope
+        assert rising == pytest.approx(facet_slopes(middle[1]), abs=0.8)
+        assert abs(middle[0] - EAST - FLIGHT.speed * 0.03) < 2
+        assert segment.residual < 0.35
+        steep = np.tan(np.radians(abs(facet_slopes(middle[1]))))
+        across = (middle[1] - NORTH) % 80.0
+        assert middle[2] - GROUND == pytest.approx(steep * min(across, 80.0 - across), abs=0.3)
+        assert 0 <= segment.first_pulse < segment.last_pulse < len(line)
+        assert line.point[segment.first_pulse] == segment.first_point
+
+
+def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
+    n, count, spacing = 200, 80, 0.5
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 50 * np.exp(-0.5 * ((sample * spacing - 10 - 0.05 * row) / 2.0) ** 2)
+    origin = np.stack([0.6 * np.arange(n), np.zeros(n), np.full(n, 100.0)], axis=1)
+    line = ScanLine(
+        *(4, np.arange(n), np.arange(n) * 1e-5, origin, np.tile([0, 0, -0.15], (n, 1)), spacing, row),
+        *(sample * spacing, value.astype(np.float32)),
+    )
+    options = SliceOptions(geometry="time")
+    (segment,) = find_segments(cut_slice(line, options), options)
+    assert (segment.line, segment.first_pulse, segment.last_pulse) == (4, 0, 199)
+    for time, pulse in segment.ends:
+        assert time == pytest.approx(10 + 0.05 * pulse, abs=0.05)
+    for place, (time, pulse) in zip((segment.start, segment.end), segment.ends, strict=True):
+        assert place == pytest.approx((0.6 * np.clip(pulse, 0, n - 1), 0, 100 - 0.15 * time), abs=1e-6)
+    assert segment.residual < 0.1
+
+
+@pytest.mark.parametrize("wrong", [{"geometry": "polar"}, {"std": 0}, {"sigma": -1.0}, {"shortest": 0}, {"most": 0}])
+def test_wrong_options_are_refused(wrong):
+    with pytest.raises(ConfigError):
+        SliceOptions(**wrong)
+
+
+def run(*arguments):
+    return CliRunner().invoke(slice_, [str(argument) for argument in arguments])
+
+
+def test_csv_and_geojson_hold_the_same_segments(strip, tmp_path):
+    result = run(strip, "-o", tmp_path / "s.csv", "--lines", "1:3", "--json")
+    assert result.exit_code == 0, result.output
+    counts = json.loads(result.stdout)
+    assert counts["lines"] == 2 and 1.7 < counts["sigma"] < 2.6
+    rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
+    assert len(rows) == counts["segments"] > 8
+    assert {row["line"] for row in rows} == {"1", "2"}
+    assert run(strip, "-o", tmp_path / "s.geojson", "--lines", "1:3", "-q").output == ""
+    features = json.loads((tmp_path / "s.geojson").read_text())["features"]
+    assert len(features) == len(rows)
+    for row, feature in zip(rows, features, strict=True):
+        ends = feature["geometry"]["coordinates"]
+        assert [float(row[name]) for name in ("x1", "y1", "z1")] == pytest.approx(ends[0])
+        assert float(row["length"]) == pytest.approx(np.linalg.norm(np.subtract(*ends)), rel=1e-3)
+
+
+def test_picture_of_a_slice(strip, tmp_path):
+    pytest.importorskip("matplotlib")
+    for geometry in ("plane", "time"):
+        target = tmp_path / f"{geometry}.png"
+        assert run(strip, "--png", target, "--lines", "2", "--geometry", geometry).exit_code == 0
+        assert target.read_bytes().startswith(b"\x89PNG")
+
+
+def test_errors_are_one_line_and_leave_nothing(strip, tmp_path):
+    (tmp_path / "old.csv").write_text("x")
+    cases = [
+        ((strip, "-o", tmp_path / "old.csv"), 1, "exists already"),
+        ((strip, "-o", tmp_path / "s.txt"), 2, ".csv or .geojson"),
+        ((strip, "-o", tmp_path / "s.csv", "--std", "0"), 2, "above 0"),
+        ((tmp_path / "none.las", "-o", tmp_path / "s.csv"), 1, "none.las"),
+        ((strip, "--png", tmp_path / "s.png", "--lines", "99"), 1, "--lines"),
+    ]
+    for arguments, code, text in cases:
+        result = run(*arguments)
+        assert result.exit_code == code, result.output
+        assert text in result.stderr
+    assert run(strip).exit_code == 2
+    assert run(strip, "-o", tmp_path / "s.csv", "--lines", "a").exit_code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["old.csv"]
+
+
+def test_a_shuffled_strip_says_what_to_do(tiny_strip, tmp_path, edit_points, rng):
+    shuffled = edit_points(tiny_strip, tmp_path / "s.las", lambda points: rng.permutation(points))
+    result = run(shuffled, "-o", tmp_path / "s.csv")
+    assert result.exit_code == 1
+    assert "order of time" in result.stderr
+
+
+def test_real_strip(riegl, tmp_path):
+    result = run(riegl, "-o", tmp_path / "s.csv", "--json")
+    assert result.exit_code == 0, result.output
+    counts = json.loads(result.stdout)
+    assert counts["lines"] > 50 and counts["segments"] > 50

@@ -1,0 +1,583 @@
+"""Strips into voxels: energy, places, light, and the same bytes however it was cut."""
+
+import json
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C, SQRT_2PI
+from wavebatch.core.waveforms import Digitizer, SystemPulse
+from wavebatch.files.las.header import read_header
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.kernels.physics.radiometry import backscatter, cross_section
+from wavebatch.surveying import Survey, survey_block
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.sensor import SensorRequest
+from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.blocks import simulate_block
+from wavebatch.tools.simulate.geometry import Flight
+from wavebatch.tools.simulate.pulses import find_pulse
+from wavebatch.tools.simulate.render import Recording
+from wavebatch.tools.simulate.strip import WKT, StripOptions
+from wavebatch.tools.voxels import Deconvolution, VoxelOptions, voxelize_strip
+from wavebatch.tools.voxels.ceiling import Ceiling
+from wavebatch.tools.voxels.profile import _pulse_taps, deconvolve_block
+
+SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.05)
+SAVED = SavedSurvey(Survey(SYSTEM, 1000, {}, ()))
+DOWN = np.array([0.0, 0.0, -HALF_C])
+
+
+def write_strip(path, echoes, *, sigma=2.0, height=110.0, directions=None, xy=None, point_format=4, wkt=None, bits=8,
+                noise=0.5, seed=1, returns=True):  # fmt: skip
+    """A strip of pulses whose echoes are lists of (height [m], amplitude); sample 0 lies at `height` (n,)."""
+    rng, s = np.random.default_rng(seed), 160
+    n = len(echoes)
+    height = np.broadcast_to(height, n)
+    xy = np.stack([np.arange(n) * 0.3 + 0.1, np.full(n, 0.4)], axis=1) if xy is None else np.asarray(xy)
+    directions = np.tile(DOWN, (n, 1)) if directions is None else np.asarray(directions)
+    time = np.arange(s)
+    signal = np.full((n, s), 12.0)
+    points = []
+    for row, pairs in enumerate(echoes):
+        shift = rng.uniform(-0.5, 0.5) if returns else 0.0
+        for number, (z, amplitude) in enumerate(pairs or [(100.0, 0.0)]):
+            at = (z - height[row]) / directions[row, 2]
+            signal[row] += amplitude * np.exp(-0.5 * ((time - at) / sigma) ** 2)
+            points.append((row, number + 1, max(len(pairs), 1), at, at + shift))
+    counts = np.clip(np.rint(signal + noise * rng.standard_normal(signal.shape)), 0, 2**bits - 1)
+    version = "1.4" if point_format > 5 else "1.3"
+    writer = FullwaveWriter(
+        path, version=version, point_format=point_format, internal=True, digitizers=[Digitizer(1, bits, s, 1.0)],
+        wkt=wkt,
+    )  # fmt: skip
+    with writer:
+        offset = writer.write_packets(counts.astype(f"<u{bits // 8}"), 1)
+        rows = np.zeros(len(points), writer.dtype)
+        table = np.array(points)
+        row = table[:, 0].astype(int)
+        start = np.column_stack([xy, height])
+        place = start[row] + directions[row] * table[:, 3:4]
+        for axis, name in enumerate("XYZ"):
+            rows[name] = np.rint(place[:, axis] / 0.001)
+        for axis, name in enumerate(("x_t", "y_t", "z_t")):
+            rows[name] = -directions[row, axis] / 1000.0
+        shift = 4 if point_format > 5 else 3
+        rows["bit_fields"] = table[:, 1].astype(int) | (table[:, 2].astype(int) << shift)
+        rows["gps_time"] = 1000.0 + row * 1e-5
+        rows["wavepacket_index"], rows["wavepacket_offset"] = 1, offset[row]
+        rows["wavepacket_size"] = s * bits // 8
+        rows["return_point_wave_location"] = table[:, 4] * 1000.0
+        writer.write_points(rows)
+        writer.commit()
+    return path
+
+
+def load(path):
+    with np.load(path) as file:
+        return {name: file[name] for name in file}
+
+
+def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, **options):
+    settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed)
+    summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), **options)
+    return summary, load(target) if target.suffix == ".npz" else laspy.read(target)
+
+
+def sum_by_layer(found):
+    """Energy by height of the layer's lower face."""
+    z = found["origin"][2] + found["index"][:, 2] * found["size"]
+    return {round(float(one), 6): float(found["energy"][z == one].sum()) for one in np.unique(z)}
+
+
+@pytest.fixture(scope="module")
+def forest(tmp_path_factory):
+    """1500 pulses over a forest, and the truth."""
+    folder = tmp_path_factory.mktemp("voxels")
+    flight = Flight(half_angle=3.0, pulse_rate=50_000.0)
+    simulate_strip("forest", folder / "forest.las", pulses=1500, seed=8, truth=folder / "truth.npz", flight=flight)
+    return folder / "forest.las", folder / "truth.npz"
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(("scene", "least", "most"), [("flat", 0.997, 1.01), ("forest", 0.995, 1.01)])
+def test_energy_is_that_of_the_echoes(scene, least, most, seed):
+    block, truth = simulate_block(scene, 3000, np.random.default_rng(seed))
+    profiles = deconvolve_block(block, SYSTEM, Deconvolution())
+    energy = profiles.value.sum() * profiles.area
+    assert least < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < most
+
+
+@pytest.mark.parametrize("name", ["riegl", "leica"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_energy_of_learned_pulses_is_that_of_the_waveforms(name, seed):
+    recording = Recording(n_samples=160, pulse=find_pulse(name), baseline_spread=0.0)
+    block, truth = simulate_block("flat", 3000, np.random.default_rng(seed), recording=recording)
+    system = survey_block(block).system
+    assert len(system.components) > 1
+    profiles = deconvolve_block(block, system, Deconvolution())
+    energy = profiles.value.sum() * profiles.area
+    assert energy == pytest.approx(float((block.samples - 12.0).sum()), rel=0.04)
+    off = np.arange(160) - truth.time[:, None]
+    near = profiles.value[truth.waveform][np.abs(off) < 3].sum()
+    assert near > 0.97 * profiles.value.sum()
+
+
+def test_a_learned_pulse_ends_where_nothing_was_measured():
+    wide = replace(SYSTEM, sigma_ref=1.86, components=((1.0, 0.0, 1.83), (0.025, -0.3, 13.6), (0.03, 10.9, 1.2)))
+    taps, area = _pulse_taps(wide, 1.0)
+    lag = np.flatnonzero(taps) - len(taps) // 2
+    assert lag.min() == -9 and lag.max() == 25 and taps.max() == pytest.approx(1.0, abs=0.01)
+    assert area == pytest.approx(taps.sum())
+
+
+@pytest.mark.parametrize("method", ["gold", "wiener"])
+def test_energy_is_kept_by_every_method(method):
+    block, truth = simulate_block("flat", 2000, np.random.default_rng(4))
+    profiles = deconvolve_block(block, SYSTEM, Deconvolution(method))
+    energy = profiles.value.sum() * profiles.area
+    assert 0.97 < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < 1.06
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_noise_is_no_signal(seed):
+    block, truth = simulate_block("empty", 6000, np.random.default_rng(seed))
+    empty = truth.count(len(block)) == 0
+    seen = deconvolve_block(block, SYSTEM, Deconvolution()).seen
+    assert seen[empty].mean() < 0.005 and seen[~empty].mean() > 0.98
+    loose = deconvolve_block(block, SYSTEM, Deconvolution(threshold=1.0)).seen
+    assert loose[empty].mean() > 0.05
+
+
+def test_profiles_do_not_depend_on_the_block():
+    block, _ = simulate_block("forest", 300, np.random.default_rng(7))
+    for options in (Deconvolution(), Deconvolution("gold", iterations=20), Deconvolution("wiener")):
+        whole = deconvolve_block(block, SYSTEM, options)
+        for rows in (slice(0, 1), slice(1, 4), slice(250, 300)):
+            part = deconvolve_block(block.rows(rows), SYSTEM, options)
+            for name in ("value", "offset", "seen", "clipped"):
+                assert np.array_equal(getattr(whole, name)[rows], getattr(part, name)), name
+    with pytest.raises(ValueError, match="read-only"):
+        block.samples[0, 0] = 1
+
+
+def test_voxels_hold_all_energy_and_lie_where_the_echoes_are(forest, tmp_path):
+    strip, truth = forest
+    summary, found = voxelize(strip, tmp_path / "v.npz", 1.0)
+    true = load(truth)
+    energy = true["amplitude"] * true["sigma"] * SQRT_2PI
+    assert summary.energy == pytest.approx(float(np.sum(found["energy"], dtype=np.float64)), rel=1e-6)
+    assert summary.energy == pytest.approx(energy.sum(), rel=0.015)
+    place = np.stack([true[name] for name in "xyz"], axis=1)
+    index = np.floor((place - found["origin"]) / 1.0).astype(int)
+    # Within one voxel of a true echo: their steps and widths reach over faces.
+    near = {tuple(one + off) for one in index for off in np.ndindex(3, 3, 3)}
+    inside = np.array([tuple(one) in near for one in (found["index"] + 1).tolist()])
+    assert found["energy"][inside].sum() > 0.99 * summary.energy
+    assert summary.voxels == len(found["index"]) and summary.shape == tuple(found["index"].max(axis=0) + 1)
+    assert (found["energy"] > 0).all() and (found["index"].min(axis=0) == 0).all()
+    assert np.array_equal(found["index"], found["index"][np.lexsort(found["index"].T[::-1])])
+    assert len(np.unique(found["index"], axis=0)) == len(found["index"])
+
+
+@pytest.mark.parametrize("size", [1.0, 0.5, 0.05])
+def test_a_plane_fills_the_voxels_of_its_layer(tmp_path, size):
+    strip = write_strip(tmp_path / "plane.las", [[(100.0 + size / 2 if size > 0.2 else 100.02, 80.0)]] * 200)
+    summary, found = voxelize(strip, tmp_path / "v.npz", size)
+    assert summary.anchored == summary.with_signal == 200
+    layers = sum_by_layer(found)
+    assert summary.energy == pytest.approx(200 * 80 * 2.0 * SQRT_2PI, rel=0.01)
+    if size > 0.2:
+        assert layers[100.0] > 0.97 * summary.energy if size == 1.0 else layers[100.0] > 0.8 * summary.energy
+        low = found["index"][np.rint(found["origin"][2] / size) + found["index"][:, 2] == np.rint(100.0 / size)]
+        assert np.array_equal(np.unique(low[:, 0]), np.arange(round(60.0 / size)))
+        return
+    # Smaller than a sample's way: a column of voxels without holes.
+    for x in np.unique(found["index"][:, 0]).tolist():
+        z = np.sort(found["index"][found["index"][:, 0] == x, 2])
+        assert (np.diff(z) == 1).all() and len(z) >= 3
+    centre = sum(z * e for z, e in layers.items()) / summary.energy + size / 2
+    assert centre == pytest.approx(100.02, abs=0.02)
+
+
+@pytest.mark.parametrize(("iterations", "least", "most"), [(None, 0.37, 0.18), (200, 0.46, 0.04)])
+def test_two_surfaces_that_the_waveform_shows_as_one_are_two_layers(tmp_path, iterations, least, most):
+    pulse = replace(SYSTEM, sigma_ref=4.2)
+    separation = 1.2
+    strip = write_strip(tmp_path / "two.las", [[(101.35, 60.0), (101.35 - separation, 60.0)]] * 150, sigma=4.2)
+    with StripReader(strip) as reader:
+        block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 500, True))
+    mean = block.samples.mean(axis=0)
+    assert np.count_nonzero((mean[1:-1] > mean[:-2]) & (mean[1:-1] >= mean[2:]) & (mean[1:-1] > 20)) == 1
+    saved = SavedSurvey(Survey(pulse, 150, {}, ()))
+    method = Deconvolution(iterations=iterations)
+    _, found = voxelize(strip, tmp_path / "v.npz", 0.3, system=saved, deconvolution=method)
+    layers = sum_by_layer(found)
+    energy = sum(layers.values())
+    heights = np.array(sorted(layers))
+    values = np.array([layers[h] for h in heights]) / energy
+
+    def near(z):
+        return values[np.abs(heights + 0.15 - z) < 0.35].sum()
+
+    assert near(101.35) > least and near(101.35 - separation) > least
+    assert near(101.35 - separation / 2) < most
+
+
+def naive_voxels(strip, size, headroom):
+    """Rays per voxel, by small steps along every ray: what each crosses from its begin to its last signal."""
+    rays = {}
+    with StripReader(strip) as reader, reader.scan() as scan:
+        for number in range(reader.unit_count()):
+            for block, _ in reader.read_blocks(reader.read_unit(number, scan), 1000, True):
+                profiles = deconvolve_block(block, SYSTEM, Deconvolution())
+                for row in range(len(block)):
+                    signal = np.flatnonzero(profiles.value[row])
+                    end = (signal[-1] if len(signal) else block.samples.shape[1] - 1) + 0.5
+                    speed = np.linalg.norm(block.direction[row])
+                    time, offset = np.arange(-0.5 - headroom / speed, end, 0.008), profiles.offset[row]
+                    place = block.origin[row] + (time[:, None] - offset) * block.direction[row]
+                    for cell in np.unique(np.floor(place / size), axis=0).tolist():
+                        rays[tuple(cell)] = rays.get(tuple(cell), 0) + 1
+    return rays
+
+
+@pytest.mark.parametrize("headroom", [0.0, 4.0])
+def test_rays_through_voxels_are_those_of_a_slow_tracer(tmp_path, headroom):
+    rng = np.random.default_rng(12)
+    directions = DOWN + rng.normal(0, 0.02, (40, 3)) * [1, 1, 0]
+    echoes = [[(103.0, 40.0), (100.0, 50.0)] if i % 3 else [] for i in range(40)]
+    strip = write_strip(tmp_path / "s.las", echoes, directions=directions, xy=rng.uniform(0, 3, (40, 2)))
+    _, found = voxelize(strip, tmp_path / "v.npz", 0.7, headroom=headroom, all_crossed=True)
+    slow = naive_voxels(strip, 0.7, headroom)
+    base = np.rint(found["origin"] / 0.7)
+    mine = {tuple(one): int(n) for one, n in zip((found["index"] + base).tolist(), found["rays"], strict=True)}
+    assert set(slow) <= set(mine)
+    # What small steps miss are corners that a ray only cuts.
+    off = [one for one in mine if mine[one] != slow.get(one, 0)]
+    assert all(mine[one] - slow.get(one, 0) == 1 for one in off) and len(off) < 0.03 * len(mine)
+    top = found["index"][:, 2].max() * 0.7 + found["origin"][2]
+    assert top <= 110.2 + headroom <= top + 0.85
+
+
+def test_every_ray_that_crossed_a_voxel_with_signal_counts(tmp_path):
+    """A tree of 20 m between oblique rays whose waveforms begin 4 m above the ground."""
+    tree, ground = [[(120.5, 60.0)]] * 30, [[(100.5, 60.0)]] * 30
+    unit = np.array([0.3, 0.0, -1.0]) / np.hypot(0.3, 1.0) * HALF_C
+    x = np.concatenate([np.full(30, 0.5), np.full(30, 0.5 + 0.3 * (120.5 - 104.0))])
+    strip = write_strip(
+        tmp_path / "tree.las", tree + ground, xy=np.column_stack([x, np.full(60, 0.5)]),
+        height=[125.0] * 30 + [104.0] * 30, directions=[DOWN] * 30 + [unit] * 30,
+    )  # fmt: skip
+    crowns = []
+    for headroom in (0.0, None, 300.0):
+        _, found = voxelize(strip, tmp_path / "v.npz", 1.0, headroom=headroom, overwrite=True)
+        z = found["origin"][2] + found["index"][:, 2]
+        row = np.flatnonzero((z == 120.0) & (found["index"][:, 0] == -found["origin"][0]))
+        assert len(row) == 1
+        crowns.append({name: float(found[name][row[0]]) for name in ("rays", "light", "path", "share")})
+    assert crowns[0]["rays"] == 30 and crowns[1]["rays"] == 60 and crowns[1] == crowns[2]
+    assert crowns[0]["share"] > 0.9 and crowns[1]["share"] == pytest.approx(crowns[0]["share"] / 2, abs=0.01)
+
+
+def test_followed_up_to_the_highest_return_rays_count_as_if_from_the_sensor(tmp_path):
+    strip = tmp_path / "hills.las"
+    flight = Flight(half_angle=3.0, pulse_rate=30_000.0)
+    simulate_strip("urban", strip, pulses=1500, seed=4, flight=flight)
+    near, far = (
+        voxelize(strip, tmp_path / "v.npz", 0.8, headroom=headroom, overwrite=True)[1] for headroom in (None, 300.0)
+    )
+    for name in ("index", "energy"):
+        assert np.array_equal(near[name], far[name])
+    # Signal high above all returns is rare, and noise.
+    for name in ("rays", "light", "path", "share"):
+        assert np.mean(near[name] != far[name]) < 0.01
+
+
+@pytest.mark.parametrize("most", [8, 100, 1 << 18])
+def test_ceilings_are_those_of_a_slow_search(monkeypatch, most):
+    monkeypatch.setattr("wavebatch.tools.voxels.ceiling.MOST_CELLS", most)
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0, 120, (300, 3)) * [1, 1, 0.3]
+    ceiling = Ceiling(np.array([60.0, 60.0, 0.0]), 1.0)
+    for part in (points[:100], points[100:101], points[101:]):
+        ceiling.add(part)
+    ceiling.add(np.array([[np.nan, 0, 1], [1e300, 0, 1], [0, 0, np.inf]]))
+    ceiling.finish()
+    assert len(ceiling._key) <= 9 * most
+    start = np.column_stack([rng.uniform(0, 120, (80, 2)), np.zeros(80)])
+    step = np.column_stack([rng.normal(0, 0.05, (80, 2)), np.full(80, -0.1)])
+    start[0, 0], step[1], step[2, 2] = np.nan, 0.0, 0.001
+    headroom = ceiling.measure_headroom(start, step)
+    assert headroom[:3].tolist() == [0.0, 0.0, 0.0]
+    unit = -step / np.linalg.norm(np.where(step == 0, 1e-30, step), axis=1)[:, None]
+    for row in range(3, 80):
+        way = np.arange(0, 60, 0.25)
+        place = start[row] + unit[row] * way[:, None]
+        gap = np.abs(place[:, None, :2] - points[None, :, :2]).max(axis=2)
+        # Whatever lies in the same cell lies within a cell; whatever is higher there needs the ray.
+        needed = (np.where(gap < 0.5 * ceiling.cell, points[:, 2], -np.inf).max(axis=1) > place[:, 2])
+        assert headroom[row] >= (way[needed].max() if needed.any() else 0.0)
+        assert headroom[row] <= 39.0 / unit[row, 2] + 2 * ceiling.cell
+
+
+def test_strips_in_degrees_are_refused(tmp_path):
+    wkt = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],' \
+        'UNIT["degree",0.0174532925199433]]'  # fmt: skip
+    strip = write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30, point_format=9, wkt=wkt)
+    with pytest.raises(InputError, match="degrees"):
+        voxelize(strip, tmp_path / "v.npz", 1.0)
+
+
+def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tmp_path):
+    echoes = [[(105.5, 60.0), (102.5, 20.0)]] * 40 + [[]] * 10
+    xy = np.column_stack([np.full(50, 0.5), np.full(50, 0.5)])
+    strip = write_strip(tmp_path / "s.las", echoes, xy=xy)
+    _, some = voxelize(strip, tmp_path / "a.npz", 1.0)
+    _, every = voxelize(strip, tmp_path / "b.npz", 1.0, all_crossed=True)
+    height = {round(float(z)): row for row, z in enumerate(every["origin"][2] + every["index"][:, 2])}
+    rays, light, share, energy = (every[name] for name in ("rays", "light", "share", "energy"))
+    for z in (109, 108, 107):
+        row = height[z]
+        assert (rays[row], light[row], share[row], energy[row]) == (50, 50, 0, 0)
+    top, middle, low = height[105], height[104], height[102]
+    assert rays[top] == 50 and share[top] == pytest.approx(40 * 0.75 / 50, abs=0.03)
+    assert rays[middle] == 50 and light[middle] == pytest.approx(10 + 40 * 0.25, abs=1.5)
+    assert share[low] == pytest.approx(0.5, abs=0.05) and light[height[101]] == pytest.approx(10, abs=0.5)
+    assert rays[height[100]] == 10 and every["path"][height[108]] == pytest.approx(50, abs=0.01)
+    assert height[min(height)] == 0 and min(height) < 90
+    kept = every["energy"] > 0
+    for name in ("energy", "rays", "light", "share", "path"):
+        assert np.array_equal(some[name], every[name][kept])
+
+
+@pytest.mark.parametrize("target", ["v.npz", "v.laz"])
+def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target, monkeypatch):
+    strip, _ = forest
+    folder = tmp_path / "whole"
+    folder.mkdir()
+    options = {"all_crossed": target == "v.npz"}
+    voxelize(strip, folder / target, 0.8, **options)
+    whole = (folder / target).read_bytes()
+    for block_size, held in ((97, 1 << 20), (600, 500), (1500, 3)):
+        voxelize(strip, tmp_path / target, 0.8, block_size=block_size, held=held, overwrite=True, **options)
+        assert (tmp_path / target).read_bytes() == whole
+    monkeypatch.setattr("wavebatch.kernels.geometry.voxels.AT_A_TIME", 700)
+    voxelize(strip, tmp_path / target, 0.8, overwrite=True, **options)
+    assert (tmp_path / target).read_bytes() == whole
+
+
+def test_two_halves_of_a_strip_add_up_to_the_whole(tmp_path):
+    rng = np.random.default_rng(3)
+    echoes = [[(rng.uniform(98, 106), rng.uniform(20, 80))] for _ in range(120)]
+    xy = rng.uniform(0, 4, (120, 2))
+    parts = [slice(0, 120), slice(0, 50), slice(50, 120)]
+    tables = []
+    for number, part in enumerate(parts):
+        strip = write_strip(tmp_path / f"{number}.las", echoes[part], xy=xy[part], noise=0.0, returns=False)
+        _, found = voxelize(strip, tmp_path / f"{number}.npz", 0.5, all_crossed=True)
+        cells = np.rint(found["origin"] / 0.5) + found["index"]
+        values = zip(found["energy"].astype(float), found["rays"].astype(float), strict=True)
+        tables.append(dict(zip(map(tuple, cells.tolist()), values, strict=True)))
+    whole, first, second = tables
+    assert set(whole) == set(first) | set(second)
+    for cell, (energy, rays) in whole.items():
+        a, b = first.get(cell, (0, 0)), second.get(cell, (0, 0))
+        assert rays == a[1] + b[1] and energy == pytest.approx(a[0] + b[0], rel=1e-6, abs=1e-5)
+
+
+@pytest.mark.parametrize(("point_format", "output"), [(4, 0), (5, 0), (9, 6), (10, 6)])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_point_cloud_holds_what_the_npz_holds(tmp_path, point_format, output, suffix):
+    wkt = WKT if output == 6 else None
+    strip = write_strip(tmp_path / "s.las", [[(104.0, 50.0), (100.3, 40.0)]] * 50, point_format=point_format, wkt=wkt)
+    _, found = voxelize(strip, tmp_path / "v.npz", 0.3)
+    summary, cloud = voxelize(strip, tmp_path / f"v{suffix}", 0.3)
+    assert cloud.header.point_format.id == output and summary.voxels == len(cloud.points) == len(found["index"])
+    centre = found["origin"] + (found["index"] + 0.5) * 0.3
+    assert np.stack([cloud.x, cloud.y, cloud.z], axis=1) == pytest.approx(centre, abs=1e-9)
+    names = list(cloud.point_format.extra_dimension_names)
+    assert names == ["energy", "rays", "path", "light", "share"]
+    for name in names:
+        assert np.array_equal(np.asarray(cloud[name]), found[name])
+    assert (np.asarray(cloud.return_number) == 1).all() and (np.asarray(cloud.number_of_returns) == 1).all()
+    assert str(found["crs"]) == (wkt or "")
+    header = read_header(tmp_path / f"v{suffix}")
+    kept = [vlr for vlr in header.vlrs if vlr.user == "LASF_Projection"]
+    assert [vlr.payload.rstrip(b"\0").decode() for vlr in kept] == ([wkt] if wkt else [])
+    assert bool(header.global_encoding & 16) == (output == 6)
+    meta = [json.loads(vlr.payload) for vlr in header.vlrs if vlr.user == "wavebatch"]
+    assert meta == [json.loads(str(found["meta"]))] and meta[0]["deconvolution"]["iterations"] == 40
+
+
+CALIBRATION = Calibration(2.5e-8, 0.03, 0.22, 0.5)
+
+
+@pytest.fixture(scope="module")
+def level(tmp_path_factory):
+    """500 pulses over level ground, echoes of the system's width."""
+    path = tmp_path_factory.mktemp("level") / "flat.las"
+    simulate_strip(
+        "flat", path, pulses=500, seed=2, truth=path.with_suffix(".npz"), options=StripOptions(without_waveform=0.0)
+    )
+    return path
+
+
+def test_cross_sections_are_those_of_the_echoes(level, tmp_path):
+    summary, found = voxelize(level, tmp_path / "v.npz", 1.0, calibration=CALIBRATION)
+    truth = load(level.with_suffix(".npz"))
+    gamma = backscatter(2.5e-8, truth["range"], truth["amplitude"], truth["sigma"], 0.22)
+    expected = cross_section(gamma, truth["range"], 0.5e-3)
+    assert summary.sensor == "direction vectors" and summary.unknown == 0
+    assert np.sum(found["cross_section"], dtype=np.float64) == pytest.approx(expected.sum(), rel=0.02)
+    assert list(found)[:3] == ["index", "energy", "cross_section"]
+    again, _ = voxelize(level, tmp_path / "w.npz", 1.0)
+    assert again.sensor is None and again.energy == summary.energy
+
+
+def test_what_is_not_known_is_no_data_never_zero(level, tmp_path):
+    path = tmp_path / "trajectory.txt"
+    with StripReader(level) as reader:
+        block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 5000, True))
+    middle = float(np.median(block.gps_time))
+    rows = []
+    for time in np.linspace(block.gps_time.min() - 0.01, middle, 30):
+        ray = np.argmin(np.abs(block.gps_time - time))
+        sensor = block.origin[ray] - block.direction[ray] * 5000.0
+        rows.append(f"{time:.7f} {sensor[0]:.3f} {sensor[1]:.3f} {sensor[2]:.3f}")
+    path.write_text("time x y z\n" + "\n".join(rows) + "\n")
+    for target in ("v.npz", "v.las"):
+        summary, found = voxelize(
+            level, tmp_path / target, 1.0, calibration=CALIBRATION, sensor=SensorRequest(trajectory=path)
+        )
+        assert 0 < summary.unknown < summary.with_signal
+        section = np.asarray(found["cross_section"])
+        none = np.isnan(section) if target == "v.npz" else section == -9999.0
+        assert 0 < none.sum() < len(none) and (section[~none] > 0).all()
+
+
+def test_calibration_without_divergence_or_sensor_is_refused(level, tmp_path):
+    with pytest.raises(ConfigError, match="divergence"):
+        voxelize(level, tmp_path / "v.npz", 1.0, calibration=replace(CALIBRATION, divergence=None))
+    strip = write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30)
+    with pytest.raises(InputError, match="where the sensor was"):
+        voxelize(strip, tmp_path / "v.npz", 1.0, calibration=CALIBRATION)
+    assert not (tmp_path / "v.npz").exists()
+    summary, _ = voxelize(
+        strip, tmp_path / "v.npz", 1.0, calibration=CALIBRATION, sensor=SensorRequest(height=500.0)
+    )
+    assert summary.sensor == "flight height" and summary.unknown == 0
+
+
+def test_rays_far_from_all_others_are_counted_and_left_out(forest, tmp_path, edit_points):
+    strip, _ = forest
+
+    def throw(points):
+        points["X"][:40] = 2_147_000_000
+        points["Z"][40:60] = -2_147_000_000
+        return points
+
+    bent = edit_points(strip, tmp_path / "bent.las", throw)
+    summary, found = voxelize(bent, tmp_path / "v.npz", 0.2)
+    assert 30 < summary.outside <= 60 and summary.waveforms > 1450
+    assert np.ptp(found["index"], axis=0).max() < 5000
+
+
+def test_voxels_too_small_for_the_strip_are_one_line(forest, tmp_path):
+    with pytest.raises(ConfigError, match=r"--size 1e-06: too small .* take \S+ m or more"):
+        voxelize(forest[0], tmp_path / "v.npz", 1e-6)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"size": 0.0}, {"size": -1.0}, {"size": float("nan")}, {"size": 1e9}, {"headroom": -1.0}, {"headroom": np.inf}],
+)
+def test_wrong_sizes_are_refused(wrong):
+    with pytest.raises(ConfigError):
+        VoxelOptions(**{"size": 1.0, **wrong})
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"method": "clean"}, {"iterations": 0}, {"method": "wiener", "iterations": 5}, {"snr": 5.0},
+        {"method": "wiener", "snr": 0.0}, {"threshold": -1.0},
+    ],
+)  # fmt: skip
+def test_wrong_deconvolutions_are_refused(wrong):
+    with pytest.raises(ConfigError):
+        Deconvolution(**wrong)
+
+
+def test_an_output_is_refused_or_replaced_and_never_the_strip(forest, tmp_path):
+    strip = Path(write_strip(tmp_path / "s.las", [[(100.0, 50.0)]] * 30))
+    (tmp_path / "v.npz").write_text("old")
+    with pytest.raises(InputError, match="exists already"):
+        voxelize(strip, tmp_path / "v.npz", 1.0)
+    voxelize(strip, tmp_path / "v.npz", 1.0, overwrite=True)
+    before = strip.read_bytes()
+    with pytest.raises(InputError, match="is the strip itself"):
+        voxelize(strip, strip, 1.0, overwrite=True)
+    with pytest.raises(ConfigError, match=r"\.npz, \.las or \.laz"):
+        voxelize(strip, tmp_path / "v.tif", 1.0)
+    assert strip.read_bytes() == before and sorted(p.name for p in tmp_path.iterdir()) == ["s.las", "v.npz"]
+
+
+def test_a_strip_without_any_signal_gives_no_voxel(tmp_path):
+    strip = write_strip(tmp_path / "s.las", [[]] * 20)
+    for target in ("v.npz", "v.laz", "v.las"):
+        summary, found = voxelize(strip, tmp_path / target, 1.0)
+        assert summary.voxels == summary.with_signal == 0 and summary.waveforms == 20 and summary.shape == (0, 0, 0)
+        assert len(found["energy"]) == 0
+
+
+def test_32_bit_samples_do_not_overflow(tmp_path):
+    strip = write_strip(tmp_path / "s.las", [[(100.5, 4e9)]] * 60, bits=32, xy=np.full((60, 2), 0.5), noise=0.0)
+    summary, found = voxelize(strip, tmp_path / "v.npz", 1.0)
+    assert summary.energy == pytest.approx(60 * 4e9 * 2 * SQRT_2PI, rel=0.03)
+    assert found["energy"].max() > 0.9 * summary.energy
+
+
+def test_real_strips(riegl, leica, tmp_path):
+    for path, waveforms in ((riegl, 2375), (leica, 999)):
+        summary, found = voxelize(path, tmp_path / "v.npz", 0.5, system=None, overwrite=True)
+        assert summary.waveforms == waveforms and summary.with_signal > 0.99 * waveforms
+        assert summary.anchored > 0.98 * summary.with_signal and summary.outside == 0
+        with StripReader(path) as reader:
+            points = reader.read_points(0, reader.facts.point_count)
+            scales, offsets = np.array(reader.facts.scales), np.array(reader.facts.offsets)
+        xyz = np.stack([points[name] for name in "XYZ"], axis=1) * scales + offsets
+        returns = np.floor((xyz - found["origin"]) / 0.5).astype(int)
+        near = {tuple(one + off) for one in returns for off in np.ndindex(3, 3, 3)}
+        inside = np.array([tuple(one) in near for one in (found["index"] + 1).tolist()])
+        assert found["energy"][inside].sum() > 0.97 * summary.energy
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_strip(tmp_path):
+    peaks = []
+    for pulses in (60_000, 600_000):
+        strip = tmp_path / f"{pulses}.las"
+        simulate_strip("urban", strip, pulses=pulses, seed=1)
+        script = f"""
+            import resource
+            from pathlib import Path
+            from wavebatch.tools.voxels import VoxelOptions, voxelize_strip
+            voxelize_strip(Path({str(strip)!r}), Path({str(strip)!r}).with_suffix(".npz"), VoxelOptions(0.25))
+            print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        """
+        result = subprocess.run(
+            [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
+        )
+        peaks.append(int(result.stdout) / 1024)
+    assert peaks[1] < 400 and peaks[1] < peaks[0] + 120

@@ -1,0 +1,188 @@
+"""How well chains find what was simulated: groups that are simulated and surveyed apart, and the figures of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.score import QUANTITIES, find_isolated, match_echoes
+from wavebatch.surveying import Survey, survey_block
+from wavebatch.tools.bench.figures import Figure, root_mean_square, share
+from wavebatch.tools.bench.truth import describe_truth, find_bounds
+from wavebatch.tools.simulate import Scene, simulate_blocks
+
+CLEAR = 10.0
+"""Signal to noise from which an echo's error is compared with its bound."""
+
+GROSS = 10.0
+"""An error of more bounds than this is a gross one: counted, but left out of error/bound."""
+
+GROUPS = 8
+"""Groups of a scene; each is surveyed anew, as the strips of a project are."""
+
+CM_PER_NS = 100 * HALF_C
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Waveforms of one seed, what is true of them, and what a survey says."""
+
+    number: int
+    block: WaveformBlock
+    truth: EchoTable
+    """As found echoes would be described."""
+    isolated: np.ndarray
+    """bool (m,)."""
+    bounds: np.ndarray
+    """Cramer-Rao bounds of time, amplitude and sigma, (m, 3)."""
+    survey: Survey
+    clear: np.ndarray
+    """Strong enough for its error to be compared with its bound, bool (m,)."""
+
+    @property
+    def system(self) -> SystemPulse:
+        """What the survey says of the sensor."""
+        return self.survey.system
+
+
+def derive_seed(*numbers: int) -> int:
+    """A seed that depends on all of the numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
+def make_groups(
+    scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
+) -> list[Group]:
+    """`waveforms` waveforms of the scene in groups with a seed and a survey of their own."""
+    size = max(waveforms // GROUPS, 1)
+    groups = []
+    for place in range(GROUPS):
+        progress(f"{scene.name}: simulating and surveying, group {place + 1} of {GROUPS}")
+        ((block, truth),) = simulate_blocks(scene, size, seed=derive_seed(seed, place), size=size)
+        groups.append(make_group(scene, place, block, truth, survey_block(block)))
+    return groups
+
+
+def make_group(
+    scene: Scene,
+    number: int,
+    block: WaveformBlock,
+    truth: EchoTable,
+    survey: Survey,
+    *,
+    clear: float = CLEAR,
+) -> Group:
+    """The group of a simulated block with what its survey says; clear: signal to noise from which echoes are clear."""
+    recording = scene.recording
+    return Group(
+        number=number,
+        block=block,
+        truth=describe_truth(truth, recording.pulse),
+        isolated=find_isolated(truth),
+        bounds=find_bounds(recording, truth, len(block)),
+        survey=survey,
+        clear=truth.amplitude >= clear * recording.recorded_noise,
+    )
+
+
+def describe_found(found: EchoTable) -> EchoTable:
+    """The echoes with the full width at half maximum over 2.354820 as their sigma, where their chain tells it."""
+    if "echo_width" not in found.attributes:
+        return found
+    factor = np.float32(1 / FWHM_PER_SIGMA)
+    return replace(
+        found,
+        sigma=found.attributes["echo_width"] * factor,
+        sigma_err=found.attributes["echo_width_err"] * factor,
+    )
+
+
+@dataclass(slots=True)
+class Tally:
+    """Collects what was found in groups; `figures` says what it amounts to."""
+
+    _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
+    _echoes: list[dict[str, np.ndarray]] = field(default_factory=list)
+    _offset: int = 0
+
+    def add(self, group: Group, found: EchoTable) -> None:
+        """Take in the echoes found in the waveforms of a group."""
+        n, truth = len(group.block), group.truth
+        match = match_echoes(found, truth)
+        matched = np.zeros(len(truth), bool)
+        matched[match.truth] = True
+        counts = {"true": truth.count(n), "found": found.count(n), "group": np.full(n, group.number)}
+        counts["matched"] = np.bincount(truth.waveform[matched], minlength=n)
+        for kind, rows in (("isolated", group.isolated), ("overlapped", ~group.isolated)):
+            counts[kind] = np.bincount(truth.waveform[rows], minlength=n)
+            counts[f"{kind}_matched"] = np.bincount(truth.waveform[rows & matched], minlength=n)
+        self._waveforms.append(counts)
+        part = {
+            "waveform": truth.waveform[match.truth].astype(np.int64) + self._offset,
+            "group": np.full(len(match.truth), group.number),
+            "isolated": group.isolated[match.truth],
+            "clear": group.clear[match.truth],
+        }
+        for place, name in enumerate(QUANTITIES):
+            error = getattr(found, name)[match.found].astype(np.float64) - getattr(truth, name)[match.truth]
+            reported = getattr(found, f"{name}_err")[match.found].astype(np.float64)
+            part[name] = error
+            part[f"{name}_ratio"] = error / group.bounds[match.truth, place]
+            part[f"{name}_scaled"] = error / np.where(reported > 0, reported, np.nan)
+        self._echoes.append(part)
+        self._offset += n
+
+    def figures(self) -> dict[str, Figure]:
+        """Every figure by name; shares are of 1, lengths in cm of range, the others have no unit."""
+        return {**self._shares(), **self._errors()}
+
+    @property
+    def waveforms(self) -> int:
+        """Waveforms taken in."""
+        return self._offset
+
+    def _shares(self) -> dict[str, Figure]:
+        w = _join(self._waveforms)
+        group, true, found = w["group"], w["true"], w["found"]
+        one, none = true == 1, true == 0
+        return {
+            "completeness": share(w["matched"], true, group),
+            "correctness": share(w["matched"], found * true.any(), group),
+            "exact_count": share(found == true, np.ones(len(true)), group),
+            "false_splits": share(one & (found > 1), one, group),
+            "false_alarms": share(none & (found > 0), none, group),
+            "found_isolated": share(w["isolated_matched"], w["isolated"], group),
+            "found_overlapped": share(w["overlapped_matched"], w["overlapped"], group),
+            "wrong": share(true + found - 2 * w["matched"], (true + found) * true.any(), group),
+        }
+
+    def _errors(self) -> dict[str, Figure]:
+        e = _join(self._echoes)
+        every = np.ones(len(e["time"]), bool)
+        figures = {}
+        for kind, rows in (("all", every), ("isolated", e["isolated"]), ("overlapped", ~e["isolated"])):
+            figures[f"rmse_{kind}_cm"] = _spread(e, "time", rows).scale(CM_PER_NS)
+            if kind == "all":
+                continue
+            clear = rows & e["clear"]
+            ratios = np.stack([e[f"{name}_ratio"] for name in QUANTITIES])
+            gross = np.abs(ratios).max(axis=0) > GROSS
+            figures[f"gross_{kind}"] = share(clear & gross, clear, e["group"])
+            for name in QUANTITIES:
+                figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
+                known = np.isfinite(e[f"{name}_scaled"])
+                figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
+        return figures
+
+
+def _spread(echoes: Mapping[str, np.ndarray], name: str, rows: np.ndarray) -> Figure:
+    return root_mean_square(echoes[name][rows], echoes["waveform"][rows], echoes["group"][rows])
+
+
+def _join(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

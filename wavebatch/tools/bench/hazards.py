@@ -1,0 +1,138 @@
+"""The stiff and extreme cases H1 to H16 of ALGORITHMS.md 3 that can be simulated, each at stated values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from wavebatch.tools.simulate import PulseModel, Recording, Scene
+from wavebatch.tools.simulate.draws import Drawn
+from wavebatch.tools.simulate.hazards import draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
+
+SIGMA = 2.0
+"""Width of the system pulse in all cases [ns]."""
+
+Draw = Callable[[np.random.Generator, int, Recording], Drawn]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One row of the stability section."""
+
+    hazard: str
+    """H1 ... H16."""
+    name: str
+    draw: Draw
+    recording: Recording = field(default_factory=Recording)
+
+
+@dataclass(frozen=True, slots=True)
+class CaseScene(Scene):
+    """A scene that holds one case."""
+
+    case: Case | None = None
+
+    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
+        """Echoes of n waveforms."""
+        return self.case.draw(rng, n, self.recording)
+
+
+def make_scene(case: Case) -> CaseScene:
+    """The scene of a case."""
+    return CaseScene(f"{case.hazard} {case.name}", case.name, recording=case.recording, case=case)
+
+
+def draw_echoes(
+    rng: np.random.Generator, n: int, recording: Recording, *, heights: tuple[float, ...], gap: float = 0.0
+) -> Drawn:
+    """Echoes of the system's width and the given heights [count], `gap` widths apart, somewhere in the middle."""
+    s, k = recording.pulse.sigma, len(heights)
+    middle = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
+    time = middle + gap * s * (np.arange(k) - 0.5 * (k - 1))
+    return _flatten(time, np.broadcast_to(np.array(heights, np.float64), (n, k)), s)
+
+
+def draw_between(rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float) -> Drawn:
+    """One echo of the system's width between two heights [count], evenly over their logarithm."""
+    s = recording.pulse.sigma
+    time = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
+    return _flatten(time, np.exp(rng.uniform(np.log(low), np.log(high), (n, 1))), s)
+
+
+def draw_at_edge(rng: np.random.Generator, n: int, recording: Recording, *, inside: float) -> Drawn:
+    """One echo of 100 counts whose centre lies `inside` widths, give or take half a sample, from an end."""
+    distance = inside * recording.pulse.sigma + rng.uniform(-0.5, 0.5, (n, 1)) * recording.spacing
+    time = np.where(rng.random((n, 1)) < 0.5, distance, recording.duration - distance)
+    return _flatten(time, np.full((n, 1), 100.0), recording.pulse.sigma)
+
+
+def draw_clipped(rng: np.random.Generator, n: int, recording: Recording, *, level: float) -> Drawn:
+    """One echo of which the receiver records the lowest `level` of its height."""
+    return draw_echoes(rng, n, recording, heights=((recording.clip - recording.baseline) / level,))
+
+
+def _flatten(time: np.ndarray, amplitude: np.ndarray, sigma: float) -> Drawn:
+    n, k = time.shape
+    return Drawn(np.repeat(np.arange(n), k), time.ravel(), amplitude.ravel().copy(), np.full(n * k, sigma))
+
+
+def _list_cases() -> tuple[Case, ...]:
+    base = Recording(n_samples=96, pulse=PulseModel(SIGMA))
+    deep = replace(base, bits=16, baseline=200.0)
+    clipping = replace(base, saturation=255)
+    one = partial(partial, draw_echoes)
+    cases = [
+        Case("H1", f"pair {gap:g} s apart, SNR 50", one(heights=(52.0, 52.0), gap=gap), base)
+        for gap in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5)
+    ]
+    cases += [Case("H1", "pair 1.75 s apart, 52 and 10 DN", one(heights=(52.0, 10.4), gap=1.75), base)]
+    cases += [
+        Case("H2", f"pair {gap:g} s apart, 20000 DN", one(heights=(2e4, 2e4), gap=gap), deep) for gap in (0.25, 1)
+    ]
+    cases += [Case("H3", f"weak: SNR {snr}", one(heights=(1.041 * snr,)), base) for snr in (3, 4, 5)]
+    cases += [
+        Case("H4", f"skew {kappa:g}, SNR 100", one(heights=(104.0,)), replace(base, pulse=PulseModel(SIGMA, kappa)))
+        for kappa in (0.06, 0.10, 0.15)
+    ]
+    cases += [Case("H5", "50 to 50000 DN in 16 bit", partial(draw_between, low=50.0, high=5e4), deep)]
+    cases += [
+        Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), clipping)
+        for level in (0.95, 0.8, 0.64, 0.5, 0.3)
+    ]
+    cases += [Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)]
+    cases += [Case("H6", "5 to 500 times the range", draw_huge, clipping)]
+    cases += [
+        Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), replace(base, pulse=base.pulse.with_ringing(ring)))
+        for ring in (0.01, 0.02, 0.03)
+    ]
+    cases += [
+        Case("H8", f"centre {inside:g} s inside", partial(draw_at_edge, inside=inside), base)
+        for inside in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5)
+    ]
+    quiet = replace(base, noise_std=0.5, baseline_spread=0.1)
+    cases += [Case("H9", "2 to 6 DN, noise 0.5", partial(draw_between, low=2.0, high=6.0), quiet)]
+    cases += [
+        Case("H10", "constant 0, 12 or 255", draw_constant, base),
+        Case("H10", "noise only", one(heights=()), base),
+    ]
+    cases += [
+        Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho))
+        for rho in (0.5, 0.667, 0.8)
+    ]
+    cases += [
+        Case("H12", f"variance +{gain:g} per DN", one(heights=(150.0,)), replace(base, noise_gain=gain))
+        for gain in (0.05, 0.1)
+    ]
+    cases += [
+        Case("H16", "2.5 to 4 times as wide", draw_broad, base),
+        Case("H16", "weak beside strong", draw_contrast, base),
+        Case("H16", "eight echoes", draw_crowd, base),
+    ]
+    return tuple(cases)
+
+
+CASES: tuple[Case, ...] = _list_cases()
+"""Every case, in the order of the hazards. H13 to H15 are no matter of waveforms but of range and angle."""

@@ -1,0 +1,120 @@
+"""The work-precision plot: error against time per waveform, the chains that nobody beats joined by a line."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.tools.bench.rank_chains import find_front
+
+PANELS = (
+    ("wrong", 100.0, "echoes missed or false [%]"),
+    ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
+)
+
+PLACES = (
+    *((6, 5), (6, -5), (-6, 5), (-6, -5), (0, 8), (0, -8)),
+    *((6, 16), (6, -16), (-6, 16), (-6, -16), (0, 20), (0, -20)),
+)
+"""Where a label may stand, from its point [points], the first choice first."""
+
+
+def can_plot() -> bool:
+    """Whether matplotlib is installed (extra `plot`)."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def plot_scene(section: Mapping[str, Any], target: Path) -> None:
+    """Writes the plot of one scene of a document as PNG, over an older one."""
+    with open_picture(target, (11, 4.6), overwrite=True, dpi=120) as figure:
+        figure.suptitle(plain_text(f"{section['scene']}: error against run time, one core"))
+        panels = figure.subplots(1, len(PANELS))
+        labels = [
+            _draw_panel(axes, section["rows"], name, factor, label)
+            for axes, (name, factor, label) in zip(panels, PANELS, strict=True)
+        ]
+        # Where labels end up on paper is known once the panels have their size.
+        figure.draw_without_rendering()
+        for axes, names in zip(panels, labels, strict=True):
+            _place_labels(axes, names)
+
+
+def _draw_panel(
+    axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str
+) -> list[tuple[str, float, float]]:
+    """Draws one error against time; the labels of the points, and where these are."""
+    from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+
+    twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
+    rows = [row for row in rows if "same_as" not in row]
+    known = [row for row in rows if row["kernels"]["median"] and row["figures"][name]["value"] is not None]
+    time = np.array([row["kernels"]["median"] for row in known])
+    value = np.array([row["figures"][name]["value"] * factor for row in known])
+    error = np.array([(row["figures"][name]["error"] or 0.0) * factor for row in known])
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("kernels: microseconds per waveform")
+    axes.set_ylabel(label)
+    if not known:
+        return []
+    chains = np.array([row["kind"] == "chain" for row in known])
+    front = find_front(np.where(chains[:, None], np.stack([time, value], axis=1), np.nan))
+    order = np.flatnonzero(front)[np.argsort(time[front])]
+    axes.plot(time[order], value[order], color="tab:red", zorder=1, label="Pareto front")
+    labels = []
+    for i, row in enumerate(known):
+        marker = "o" if row["kind"] == "chain" else "s"
+        color = "tab:red" if front[i] else "tab:gray"
+        axes.errorbar(time[i], value[i], yerr=error[i], fmt=marker, color=color, capsize=2)
+        labels.append((" = ".join([row["name"], *filter(None, [twins.get(row["name"])])]), time[i], value[i]))
+    axes.margins(x=0.25, y=0.15)
+    axes.set_ylim(bottom=0)
+    axes.legend()
+    return labels
+
+
+def _place_labels(axes: Any, labels: list[tuple[str, float, float]]) -> None:
+    """Writes each label beside its point, at the first place where it covers no point and no other label."""
+    from matplotlib.transforms import Bbox
+
+    legend = axes.get_legend()
+    taken = [legend.get_window_extent()] if legend else []
+    dot = 4 * axes.figure.dpi / 72
+    for _, x, y in labels:
+        x, y = axes.transData.transform((x, y))
+        taken.append(Bbox.from_extents(x - dot, y - dot, x + dot, y + dot))
+    frame = axes.get_window_extent()
+    for text, x, y in labels:
+        note = axes.annotate(text, (x, y), textcoords="offset points", xytext=(6, 5))
+        best = None
+        for place in PLACES:
+            _move(note, place)
+            box = note.get_window_extent()
+            covered = sum(_overlap(box, other) for other in taken)
+            covered += box.width * box.height - _overlap(box, frame)
+            if best is None or covered < best[0]:
+                best = covered, place
+            if not covered:
+                break
+        _move(note, best[1])
+        taken.append(note.get_window_extent())
+
+
+def _move(note: Any, place: tuple[float, float]) -> None:
+    """Puts a label at an offset [points] from its point, on the side to which the offset goes."""
+    note.set_position(place)
+    note.set_ha("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
+    note.set_va("bottom" if place[1] > 0 else "top" if place[1] < 0 else "center")
+
+
+def _overlap(a: Any, b: Any) -> float:
+    """Area that two boxes share [pixels]."""
+    width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+    return width * height if width > 0 and height > 0 else 0.0

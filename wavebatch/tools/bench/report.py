@@ -1,0 +1,220 @@
+"""What a benchmark prints and writes: text tables, bench.json, bench.txt and plots."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from wavebatch.files.disk.publish import reporting
+from wavebatch.tools.bench.plot import can_plot, plot_scene
+
+Column = tuple[str, str, float, int]
+"""Head, name of the figure, factor, decimals."""
+
+SHARES: tuple[Column, ...] = (
+    ("complete %", "completeness", 100, 2),
+    ("correct %", "correctness", 100, 2),
+    ("exact %", "exact_count", 100, 2),
+    ("splits %", "false_splits", 100, 2),
+    ("isolated %", "found_isolated", 100, 2),
+    ("overlapped %", "found_overlapped", 100, 2),
+)
+LENGTHS: tuple[Column, ...] = (
+    ("all cm", "rmse_all_cm", 1, 2),
+    ("isolated cm", "rmse_isolated_cm", 1, 2),
+    ("overlapped cm", "rmse_overlapped_cm", 1, 2),
+)
+QUANTITIES = (("time", "time"), ("amplitude", "amplitude"), ("sigma", "sigma"))
+
+
+def _ratios(kind: str) -> tuple[Column, ...]:
+    columns = tuple((head, f"{name}_ratio_{kind}", 1.0, 3) for head, name in QUANTITIES)
+    return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
+
+
+def format_document(document: Mapping[str, Any]) -> str:
+    """All tables, as they are printed."""
+    parts = [
+        f"wavebatch {document['version']} bench, seed {document['seed']}. +- is the {document['error_means']} "
+        "(1.41 times that of the figure).",
+        *(_format_scene(section, document.get("tolerance_cm")) for section in document["scenes"]),
+    ]
+    if "stability" in document:
+        parts.append(_format_stability(document))
+    return "\n\n".join(parts)
+
+
+def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str:
+    rows, survey = section["rows"], section["survey"]
+    lines = [
+        f"== {section['scene']}: {section['meaning']}",
+        f"survey of {survey['groups']} x {survey['waveforms_of_a_group']} waveforms: "
+        f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, "
+        f"kappa {_span(survey['kappa'])}, "
+        f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}",
+        "",
+        *_speed_table(rows),
+        "",
+        *_figure_table("echoes found", rows, SHARES),
+        "",
+        *_figure_table("rms error of the range", rows, LENGTHS),
+    ]
+    for kind in ("isolated", "overlapped"):
+        lines += ["", *_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind))]
+    if tolerance_cm is not None:
+        lines += ["", _tell_cheapest(section, tolerance_cm)]
+    return "\n".join(lines)
+
+
+def _tell_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:
+    wanted = f"an error of {tolerance_cm:g} cm for isolated echoes"
+    if section["cheapest"] is None:
+        return f"no chain meets {wanted}"
+    row = next(row for row in section["rows"] if row["name"] == section["cheapest"])
+    return f"cheapest chain with {wanted}: {row['name']} ({figure_text(row, LENGTHS[1])} cm)"
+
+
+def _span(times: Mapping[str, Any]) -> str:
+    low, high = f"{times['min']:.4g}", f"{times['max']:.4g}"
+    return low if low == high else f"{low}..{high}"
+
+
+def rate_text(times: Mapping[str, Any]) -> str:
+    """Waveforms per second from microseconds: median and range."""
+    if not times["median"]:
+        return "-"
+    return f"{1e6 / times['median']:,.0f} ({1e6 / times['max']:,.0f}..{1e6 / times['min']:,.0f})"
+
+
+def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    head = ["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]
+    lines = [head]
+    for row in rows:
+        name = row["name"]
+        if row.get("same_as"):
+            name += f" (is {row['same_as']})"
+        if row.get("crashed_or_hung"):
+            name += f" ({row['crashed_or_hung']} crashed or hung)"
+        once, memory = row["survey_seconds"]["median"], row["peak_bytes"]
+        lines.append(
+            [
+                name,
+                rate_text(row["kernels"]),
+                rate_text(row["file"]),
+                rate_text(row["file_with_survey"]),
+                "-" if once is None else f"{once:.2f}",
+                "-" if memory is None else f"{memory / 1e6:.0f}",
+                "*" if row["pareto"] else "",
+            ]
+        )
+    return align(lines)
+
+
+def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[Column]) -> list[str]:
+    lines = [[title, *(column[0] for column in columns)]]
+    lines += [[row["name"], *(figure_text(row, column) for column in columns)] for row in rows]
+    return align(lines)
+
+
+def figure_text(row: Mapping[str, Any], column: Column) -> str:
+    """A figure of a row with its error; a dash where there is none."""
+    _, name, factor, decimals = column
+    figure = row["figures"][name]
+    if figure["value"] is None:
+        return "-"
+    text = f"{figure['value'] * factor:.{decimals}f}"
+    return text if figure["error"] is None else f"{text} +-{figure['error'] * factor:.{decimals}f}"
+
+
+def align(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Cells as columns: the first to the left, the others to the right."""
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if place == 0 else cell.rjust(width)
+            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+
+
+def _format_stability(document: Mapping[str, Any]) -> str:
+    rows = document["stability"]
+    parts = [
+        "== stiff and extreme cases: s is the width of the system pulse, false the share of single echoes split or of "
+        "empty waveforms with an echo, err the rms error / Cramer-Rao bound"
+    ]
+    for chain in dict.fromkeys(row["chain"] for row in rows if not row["is_method"]):
+        parts.append("\n".join(align(_stability_lines([row for row in rows if row["chain"] == chain], chain))))
+    methods = [row for row in rows if row["is_method"]]
+    if methods:
+        parts.append("\n".join(align(_method_lines(methods))))
+    return "\n\n".join(parts)
+
+
+def _method_lines(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """A line per method: waveforms with the exact number of echoes, mean of the cases of each hazard, and failures."""
+    hazards = list(dict.fromkeys(row["hazard"] for row in rows))
+    lines = [["every method: exact %, mean of the cases", *hazards, "failures"]]
+    for name in dict.fromkeys(row["chain"] for row in rows):
+        own = [row for row in rows if row["chain"] == name]
+        cells = []
+        for hazard in hazards:
+            exact = [row["figures"]["exact_count"]["value"] for row in own if row["hazard"] == hazard]
+            cells.append(f"{100 * sum(exact) / len(exact):.1f}")
+        lines.append([name, *cells, _tell_failures(own)])
+    return lines
+
+
+def _tell_failures(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Sums per kind of failure over the rows; `none` without any."""
+    kinds = {name: sum(row["failures"][name] for row in rows) for name in rows[0]["failures"]}
+    return ", ".join(f"{number} {name}" for name, number in kinds.items() if number) or "none"
+
+
+def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list[str]]:
+    heads = ("found %", "exact %", "false %", "err time", "err amplitude", "err sigma", "gross %")
+    title = f"{chain} (is auto)" if all(row["is_auto"] for row in rows) and chain != "auto" else chain
+    lines = [[title, "waveforms", *heads, "failures", "flags of the echoes"]]
+    for row in rows:
+        known = {name for name, figure in row["figures"].items() if figure["value"] is not None}
+        kind = "isolated" if "found_isolated" in known else "overlapped"
+        columns: list[Column] = [
+            ("", "completeness", 100, 1),
+            ("", "exact_count", 100, 1),
+            ("", "false_splits" if "false_splits" in known else "false_alarms", 100, 1),
+            *(("", f"{name}_ratio_{kind}", 1.0, 2) for _, name in QUANTITIES),
+            ("", f"gross_{kind}", 100, 1),
+        ]
+        cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
+        figures = [figure_text(row, column) for column in columns]
+        lines.append([*cells, *figures, _tell_failures([row]), _tell_flags(row)])
+    return lines
+
+
+def _tell_flags(row: Mapping[str, Any]) -> str:
+    shares = {name: number / max(row["echoes"], 1) for name, number in row["flags"].items()}
+    return ", ".join(f"{name} {share:.0%}" if share >= 0.005 else f"{name} <1%" for name, share in shares.items())
+
+
+def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:
+    """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns what to tell.
+
+    Without matplotlib there are no plots, and a line says how to get them. Raises InputError where it cannot write.
+    """
+    with reporting(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "bench.json").write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", "utf-8")
+        (folder / "bench.txt").write_text(text + "\n", "utf-8")
+        written = ["bench.json", "bench.txt"]
+        if can_plot():
+            for section in document["scenes"]:
+                name = f"bench-{Path(section['scene']).stem}.png"
+                plot_scene(section, folder / name)
+                written.append(name)
+    lines = [f"{folder}: {', '.join(written)}"]
+    if not can_plot():
+        lines.append("no plot without matplotlib: pip install 'wavebatch[plot]'")
+    return lines

@@ -1,0 +1,174 @@
+"""Scenes of the benchmark: the named ones, and one shaped like a strip by resampling its own decomposed waveforms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.stages.chain import Chain
+from wavebatch.surveying import SAMPLE, survey_blocks
+from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene
+from wavebatch.tools.simulate.draws import Drawn
+
+BENCH_SCENES: dict[str, str] = {
+    "mixed": "mixed",
+    "open": "urban",
+    "forest": "forest",
+    "empty": "empty",
+    "flat": "flat",
+    "stiff": "stiff",
+}
+"""Scenes by the name that the benchmark gives them; any other scene of simulate may be named too."""
+
+LEAST_WAVEFORMS = 200
+"""Waveforms that a strip must have for its echoes to be resampled."""
+
+JITTER = 0.05
+"""Relative change of the amplitudes and gaps of a resampled waveform, one standard deviation."""
+
+STRONG = 20.0
+"""Signal to noise from which the width of an echo is taken as it was measured."""
+
+
+def find_bench_scene(name: str) -> Scene:
+    """The scene of that name; raises ConfigError with the nearest name when there is none."""
+    return replace(find_scene(BENCH_SCENES.get(name, name)), name=name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """Echoes of decomposed waveforms, to be drawn again and again."""
+
+    first: np.ndarray
+    """Row of each waveform's first echo, i8 (n,)."""
+    count: np.ndarray
+    """Echoes of each waveform, i8 (n,)."""
+    time: np.ndarray
+    amplitude: np.ndarray
+    sigma: np.ndarray
+    """Of the main lobe [ns], freed from the scatter of its own error, f8 (m,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class StripScene(Scene):
+    """Waveforms like those of a strip: counts, amplitudes, widths and gaps of real ones, each drawn anew."""
+
+    sample: Sample | None = None
+
+    def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
+        """Echoes of n waveforms: whole waveforms of the sample, moved by part of a sample, jittered and cut off at
+        the ends of the window."""
+        sample, recording = self.sample, self.recording
+        chosen = rng.integers(0, len(sample.count), n)
+        count = sample.count[chosen]
+        waveform = np.repeat(np.arange(n), count)
+        within = np.arange(len(waveform)) - np.repeat(np.cumsum(count) - count, count)
+        row = np.repeat(sample.first[chosen], count) + within
+        start = sample.time[np.repeat(sample.first[chosen], count)]
+        stretch = np.exp(JITTER * rng.standard_normal(n))[waveform]
+        shift = rng.uniform(-0.5, 0.5, n)[waveform] * recording.spacing
+        time = start + shift + (sample.time[row] - start) * stretch
+        amplitude = sample.amplitude[row] * np.exp(JITTER * rng.standard_normal(len(row)))
+        inside = (time > 0) & (time < recording.duration)
+        return Drawn(waveform[inside], time[inside], amplitude[inside], sample.sigma[row][inside])
+
+
+def shape_scene(strip: Path, chain: Chain) -> StripScene:
+    """A scene like the strip's own survey: its noise, baselines, learned pulse and the echoes that `chain` finds.
+
+    Raises InputError where the strip cannot be read or holds too few waveforms.
+    """
+    with StripReader(strip) as reader:
+        scan = reader.scan()
+        try:
+            blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
+        finally:
+            scan.close()
+    kinds = {(block.spacing, block.samples.shape[1]) for block in blocks}
+    largest = max(kinds, key=lambda kind: sum(b.samples.size for b in blocks if _kind(b) == kind), default=None)
+    chosen = [block for block in blocks if _kind(block) == largest]
+    number = sum(len(block) for block in chosen)
+    if number < LEAST_WAVEFORMS:
+        raise InputError(
+            f"{strip}: {number} waveforms of one length are too few to shape a benchmark like it ({LEAST_WAVEFORMS} "
+            "are needed); name a scene with --scene"
+        )
+    samples = np.concatenate([block.samples for block in chosen])
+    block = WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
+    system = survey_blocks([block]).system
+    recording = describe_recording(system, block)
+    sample = _take_sample(chain.run(block, system), len(block), system, recording)
+    return StripScene(strip.name, f"like {strip.name}", recording=recording, sample=sample)
+
+
+def _kind(block: WaveformBlock) -> tuple[float, int]:
+    return block.spacing, block.samples.shape[1]
+
+
+def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
+    """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
+    color = _find_color(system)
+    first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
+    gain = np.sqrt((6 + 8 * first + 2 * second) / 6)
+    pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
+    if len(system.components) > 1:
+        weight, delay, sigma = system.components[0]
+        pulse = PulseModel(sigma, 0.0, tuple((w / weight, d - delay, s) for w, d, s in system.components[1:]))
+    clip = None if system.saturation is None else int(min(system.saturation, block.digitizer.max_count))
+    return Recording(
+        n_samples=block.samples.shape[1],
+        spacing=block.spacing,
+        bits=block.digitizer.bits,
+        baseline=system.baseline,
+        baseline_spread=system.baseline_spread,
+        noise_std=float(np.sqrt(max(system.noise_std**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        rho=color / (color + 1),
+        noise_gain=system.noise_gain,
+        saturation=clip,
+        pulse=pulse,
+    )
+
+
+def _find_color(system: SystemPulse) -> int:
+    """Order of the binomial filter whose noise grows by smoothing as that behind the strip's echoes does."""
+    kinds = system.noise_by_kind
+    pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
+    ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
+    orders = np.arange(5)
+    first, second = orders / (orders + 1), orders * (orders - 1) / ((orders + 1) * (orders + 2))
+    return int(np.argmin(np.abs(np.sqrt((6 + 8 * first + 2 * second) / 6) - ratio)))
+
+
+def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recording) -> Sample:
+    bad = int(EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE | EchoFlag.AMPLITUDE_UNRELIABLE)
+    keep = (found.flags & bad) == 0
+    keep &= (found.time > 0) & (found.time < recording.duration)
+    found = found.take(np.flatnonzero(keep))
+    count = found.count(n)
+    scale = recording.pulse.sigma / system.sigma_ref
+    sigma = _free_widths(found, system) * scale
+    return Sample(
+        first=np.cumsum(count) - count,
+        count=count,
+        time=found.time,
+        amplitude=np.clip(found.amplitude.astype(np.float64), 1.0, 4.0 * (1 << recording.bits)),
+        sigma=np.clip(sigma, 0.85 * recording.pulse.sigma, 4.0 * recording.pulse.sigma),
+    )
+
+
+def _free_widths(found: EchoTable, system: SystemPulse) -> np.ndarray:
+    """Widths [ns] drawn towards the typical one as far as their own error explains how they differ from it."""
+    sigma = found.sigma.astype(np.float64)
+    strong = sigma[found.amplitude > STRONG * system.noise_std]
+    if len(strong) < 2:
+        return np.full(len(sigma), system.sigma_ref)
+    typical, spread = float(np.median(strong)), float(strong.var())
+    error = np.nan_to_num(found.sigma_err.astype(np.float64), nan=0.0, posinf=1e3)
+    return typical + (sigma - typical) * spread / np.maximum(spread + error**2, 1e-12)

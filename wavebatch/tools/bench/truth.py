@@ -1,0 +1,131 @@
+"""True echoes in the words of the found ones, and the least error with which each of them could be found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN
+from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
+from wavebatch.tools.simulate.render import Recording, paint_echoes
+
+_GRID = 49
+_STEP = 0.02
+"""Step of the numeric derivatives, in widths of the system pulse."""
+
+
+def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
+    """The truth with the time of the peak and, as sigma, the full width at half maximum over 2.354820.
+
+    simulate counts time and sigma by the main lobe; decomposers report the whole pulse. For a Gaussian both are one.
+    """
+    delay, sigma = _measure(pulse, truth.sigma.astype(np.float64))
+    return replace(truth, time=truth.time + delay, sigma=sigma.astype(np.float32))
+
+
+def effective_noise(recording: Recording) -> float:
+    """Standard deviation of one recorded sample [count] that white noise of the same weight on an echo would have.
+
+    Of coloured noise that of the [1 2 1]/4-smoothed samples over the gain for white noise (ALGORITHMS.md H11).
+    """
+    m = recording.color
+    first, second = m / (m + 1), m * (m - 1) / ((m + 1) * (m + 2))
+    smoothed = np.sqrt((6 + 8 * first + 2 * second) / 16) / SMOOTH_GAIN
+    return float(np.hypot(recording.noise_std * smoothed, QUANTISATION_STD))
+
+
+def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
+    """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo in its company, (m, 3).
+
+    All echoes of a waveform are unknown together, the baseline is known; clipped samples tell nothing, signal adds
+    its noise. truth: as simulate gives it; the bounds are of the words of `describe_truth`. Infinity where the samples
+    cannot tell. Source: inverse Fisher matrix, derivatives of the painted pulse by central differences.
+    """
+    if not len(truth):
+        return np.empty((0, 3))
+    columns, painted = _differentiate(recording, truth)
+    weight = _weigh(recording, truth, painted, n)
+    columns *= weight[truth.waveform][:, None, :]
+    bounds = np.full((len(truth), 3), np.inf)
+    count = truth.count(n)
+    first = np.cumsum(count) - count
+    for k in np.unique(count[count > 0]):
+        rows = first[count == k][:, None] + np.arange(k)
+        bounds[rows] = _invert(columns[rows].reshape(len(rows), 3 * k, -1)).reshape(len(rows), k, 3)
+    return bounds
+
+
+def _differentiate(recording: Recording, truth: EchoTable) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of each echo alone by time, amplitude and sigma, (m, 3, s), and the echo, (m, s)."""
+    rows = np.arange(len(truth))
+    amplitude, sigma = truth.amplitude.astype(np.float64), truth.sigma.astype(np.float64)
+
+    def paint(time: np.ndarray, width: np.ndarray) -> np.ndarray:
+        return paint_echoes(recording, len(truth), rows, time, amplitude, width)
+
+    step = _STEP * recording.pulse.sigma
+    echo = paint(truth.time, sigma)
+    by_time = (paint(truth.time + step, sigma) - paint(truth.time - step, sigma)) / (2 * step)
+    delay, _ = _measure(recording.pulse, sigma)
+    sides = []
+    for width in (sigma + step, sigma - step):
+        moved, whole = _measure(recording.pulse, width)
+        sides.append((paint(truth.time + delay - moved, width), whole))
+    by_sigma = (sides[0][0] - sides[1][0]) / np.maximum(sides[0][1] - sides[1][1], 1e-9)[:, None]
+    return np.stack([by_time, echo / amplitude[:, None], by_sigma], axis=1).astype(np.float64), echo
+
+
+def _weigh(recording: Recording, truth: EchoTable, painted: np.ndarray, n: int) -> np.ndarray:
+    """Inverse standard deviation of every sample, 0 where it is clipped, (n, s)."""
+    signal = np.zeros((n, recording.n_samples))
+    np.add.at(signal, truth.waveform, painted)
+    variance = effective_noise(recording) ** 2 + recording.noise_gain * np.maximum(signal, 0)
+    return np.where(signal + recording.baseline < recording.clip, 1 / np.sqrt(variance), 0.0)
+
+
+def _invert(columns: np.ndarray) -> np.ndarray:
+    """Standard deviations (g, p) from weighted derivatives (g, p, s)."""
+    scale = np.sqrt(np.square(columns).sum(axis=2))
+    columns = columns / np.where(scale > 0, scale, 1.0)[:, :, None]
+    values, vectors = np.linalg.eigh(columns @ columns.transpose(0, 2, 1))
+    # Scaled columns: the diagonal is 1, so that eigenvalues say how well parameters can be told apart.
+    values = np.where(values > 1e-11, values, np.nan)
+    variance = (np.square(vectors) / values[:, None, :]).sum(axis=2)
+    known = ~np.isnan(variance) & (scale > 0)
+    return np.where(known, np.sqrt(np.where(known, variance, 1.0)) / np.where(scale > 0, scale, 1.0), np.inf)
+
+
+def _measure(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Delay of the peak behind the truth's time and full width at half maximum over 2.354820 [ns], each (m,)."""
+    if not pulse.lobes:
+        skew = abs(pulse.kappa)
+        wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0
+        return np.zeros_like(sigma), sigma * wider
+    if not len(sigma):
+        return sigma, sigma
+    grid = np.linspace(sigma.min(), max(sigma.max(), 1.001 * sigma.min()), _GRID)
+    step = grid[0] / 100
+    x = np.arange(-int(4 * grid[-1] / step), int(6 * grid[-1] / step))[:, None] * step
+    ones = np.ones(_GRID)
+    total = np.zeros((len(x), _GRID))
+    for number, (start, height, width) in enumerate(spread_lobes(pulse, 0 * ones, ones, grid)):
+        total += height * main_lobe((x - start) / width, pulse.kappa if number == 0 else 0.0)
+    peak, wide = np.array([_measure_curve(x[:, 0], total[:, i]) for i in range(_GRID)]).T
+    return np.interp(sigma, grid, peak), np.interp(sigma, grid, wide / FWHM_PER_SIGMA)
+
+
+def _measure_curve(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Place of the peak and full width at half maximum around it of one finely sampled curve."""
+    top = int(np.argmax(y))
+    bend = y[top - 1] - 2 * y[top] + y[top + 1]
+    shift = 0.5 * (y[top - 1] - y[top + 1]) / bend if bend < 0 else 0.0
+    half = 0.5 * y[top]
+    right = top + int(np.argmax(y[top:] < half))
+    left = top - int(np.argmax(y[top::-1] < half))
+    step = x[1] - x[0]
+    end = x[right] - step * (half - y[right]) / (y[right - 1] - y[right])
+    start = x[left] + step * (half - y[left]) / (y[left + 1] - y[left])
+    return float(x[top] + shift * step), float(end - start)

@@ -1,0 +1,119 @@
+"""A process of its own for whatever is measured: one thread, clean memory, and it may crash or hang."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from wavebatch.core.errors import StageError
+
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+_START = "from wavebatch.tools.bench.worker import serve; serve()"
+
+
+class WorkerDied(Exception):
+    """The process ended before it answered."""
+
+
+class Worker:
+    """Runs functions in another Python process, one after the other; a context manager."""
+
+    def __init__(self) -> None:
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+        )
+        self._replies: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def submit(self, function: Callable, *arguments: Any) -> None:
+        """Starts `function(*arguments)`; the answer is taken with `take`."""
+        try:
+            pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+        except OSError:
+            self._replies.put(("died", None))
+
+    def take(self, timeout: float | None = None) -> Any:
+        """The answer to the last `submit`; raises TimeoutError, WorkerDied, or whatever the function raised."""
+        try:
+            kind, value = self._replies.get(timeout=timeout)
+        except queue.Empty:
+            raise TimeoutError from None
+        if kind == "died":
+            raise WorkerDied("the measuring process ended")
+        if kind == "raised":
+            raise value
+        return value
+
+    def call(self, function: Callable, *arguments: Any) -> Any:
+        """`function(*arguments)`, which must be importable by name, as the process computes it."""
+        self.submit(function, *arguments)
+        return self.take()
+
+    def close(self) -> None:
+        """Ends the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        self._process.stdin.close()
+        self._process.stdout.close()
+
+    def _read(self) -> None:
+        while True:
+            try:
+                self._replies.put(pickle.load(self._process.stdout))
+            except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+                self._replies.put(("died", None))
+                return
+
+
+def serve() -> None:
+    """Answers calls on stdin until it ends; whatever else writes to stdout is sent to stderr."""
+    from wavebatch.core.memory import keep_freed_memory
+
+    keep_freed_memory()
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    while True:
+        try:
+            function, arguments = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        try:
+            answer = ("value", function(*arguments))
+        except Exception as error:
+            answer = ("raised", StageError(f"{type(error).__name__}: {error}"))
+        pickle.dump(answer, replies, pickle.HIGHEST_PROTOCOL)
+        replies.flush()
+
+
+def peak_memory() -> int | None:
+    """Most bytes that this process has held in memory; None where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text("ascii").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        import resource
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024

@@ -1,0 +1,164 @@
+"""How far angles from echo widths agree with those from the points around: Fig. 6 of Rhomberg-Kauert et al. 2024."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.cloud.angle_reader import ANGLE_DTYPE, NORMALS, WIDTHS, AngleReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.tools.compare.differences import SPEED
+from wavebatch.tools.compare.pairing import check_tolerance, pair_echoes
+
+BIN, DIFFERENCE_BIN = 5.0, 2.0
+"""Widths of the histograms' bins [deg]: of angles, of their differences."""
+
+_FINE = 1000
+"""Bins per degree in which absolute differences are counted for their median."""
+
+
+@dataclass(frozen=True, slots=True)
+class AngleAgreement:
+    """Angles from widths less those from normals [deg], over the points that have both; NaN where none has."""
+
+    a: str
+    b: str | None
+    """The second cloud; None where one cloud has both angles."""
+    points: int
+    """Points looked at; of two clouds, those that were matched."""
+    with_widths: int
+    with_normals: int
+    number: int
+    """Points with both angles."""
+    bias: float
+    """Mean difference."""
+    mae: float
+    """Mean absolute difference."""
+    median_absolute: float
+    """Median absolute difference, to 0.001 deg."""
+    rms: float
+    within_error: float
+    """Share of the points whose difference is at most one standard deviation: both errors together."""
+    edges: tuple[float, ...]
+    """Of the bins of both histograms of angles [deg]."""
+    histogram_widths: tuple[int, ...]
+    """Points per bin, of those with both angles."""
+    histogram_normals: tuple[int, ...]
+    difference_edges: tuple[float, ...]
+    histogram_difference: tuple[int, ...]
+
+    def to_json(self) -> dict:
+        """Plain numbers and lists for JSON."""
+        return asdict(self)
+
+
+def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0) -> AngleAgreement:
+    """How both kinds of angle agree in one cloud, or one kind in `a` and the other in `b`, clouds of one strip.
+
+    Echoes of two clouds are the same when they are of one pulse (equal GPS time) and at most `tolerance_ns` apart,
+    nearest first. Memory is bounded; large pairs of clouds need room in TMPDIR.
+    Raises InputError where a file cannot be read or lacks what is needed, ConfigError for a wrong tolerance.
+    """
+    check_tolerance(tolerance_ns)
+    tally = _Tally()
+    if b is None:
+        with AngleReader(a) as cloud:
+            _demand(cloud, WIDTHS, NORMALS)
+            for rows in cloud.read_angles():
+                tally.add(rows, rows)
+        return tally.finish(str(a), None)
+    with AngleReader(a) as first, AngleReader(b) as second:
+        turned = WIDTHS not in first.has or NORMALS not in second.has
+        widths, normals = (second, first) if turned else (first, second)
+        _demand(widths, WIDTHS)
+        _demand(normals, NORMALS)
+        _pair(widths, normals, tolerance_ns * SPEED, tally)
+    return tally.finish(str(a), str(b))
+
+
+def _demand(cloud: AngleReader, *columns: str) -> None:
+    missing = [name for name in columns if name not in cloud.has]
+    if missing:
+        stages = " and ".join(f"attribute.{name}" for name in missing)
+        raise InputError(f"{cloud.path}: has no column {' nor '.join(missing)}; run the strip with stage {stages}")
+
+
+def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally) -> None:
+    """Adds the echoes that both clouds have, bucket by bucket of pulses."""
+    for cloud in (widths, normals):
+        if not cloud.has_gps_time:
+            raise InputError(
+                f"{cloud.path}: has no GPS times, by which echoes of two clouds are matched; write one cloud of both"
+            )
+    number = count_buckets(max(widths.point_count, normals.point_count))
+    with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
+        for cloud, buckets in ((widths, first), (normals, second)):
+            for rows in cloud.read_angles():
+                finite = np.isfinite(rows["gps_time"]) & np.isfinite(rows["xyz"]).all(axis=1)
+                buckets.add(rows[finite], lambda part: sort_by_time(part["gps_time"], number))
+        for bucket in range(number):
+            a, b = first.read(bucket), second.read(bucket)
+            pulse = np.unique(np.concatenate([a["gps_time"], b["gps_time"]]), return_inverse=True)[1]
+            left, right = pair_echoes(pulse[: len(a)], a["xyz"], pulse[len(a) :], b["xyz"], reach)
+            tally.add(a[left], b[right])
+
+
+class _Tally:
+    """Sums and histograms; whole numbers where the order of the points could matter for more than the last digits."""
+
+    def __init__(self) -> None:
+        self.points = self.widths = self.normals = self.number = self.within = self.errors = 0
+        self.sums = np.zeros(3)
+        self.fine = np.zeros(90 * _FINE + 1, np.int64)
+        self.angles = np.zeros((2, round(90 / BIN)), np.int64)
+        self.differences = np.zeros(round(180 / DIFFERENCE_BIN), np.int64)
+
+    def add(self, widths: np.ndarray, normals: np.ndarray) -> None:
+        """Takes in points (n,), ANGLE_DTYPE: the one's angle from width, the other's from normals."""
+        a, b = widths[WIDTHS], normals[NORMALS]
+        valid = [(values >= 0) & (values <= 90) for values in (a, b)]
+        both = np.flatnonzero(valid[0] & valid[1])
+        self.points += len(a)
+        self.widths += int(valid[0].sum())
+        self.normals += int(valid[1].sum())
+        self.number += len(both)
+        a, b = a[both], b[both]
+        off = a - b
+        self.sums += [off.sum(), np.abs(off).sum(), np.square(off).sum()]
+        self.fine += np.bincount(np.rint(np.abs(off) * _FINE).astype(np.int64), minlength=len(self.fine))
+        for side, values in enumerate((a, b)):
+            self.angles[side] += _bins(values / BIN, self.angles.shape[1])
+        self.differences += _bins((off + 90.0) / DIFFERENCE_BIN, len(self.differences))
+        error = np.hypot(widths[f"{WIDTHS}_err"][both], normals[f"{NORMALS}_err"][both])
+        self.errors += int(np.isfinite(error).sum())
+        self.within += int((np.abs(off) <= error).sum())
+
+    def finish(self, a: str, b: str | None) -> AngleAgreement:
+        """The figures."""
+        bias, mae, square = self.sums / self.number if self.number else np.full(3, np.nan)
+        middle = np.searchsorted(np.cumsum(self.fine), 0.5 * self.number) / _FINE if self.number else np.nan
+        return AngleAgreement(
+            a=a,
+            b=b,
+            points=self.points,
+            with_widths=self.widths,
+            with_normals=self.normals,
+            number=self.number,
+            bias=float(bias),
+            mae=float(mae),
+            median_absolute=float(middle),
+            rms=float(np.sqrt(square)),
+            within_error=self.within / self.errors if self.errors else float("nan"),
+            edges=tuple(BIN * step for step in range(self.angles.shape[1] + 1)),
+            histogram_widths=tuple(self.angles[0].tolist()),
+            histogram_normals=tuple(self.angles[1].tolist()),
+            difference_edges=tuple(DIFFERENCE_BIN * step - 90.0 for step in range(len(self.differences) + 1)),
+            histogram_difference=tuple(self.differences.tolist()),
+        )
+
+
+def _bins(place: np.ndarray, number: int) -> np.ndarray:
+    return np.bincount(np.clip(place.astype(np.int64), 0, number - 1), minlength=number)

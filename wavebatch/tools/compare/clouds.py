@@ -1,0 +1,149 @@
+"""Two clouds of one strip, or a cloud and the truth: which echoes both have, and how far apart they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import PASSED_THROUGH
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
+from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
+from wavebatch.tools.simulate.truth import TruthReader
+
+_TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
+PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
+"""A pulse that counts even if neither side has an echo of it."""
+
+
+def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison:
+    """Echoes of two clouds of one strip; b may be the strip itself, whose points are the vendor's returns.
+
+    Echoes of a pulse (equal GPS time) at most `tolerance_ns` apart along the ray are identical, one to one, nearest
+    first. Where GPS times cannot tell pulses apart, points that are nearest neighbours of each other are.
+    Points passed through without an echo do not count. Memory is bounded; large clouds need room in TMPDIR.
+    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance.
+    """
+    with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
+        for reader, side in ((first, 0), (second, 1)):
+            for rows in read_echoes(reader):
+                task.add(side, rows)
+        return task.finish(str(a), str(b))
+
+
+def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:
+    """The comparison of two clouds, or of what is as they are, by GPS time where both tell pulses apart by it."""
+    by_time = _can_group(first) and _can_group(second) and _share_times(first, second)
+    task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
+    if not by_time:
+        task.place_borders(first)
+    return task
+
+
+def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
+    """Pieces of a cloud without the points that were passed through."""
+    for rows in reader.read_pieces():
+        yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
+
+
+def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Comparison:
+    """Echoes of a cloud against the truth of the simulated strip it was made from; errors and tolerance as in
+    compare_clouds."""
+    with CloudReader(a) as cloud, TruthReader(truth) as reference:
+        points = max(cloud.point_count, reference.meta.get("packets", 0))
+        names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
+        with CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta) as task:
+            for rows in read_echoes(cloud):
+                task.add(0, rows)
+            for piece in reference.read_pieces(*names):
+                task.add(1, _shape_truth(piece))
+            for piece in reference.read_pieces("packet_gps_time"):
+                task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
+            return task.finish(str(a), str(truth))
+
+
+def _can_group(reader: CloudReader) -> bool:
+    """Whether the first points' GPS times tell pulses apart."""
+    if not reader.has_gps_time:
+        return False
+    rows = next(reader.read_pieces(), None)
+    return rows is None or tell_pulses_apart(rows["gps_time"])
+
+
+def _share_times(first: CloudReader, second: CloudReader) -> bool:
+    """Whether any pulse of the shorter cloud's beginning is in the other one."""
+    short, long = sorted((first, second), key=lambda reader: reader.point_count)
+    rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
+    times = np.unique(rows["gps_time"])
+    return not len(rows) or any(np.isin(piece["gps_time"], times).any() for piece in long.read_pieces())
+
+
+def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
+    rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
+    for axis, name in enumerate("xyz"):
+        rows["xyz"][:, axis] = piece[name]
+    for name in ("gps_time", "amplitude", "flags", "isolated"):
+        rows[name] = piece[name]
+    rows["echo_time"] = piece["time"]
+    rows["echo_width"] = piece["sigma"] * FWHM_PER_SIGMA
+    return rows
+
+
+class CloudTask:
+    """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket.
+
+    A context manager, because temporary files hold the rows.
+    """
+
+
+    def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
+        self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
+        self.number = count_buckets(points)
+        dtypes = (CLOUD_DTYPE, _TRUTH_DTYPE if meta else CLOUD_DTYPE, PACKET_DTYPE)
+        self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
+        self.borders = np.empty(0)
+
+    def __enter__(self) -> CloudTask:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for bucket in self.buckets:
+            bucket.close()
+
+    def place_borders(self, reader: CloudReader) -> None:
+        """Borders along x of slabs with about the same number of points."""
+        if self.number > 1:
+            some = np.concatenate([rows["xyz"][::100, 0] for rows in reader.read_pieces()])
+            self.borders = np.quantile(some, np.arange(1, self.number) / self.number)
+
+    def add(self, side: int, rows: np.ndarray) -> None:
+        """Takes in rows of a (side 0), b (1) or the truth's packets (2)."""
+        self.buckets[side].add(rows, self._sort_by_time if self.by_time else self._sort_by_place)
+
+    def _sort_by_time(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return sort_by_time(rows["gps_time"], self.number)
+
+    def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The slab of every point, and the neighbouring ones that it is close to."""
+        index, bucket = [], []
+        low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
+        high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.pairing.tolerance)
+        for step in range(int((high - low).max(initial=0)) + 1):
+            inside = np.flatnonzero(low + step <= high)
+            index.append(inside)
+            bucket.append(low[inside] + step)
+        return np.concatenate(index), np.concatenate(bucket)
+
+    def finish(self, name_a: str, name_b: str) -> Comparison:
+        """Compares bucket by bucket and sums up."""
+        for number in range(self.number):
+            a, b, packets = (bucket.read(number) for bucket in self.buckets)
+            if self.by_time:
+                self.pairing.pair_by_time(a, b, packets)
+            else:
+                own = [np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b)]
+                self.pairing.pair_by_place(a, b, (own[0], own[1]))
+        return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")

@@ -1,0 +1,257 @@
+"""Maps: a statistic of a column in the cells of a grid over x and y, over clouds of any size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.even_sample import EvenSample
+from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.disk.buckets import Buckets, count_buckets
+from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
+
+STATISTICS = ("mean", "median", "min", "max", "count", "density")
+"""Per cell; `density` is points per square metre."""
+
+MOST_CELLS = 4_000_000
+"""Of a grid: more cannot be seen in a picture."""
+
+LEAST_SIZE = 1e-6
+"""Of a cell [m]."""
+
+LARGEST_EXTENT = 1e12
+"""Of coordinates [m]; beyond they are damage."""
+
+CHOSEN_SIDE = 1500
+"""Most cells along a side of a grid that is chosen."""
+
+POINTS_PER_CELL = 6
+"""On average, where points are, in a grid that is chosen."""
+
+SHOWN = (2.0, 98.0)
+"""Percentiles of the cells between which the colours lie."""
+
+_BUCKET_POINTS = 2_000_000
+_SIDE = 128
+_PLACED = np.dtype([("cell", "<u4"), ("value", "<f8")])
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Square cells of `size` metres from the south-west corner on."""
+
+    x: float
+    y: float
+    size: float
+    rows: int
+    columns: int
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south, north [m]."""
+        return self.x, self.x + self.columns * self.size, self.y, self.y + self.rows * self.size
+
+    def place(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Cell of each point, row by row from the south, -1 outside, i8 (n,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            column, row = np.floor((x - self.x) / self.size), np.floor((y - self.y) / self.size)
+            inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        cell = np.full(len(x), -1, np.int64)
+        cell[inside] = row[inside].astype(np.int64) * self.columns + column[inside].astype(np.int64)
+        return cell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Raster:
+    """A map."""
+
+    facts: ColumnFacts
+    statistic: str
+    grid: Grid
+    values: np.ndarray
+    """f8 (rows, columns), the first row is the southernmost; NaN where no point is."""
+    total: Tally
+    outside: int
+    """Points that have a value but do not lie in the grid."""
+    shown: tuple[float, float]
+    """SHOWN percentiles of the cells."""
+
+    @property
+    def label(self) -> str:
+        """What the colours mean, with the unit."""
+        if self.statistic == "count":
+            return "points per cell [-]"
+        if self.statistic == "density":
+            return "points per area [1/m2]"
+        return f"{self.statistic} of {self.facts.label}"
+
+
+def grid_values(
+    paths: Sequence[Path],
+    selection: Selection,
+    statistic: str = "mean",
+    *,
+    size: float | None = None,
+    bounds: tuple[float, float, float, float] | None = None,
+) -> Raster:
+    """The map of a column over clouds, read twice; medians need room in TMPDIR where clouds are large.
+
+    size: side of a cell [m], else so that about POINTS_PER_CELL points lie in one. bounds: west, south, east, north
+    [m], else all points, or all but far outliers.
+    Raises InputError where there is nothing to draw, ConfigError for wrong options and grids beyond MOST_CELLS.
+    """
+    _check(statistic, size, bounds)
+    clouds = Clouds(paths, selection)
+    if clouds.facts.is_flags and statistic in ("mean", "median", "min", "max"):
+        raise ConfigError(
+            f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}; count the points with a flag: "
+            "--statistic count --flags-with NAME"
+        )
+    total, sample, box = _survey(clouds, bounds)
+    if not total.values:
+        raise clouds.complain(total)
+    if not sample.seen:
+        where = "within the bounds" if bounds else "with finite coordinates"
+        raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
+    grid = _choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
+    values, placed = _Cells(grid, statistic, total.values).fill(clouds)
+    known = values[np.isfinite(values)]
+    shown = tuple(np.percentile(known, SHOWN).tolist()) if len(known) else (0.0, 1.0)
+    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, shown)
+
+
+def _check(statistic: str, size: float | None, bounds: tuple[float, float, float, float] | None) -> None:
+    if statistic not in STATISTICS:
+        raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
+    if size is not None and not (LEAST_SIZE <= size < math.inf):
+        raise ConfigError(f"cells must be at least {LEAST_SIZE:g} m long, got {size:g}")
+    if bounds is not None:
+        west, south, east, north = bounds
+        if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):
+            raise ConfigError("bounds must be WEST,SOUTH,EAST,NORTH in metres, west of east and south of north")
+
+
+def _survey(
+    clouds: Clouds, bounds: tuple[float, float, float, float] | None
+) -> tuple[Tally, EvenSample, tuple[float, float, float, float]]:
+    """What becomes of the points, an even sample of places (n, 2), and the box of all of them."""
+    total, sample = Tally(), EvenSample()
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for _, rows, tally in clouds.read():
+        total += tally
+        places = np.stack([rows["x"], rows["y"]], axis=1)
+        keep = np.isfinite(places).all(axis=1)
+        if bounds is not None:
+            keep &= (places >= bounds[:2]).all(axis=1) & (places <= bounds[2:]).all(axis=1)
+        places = places[keep]
+        if len(places):
+            sample.add({"place": places})
+            low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+    return total, sample, bounds or (*low.tolist(), *high.tolist())
+
+
+def _choose_grid(
+    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool
+) -> Grid:
+    places = sample.read()["place"]
+    west, south, east, north = box
+    if not fixed:
+        west, east = robust_limits(places[:, 0], west, east)
+        south, north = robust_limits(places[:, 1], south, north)
+    extent = max(east - west, north - south)
+    if not extent <= LARGEST_EXTENT:
+        raise InputError(f"{where}: its points lie {extent:g} m apart, which is damage; give --bounds to draw a part")
+    if size is None:
+        size = _choose_size(places, sample.seen, (west, south), extent)
+    # Cells lie on multiples of their size, so that maps of neighbouring tiles fit together.
+    x, y = (math.floor(start / size) * size for start in (west, south))
+    x, y = x - size * (x > west), y - size * (y > south)
+    columns, rows = (math.floor((end - start) / size) + 1 for end, start in ((east, x), (north, y)))
+    if columns * rows > MOST_CELLS:
+        least = _nice(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
+        raise ConfigError(
+            f"{where}: {columns} x {rows} cells of {size:g} m are too many to draw; cells of {least:g} m will do"
+        )
+    return Grid(x, y, size, rows, columns)
+
+
+def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float) -> float:
+    """Side of a cell [m]: the area on which points are is that of the cells of a coarse grid that hold any."""
+    if not extent:
+        return 1.0
+    side = extent / _SIDE
+    coarse = np.floor((places - corner) / side)
+    inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
+    filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
+    # A coarse cell holds a point on average at least, or the area would be that of the cells alone.
+    area = filled * side**2
+    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / CHOSEN_SIDE))
+
+
+def _nice(size: float) -> float:
+    """The next of 1, 2, 5, 10 ... times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(size))
+    return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))
+
+
+class _Cells:
+    """The statistic of every cell, gathered point by point: no result depends on how the points come in pieces."""
+
+    def __init__(self, grid: Grid, statistic: str, points: int) -> None:
+        self._grid, self._statistic = grid, statistic
+        self._count = np.zeros(grid.rows * grid.columns, np.int64)
+        start = {"min": np.inf, "max": -np.inf}.get(statistic, 0.0)
+        self._value = np.full(len(self._count), start)
+        self._number = count_buckets(points, _BUCKET_POINTS) if statistic == "median" else 0
+        self._buckets = Buckets(_PLACED, max(self._number, 1))
+
+    def fill(self, clouds: Clouds) -> tuple[np.ndarray, int]:
+        """Values (rows, columns), and how many points lie in them."""
+        with self._buckets:
+            for _, rows, _ in clouds.read():
+                cell = self._grid.place(rows["x"], rows["y"])
+                inside = np.flatnonzero(cell >= 0)
+                self._add(cell[inside], rows["value"][inside])
+            return self._finish().reshape(self._grid.rows, self._grid.columns), int(self._count.sum())
+
+    def _add(self, cell: np.ndarray, value: np.ndarray) -> None:
+        np.add.at(self._count, cell, 1)
+        if self._statistic == "mean":
+            with np.errstate(over="ignore"):
+                np.add.at(self._value, cell, value)
+        elif self._statistic == "min":
+            np.minimum.at(self._value, cell, value)
+        elif self._statistic == "max":
+            np.maximum.at(self._value, cell, value)
+        elif self._statistic == "median":
+            placed = np.empty(len(cell), _PLACED)
+            placed["cell"], placed["value"] = cell, value
+            self._buckets.add(placed, lambda rows: (np.arange(len(rows)), rows["cell"] % self._number))
+
+    def _finish(self) -> np.ndarray:
+        filled = self._count > 0
+        if self._statistic == "median":
+            for number in range(self._number):
+                self._take_medians(self._buckets.read(number))
+        elif self._statistic == "mean":
+            self._value[filled] /= self._count[filled]
+        elif self._statistic in ("count", "density"):
+            area = 1.0 if self._statistic == "count" else self._grid.size**2
+            self._value = self._count / area
+        return np.where(filled, self._value, np.nan)
+
+    def _take_medians(self, placed: np.ndarray) -> None:
+        """Median of every cell of a bucket; of an even number of values the mean of the middle two."""
+        pairs = np.empty(len(placed), np.complex128)  # sorted by their real, then their imaginary parts
+        pairs.real, pairs.imag = placed["cell"], placed["value"]
+        pairs.sort()
+        cell, value = pairs.real.astype(np.int64), pairs.imag
+        first = np.flatnonzero(np.r_[True, np.diff(cell) != 0]) if len(cell) else np.empty(0, np.int64)
+        count = np.diff(np.append(first, len(cell)))
+        low, high = value[first + (count - 1) // 2], value[first + count // 2]
+        self._value[cell[first]] = low + 0.5 * (high - low)

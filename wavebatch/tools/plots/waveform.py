@@ -1,0 +1,142 @@
+"""What a picture of a waveform shows, as arrays: samples, noise, fit, residual, echoes and the vendor's returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, shape_limits
+from wavebatch.tools.plots.packets import Place
+
+FINE = 8
+"""Points of a curve per sample ..."""
+
+MOST_POINTS = 20_000
+"""... as long as they are no more than this."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WaveformView:
+    """One waveform and what a chain made of it."""
+
+    packet: int
+    """Number in the strip; -1 where nobody counted."""
+    point: int
+    """First point of the file that has it."""
+    gps_time: float
+    """[s]."""
+    time: np.ndarray
+    """Of the samples after the first one [ns], f8 (s,)."""
+    samples: np.ndarray
+    """[DN], f8 (s,)."""
+    clipped: np.ndarray
+    """Samples at the digitizer's limit, bool (s,)."""
+    baseline: float
+    std: float
+    """Noise of a sample without signal [DN]."""
+    fine: np.ndarray
+    """Times of the curves [ns], f8 (q,)."""
+    curves: np.ndarray
+    """Each echo's pulse above the baseline [DN], f8 (k, q); (0, q) where the chain fits nothing that could be drawn."""
+    residual: np.ndarray | None
+    """Samples without baseline and fit, in standard deviations of the noise at each, f8 (s,); NaN for clipped samples
+    that the fit exceeds, which say no more than that. None without a fit."""
+    echoes: EchoTable
+    """Of this waveform, k of them."""
+    returns: np.ndarray
+    """Where the input's returns lie [ns], f8 (r,)."""
+    return_points: np.ndarray
+    """Their points, i8 (r,)."""
+
+    @property
+    def spacing(self) -> float:
+        """Time between two samples [ns]; 1 where there is only one."""
+        return float(self.time[1]) if len(self.time) > 1 else 1.0
+
+    @property
+    def fit(self) -> np.ndarray | None:
+        """Sum of baseline and curves [DN], f8 (q,); None without a fit."""
+        return None if self.residual is None else self.baseline + self.curves.sum(axis=0)
+
+
+def read_views(
+    reader: StripReader, scan: StripScan, places: Sequence[Place], chain: Chain, system: SystemPulse
+) -> list[WaveformView]:
+    """The waveforms at `places`, in their order, run through the chain as `wavebatch run` would."""
+    views: dict[tuple[int, int], WaveformView] = {}
+    for number in sorted({place.unit for place in places}):
+        unit = reader.read_unit(number, scan)
+        packet = {place.row: place.packet for place in places if place.unit == number}
+        for block, rows in reader.read_rows(unit, np.array(sorted(packet)), len(packet)):
+            parts = build_views(block, chain, system, [packet[int(row)] for row in rows])
+            views |= {(number, int(row)): view for row, view in zip(rows, parts, strict=True)}
+    return [views[place.unit, place.row] for place in places]
+
+
+def build_views(
+    block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int]
+) -> list[WaveformView]:
+    """A view per waveform of the block; packets: their numbers in the strip."""
+    system = system.of(block)
+    first, decomposer = chain.steps[0], chain.steps[2]
+    noise = first.stage.function(block, system, **first.parameters)
+    echoes = chain.run(block, system)
+    shape_of = MODELS[decomposer.stage.name]
+    shape = None if shape_of is None else shape_of(system, block.spacing, **decomposer.effective())
+    level = clip_level(block, system)
+    views = []
+    for row, number in enumerate(packets):
+        table = echoes.take(np.flatnonzero(echoes.waveform == row))
+        samples = block.samples[row].astype(np.float64)
+        clipped = samples >= level
+        baseline, std = float(noise.baseline[row]), float(noise.std[row])
+        time = np.arange(len(samples)) * block.spacing
+        fine = np.linspace(0.0, time[-1], max(len(time), min(FINE * (len(time) - 1) + 1, MOST_POINTS)))
+        curves, residual = np.zeros((0, len(fine))), None
+        if shape is not None:
+            pulses = _place_pulses(shape, table, system, block.spacing)
+            curves = pulses(fine)
+            residual = _residual(samples - baseline, pulses(time).sum(axis=0), clipped, std, system.noise_gain)
+        near = np.flatnonzero(block.returns.waveform == row) if block.returns is not None else np.empty(0, np.int64)
+        views.append(
+            WaveformView(
+                number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
+                fine, curves, residual, table,
+                returns=block.returns.time[near] if len(near) else np.empty(0),
+                return_points=block.returns.point[near] if len(near) else np.empty(0, np.int64),
+            )  # fmt: skip
+        )
+    return views
+
+
+def _place_pulses(
+    shape: PulseShape, echoes: EchoTable, system: SystemPulse, spacing: float
+) -> Callable[[np.ndarray], np.ndarray]:
+    """A function of times [ns] (q,) that gives the pulse of each echo [DN], f8 (k, q)."""
+    described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
+    amplitude, time, width = model_parameters(shape, shape_limits(system, spacing), described.astype(np.float64)).T
+
+    def evaluate(at: np.ndarray) -> np.ndarray:
+        if not len(echoes):
+            return np.zeros((0, len(at)))
+        x = np.tile(at / spacing, (len(echoes), 1))
+        return amplitude[:, None] * evaluate_pulse(shape, x, time[:, None], width[:, None])[0]
+
+    return evaluate
+
+
+def _residual(
+    signal: np.ndarray, fit: np.ndarray, clipped: np.ndarray, std: float, noise_gain: float
+) -> np.ndarray:
+    """Signal minus fit in standard deviations of the noise at each sample (H6, H12), f8 (s,)."""
+    difference = signal - fit
+    noise = np.sqrt(std**2 + noise_gain * np.maximum(fit, 0.0))
+    return np.where(clipped & (difference <= 0), np.nan, difference / noise)

@@ -1,0 +1,1 @@
+"""What `wavebatch stats` counts: return numbers, separations and flags, by file and area."""

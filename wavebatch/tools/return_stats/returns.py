@@ -1,0 +1,289 @@
+"""Statistics of discrete returns: how many a pulse has, how far apart they are, which flags they carry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C
+from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
+from wavebatch.tools.return_stats.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
+
+_BIN = 0.01
+_BINS = 10_000
+_MOST_PAIR = 15
+_ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
+_LEAST_PAIRS = 100
+_EDGE = 0.001
+"""Share of the separations that may lie below what is called the dead zone: a few doubled points do not hide it."""
+
+_SURE = 3.0
+"""Standard deviations by which more pulses must have the most returns than one less, to be a limit of the sensor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """Distances between two consecutive returns of a pulse [m]."""
+
+    pairs: int
+    mean: float
+    least: float
+    """NaN, as the mean, where there is no pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnStats:
+    """What the returns of one cloud, or of several together, are like."""
+
+    cloud: str
+    points: int
+    pulses: int
+    incomplete: int
+    """Pulses with another number of points than their points say: cut by a tile's border, thinned, or merged."""
+    pulses_by: str
+    """`gps_time`, or `return_number` where times do not tell pulses apart."""
+    by_number: dict[int, float]
+    """Share of all returns that have this return number."""
+    by_count: dict[int, float]
+    """Share of the pulses with exactly this many returns in the cloud."""
+    separations: dict[str, Separation]
+    """`all`, and `1-2`, `2-3` ... by return number. Points passed through without an echo do not count."""
+    dead_zone: float
+    """Distance [m] below which only one separation in a thousand lies; NaN with fewer than a hundred separations."""
+    hidden: float
+    """Pairs per pulse that would lie in the dead zone if they were as frequent there as up to twice its size."""
+    flags: dict[str, int] | None
+    """Points per flag of `echo_flags`; None where no cloud has the column."""
+    warnings: tuple[str, ...]
+    areas: tuple[AreaStats, ...] = ()
+    """Of every area that holds a pulse, where areas are asked for; together they have all points and pulses."""
+
+    @property
+    def returns_per_pulse(self) -> float:
+        """Mean number of returns; NaN without pulses."""
+        return self.points / self.pulses if self.pulses else float("nan")
+
+
+def count_returns(
+    clouds: Sequence[Path], skip=None, *, divisions: Sequence[Division] = ()
+) -> tuple[list[ReturnStats], ReturnStats]:
+    """Statistics of every cloud and of all of them together, whatever the order of their points.
+
+    Pulses are points of equal GPS time in a cloud; where times do not tell them apart, runs of rising return numbers.
+    divisions: into areas, each counted on its own; a pulse belongs, with all of its returns, to the area of its first.
+    skip: called with the InputError of a cloud that cannot be read, which is then left out; None lets it through.
+    Memory does not grow with the clouds; large ones need room in TMPDIR. Raises ConfigError for too many areas.
+    """
+    each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
+    for path in clouds:
+        try:
+            tally = _tally_cloud(Path(path), divisions)
+        except InputError as error:
+            if skip is None:
+                raise
+            skip(error)
+            continue
+        number += sum(map(len, tally.areas))
+        if number > MOST_AREAS:
+            raise ConfigError(f"{path}: more than {MOST_AREAS} areas with it; give a larger --area, or fewer clouds")
+        each.append(tally.finish(str(path)))
+        total.merge(tally)
+    return each, total.finish("total")
+
+
+def pulses_told_apart(reader: ReturnReader) -> bool:
+    """Whether the GPS times of the cloud's first points tell pulses apart."""
+    if not reader.has_gps_time:
+        return False
+    rows = next(reader.read_pieces(), None)
+    return rows is None or tell_pulses_apart(rows["gps_time"])
+
+
+def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
+    with ReturnReader(path) as reader:
+        by_time = pulses_told_apart(reader)
+        areas = [AreaTally(division) for division in divisions]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
+        if reader.has_flags:
+            tally.flags = np.zeros(16, np.int64)
+        number = count_buckets(reader.point_count)
+        with Buckets(_ROW, number) as buckets:
+            keys = _Keys(by_time)
+            for rows in reader.read_pieces():
+                tally.add_points(rows)
+                buckets.add(_shape(rows, keys.of(rows)), lambda part: _sort_by_key(part, number))
+            for bucket in range(number):
+                tally.add_pulses(buckets.read(bucket))
+    return tally
+
+
+class _Keys:
+    """A number per pulse, piece by piece."""
+
+    def __init__(self, by_time: bool) -> None:
+        self._by_time, self._pulse, self._last = by_time, 0, 255
+
+    def of(self, rows: np.ndarray) -> np.ndarray:
+        """u8 (n,)."""
+        if self._by_time:
+            return time_keys(rows["gps_time"])
+        if not len(rows):
+            return np.empty(0, np.uint64)
+        starts = rows["number"] <= np.concatenate([[self._last], rows["number"][:-1]])
+        pulse = self._pulse + np.cumsum(starts)
+        self._pulse, self._last = int(pulse[-1]), int(rows["number"][-1])
+        return pulse.astype(np.uint64)
+
+
+def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
+    shaped = np.zeros(len(rows), _ROW)
+    shaped["key"] = key
+    for name in ("xyz", "number", "total"):
+        shaped[name] = rows[name]
+    shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
+    return shaped
+
+
+def _sort_by_key(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(len(rows)), spread_keys(rows["key"], number)
+
+
+@dataclass(slots=True, eq=False)
+class _Tally:
+    """Sums from which the statistics follow; tallies of several clouds can be merged."""
+
+    points: int = 0
+    incomplete: int = 0
+    methods: set[str] = field(default_factory=set)
+    by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
+    by_count: np.ndarray = field(default_factory=lambda: np.zeros(MOST_COUNT + 1, np.int64))
+    bins: np.ndarray = field(default_factory=lambda: np.zeros(_BINS, np.int64))
+    pairs: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR, np.int64))
+    sums: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR))
+    least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
+    flags: np.ndarray | None = None
+    areas: list[AreaTally] = field(default_factory=list)
+
+    def add_points(self, rows: np.ndarray) -> None:
+        """Return numbers and flags of some points."""
+        self.points += len(rows)
+        self.by_number += np.bincount(rows["number"], minlength=16)
+        if self.flags is not None:
+            self.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
+
+    def add_pulses(self, rows: np.ndarray) -> None:
+        """Counts and separations of whole pulses, in any order."""
+        if not len(rows):
+            return
+        rows = rows[np.lexsort((rows["number"], rows["key"]))]
+        first = np.flatnonzero(np.concatenate([[True], rows["key"][1:] != rows["key"][:-1]]))
+        counts = np.diff(np.append(first, len(rows)))
+        self.by_count += np.bincount(np.minimum(counts, MOST_COUNT), minlength=MOST_COUNT + 1)
+        self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
+        pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
+        before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = np.linalg.norm(rows["xyz"][before + 1] - rows["xyz"][before], axis=1)
+        known = np.isfinite(distance)
+        before, distance = before[known], distance[known]
+        rank = np.minimum(rows["number"][before], _MOST_PAIR) - 1
+        self.bins += np.bincount(np.minimum(distance / _BIN, _BINS - 1).astype(np.int64), minlength=_BINS)
+        self.pairs += np.bincount(rank, minlength=_MOST_PAIR)
+        self.sums += np.bincount(rank, distance, _MOST_PAIR)
+        np.minimum.at(self.least, rank, distance)
+        for area in self.areas:
+            area.add(rows, first, before, distance)
+
+    def merge(self, other: _Tally) -> None:
+        """Adds what another cloud has."""
+        self.points += other.points
+        self.incomplete += other.incomplete
+        self.methods |= other.methods
+        for name in ("by_number", "by_count", "bins", "pairs", "sums"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.least = np.minimum(self.least, other.least)
+        for area, more in zip(self.areas, other.areas, strict=True):
+            area.merge(more)
+        if other.flags is not None:
+            self.flags = other.flags + (0 if self.flags is None else self.flags)
+
+    def finish(self, cloud: str) -> ReturnStats:
+        """The statistics."""
+        pulses = int(self.by_count.sum())
+        zone = self._find_dead_zone()
+        near = self._count_between(zone, 2 * zone) if not math.isnan(zone) else 0
+        hidden = near / pulses if pulses and not math.isnan(zone) else float("nan")
+        names = {flag.name: int(n) for flag, n in zip(EchoFlag, self.flags, strict=True)} if self.has_flags else None
+        return ReturnStats(
+            cloud=cloud,
+            points=self.points,
+            pulses=pulses,
+            incomplete=self.incomplete,
+            pulses_by=" and ".join(sorted(self.methods)),
+            by_number=share_counts(self.by_number),
+            by_count=share_counts(self.by_count),
+            separations=self._list_separations(),
+            dead_zone=zone,
+            hidden=hidden,
+            flags=names,
+            warnings=tuple(self._warn(zone, hidden, pulses)),
+            areas=tuple(stats for area in self.areas for stats in area.finish()),
+        )
+
+    @property
+    def has_flags(self) -> bool:
+        """Whether any cloud has flags."""
+        return self.flags is not None
+
+    def _list_separations(self) -> dict[str, Separation]:
+        table = {"all": _separation(self.pairs.sum(), self.sums.sum(), self.least.min())}
+        for rank in np.flatnonzero(self.pairs).tolist():
+            name = f"{rank + 1}-{rank + 2}" if rank + 1 < _MOST_PAIR else f"{rank + 1}-"
+            table[name] = _separation(self.pairs[rank], self.sums[rank], self.least[rank])
+        return table
+
+    def _find_dead_zone(self) -> float:
+        """Lower edge of the separations, to 1 cm, without the closest thousandth."""
+        total = int(self.bins.sum())
+        if total < _LEAST_PAIRS:
+            return float("nan")
+        return round(int(np.searchsorted(np.cumsum(self.bins), _EDGE * total, side="right")) * _BIN, 2)
+
+    def _count_between(self, low: float, high: float) -> int:
+        a, b = round(low / _BIN), round(high / _BIN)
+        return int(self.bins[a:b].sum())
+
+    def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
+        lines = []
+        if zone >= 0.05 and hidden > 0.001:
+            lines.append(
+                f"dead zone: hardly any two returns of a pulse lie closer than {zone:.2f} m ({zone / HALF_C:.1f} ns); "
+                "surfaces nearer to each other are one return. Were they as frequent there as just above it, there "
+                f"would be {hidden:.3f} more returns per pulse"
+            )
+        most = int(np.flatnonzero(self.by_count).max(initial=0))
+        last, before = int(self.by_count[most]), int(self.by_count[max(most - 1, 0)])
+        if most >= 3 and last - before > _SURE * math.sqrt(last + before):
+            lines.append(
+                f"limit: {self.by_count[most] / pulses:.1%} of the pulses have {most} returns, more than have "
+                f"{most - 1}; the sensor records no more than {most}, and what lies behind is not there"
+            )
+        if self.incomplete > 0.001 * pulses:
+            lines.append(
+                f"incomplete: {self.incomplete} of {pulses} pulses have another number of points than their points "
+                "say; tiles and thinned clouds give fewer returns per pulse than the sensor had"
+            )
+        return lines
+
+
+def _separation(pairs: int, total: float, least: float) -> Separation:
+    if not pairs:
+        return Separation(0, float("nan"), float("nan"))
+    return Separation(int(pairs), float(total) / int(pairs), float(least))

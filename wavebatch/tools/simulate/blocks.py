@@ -1,0 +1,157 @@
+"""Scenes to blocks: waveforms with geometry, and the table of the echoes that are in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.tools.simulate.geometry import Flight, Rays, trace_rays
+from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+from wavebatch.tools.simulate.scenes import Scene, find_scene
+
+SEED_BLOCK = 8192
+"""Pulses that share one seed: pulse k of a seed is the same whatever else is simulated with it."""
+
+NEIGHBOUR = 4.0
+"""Echoes closer than this many sigma (of the wider one) count as overlapped (ALGORITHMS.md 2.2)."""
+
+EDGE = 2.0
+"""Echoes closer than this many sigma to an end of the window count as near the edge (H8)."""
+
+WEAK = 5.0
+"""Echoes below this many standard deviations of the noise count as weak."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """Waveforms, the echoes in them, and the rays they came along."""
+
+    block: WaveformBlock
+    truth: EchoTable
+    rays: Rays
+
+
+def simulate_block(
+    scene: Scene | str, n: int, rng: np.random.Generator, *, recording: Recording | None = None, first: int = 0
+) -> tuple[WaveformBlock, EchoTable]:
+    """A block of n waveforms of the scene and the truth: an EchoTable of the echoes in it.
+
+    scene: a Scene or the name of one; recording: replaces the scene's own; first: number of the first pulse.
+    The truth's time is the peak [ns after sample 0], amplitude the height of the peak above the baseline [count],
+    sigma the standard deviation of the main lobe [ns]; its flags say OVERLAPPED, NEAR_EDGE, SATURATED and WEAK.
+    The block's origin is the true position of sample 0. Errors: ConfigError for an unknown scene.
+    """
+    simulated = simulate_pulses(_prepare(scene, recording), n, rng, first=first)
+    return simulated.block, simulated.truth
+
+
+def simulate_blocks(
+    scene: Scene | str, n: int, *, seed: int = 0, recording: Recording | None = None, size: int = SEED_BLOCK
+) -> Iterator[tuple[WaveformBlock, EchoTable]]:
+    """Blocks of at most `size` waveforms, n in all, and their truth; waveform k depends on scene and seed only.
+
+    So any two calls agree in the waveforms that both make, whatever their n and size.
+    """
+    scene = _prepare(scene, recording)
+    if n < 0 or size < 1:
+        raise ConfigError(f"cannot simulate {n} waveforms in blocks of {size}; give numbers above 0")
+    for start in range(0, n, size):
+        parts = list(_simulate_range(scene, seed, start, min(start + size, n)))
+        yield parts[0] if len(parts) == 1 else _join(parts, start)
+
+
+def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
+    """Pulses [SEED_BLOCK number, SEED_BLOCK (number + 1)) of the scene with this seed."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+    return simulate_pulses(scene, SEED_BLOCK, rng, first=number * SEED_BLOCK, flight=flight)
+
+
+def simulate_pulses(
+    scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: Flight | None = None
+) -> Simulated:
+    """Block, truth and rays of pulses [first, first + n); the only function that draws random numbers."""
+    recording = scene.recording
+    rays = trace_rays(flight or scene.flight or Flight(), scene.terrain, first + np.arange(n))
+    drawn = scene.draw(rng, n, rays)
+    signal = paint_echoes(recording, n, drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
+    counts = record_counts(recording, signal, rng, drawn.constant)
+    real = slice(None) if drawn.ghost is None else ~drawn.ghost
+    truth = EchoTable.build(drawn.waveform[real], drawn.time[real], drawn.amplitude[real], drawn.sigma[real])
+    truth = flag_truth(truth, recording)
+    counts.flags.writeable = False
+    block = WaveformBlock(
+        digitizer=recording.digitizer,
+        samples=counts,
+        first=first,
+        point=first + np.arange(n),
+        gps_time=rays.gps_time,
+        origin=rays.ground - _ground_time(truth, n, recording)[:, None] * rays.direction,
+        direction=rays.direction,
+    )
+    return Simulated(block, truth, rays)
+
+
+def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
+    """The truth with flags for what makes an echo hard: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
+    sigma = truth.sigma.astype(np.float64)
+    close = np.diff(truth.time) < NEIGHBOUR * np.maximum(sigma[1:], sigma[:-1])
+    close &= np.diff(truth.waveform) == 0
+    overlapped = np.zeros(len(truth), bool)
+    overlapped[1:] |= close
+    overlapped[:-1] |= close
+    depth = np.minimum(truth.time, recording.duration - truth.time)
+    flags = np.zeros(len(truth), np.uint16)
+    for flag, where in (
+        (EchoFlag.OVERLAPPED, overlapped),
+        (EchoFlag.NEAR_EDGE, depth < EDGE * sigma),
+        (EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip),
+        (EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise),
+    ):
+        flags[where] |= np.uint16(flag)
+    return replace(truth, flags=flags)
+
+
+def _ground_time(truth: EchoTable, n: int, recording: Recording) -> np.ndarray:
+    """Time at which each ray meets the ground [ns]: its last echo, or the middle of the window without one."""
+    time = np.full(n, recording.duration / 2)
+    time[truth.waveform] = truth.time
+    return time
+
+
+def _prepare(scene: Scene | str, recording: Recording | None) -> Scene:
+    scene = find_scene(scene) if isinstance(scene, str) else scene
+    return scene if recording is None else replace(scene, recording=recording)
+
+
+def _simulate_range(scene: Scene, seed: int, start: int, stop: int) -> Iterator[tuple[WaveformBlock, EchoTable]]:
+    for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
+        low, high = number * SEED_BLOCK, (number + 1) * SEED_BLOCK
+        simulated = simulate_seed_block(scene, seed, number)
+        if start <= low and high <= stop:
+            yield simulated.block, simulated.truth
+        else:
+            yield cut_block(simulated.block, simulated.truth, max(start - low, 0), min(stop, high) - low)
+
+
+def cut_block(block: WaveformBlock, truth: EchoTable, start: int, stop: int) -> tuple[WaveformBlock, EchoTable]:
+    """Waveforms [start, stop) of the block and their truth."""
+    a, b = np.searchsorted(truth.waveform, [start, stop])
+    part = truth.take(np.arange(a, b))
+    return block.rows(slice(start, stop)), replace(part, waveform=part.waveform - np.int32(start))
+
+
+def _join(parts: list[tuple[WaveformBlock, EchoTable]], first: int) -> tuple[WaveformBlock, EchoTable]:
+    blocks = [block for block, _ in parts]
+    shifts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
+    truth = EchoTable.concatenate([(truth, int(shift)) for (_, truth), shift in zip(parts, shifts, strict=True)])
+    columns = {
+        name: np.concatenate([getattr(block, name) for block in blocks])
+        for name in ("samples", "point", "gps_time", "origin", "direction")
+    }
+    columns["samples"].flags.writeable = False
+    return replace(blocks[0], first=first, **columns), truth

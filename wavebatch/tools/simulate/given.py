@@ -1,0 +1,67 @@
+"""Waveforms that hold exactly the echoes that are asked for, and what a survey without error would say of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.tools.simulate.blocks import flag_truth
+from wavebatch.tools.simulate.draws import tabulate_echoes
+from wavebatch.tools.simulate.pulses import PulseModel
+from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+
+FINE = 100.0
+"""Counts per unit of amplitude of `fine_recording`."""
+
+
+def simulate_echoes(
+    recording: Recording, time: np.ndarray, amplitude, sigma, rng: np.random.Generator
+) -> tuple[WaveformBlock, EchoTable]:
+    """A block of n waveforms without geometry that hold the given echoes, and its truth.
+
+    time: peaks (n, k) [ns after sample 0], NaN where a waveform has fewer than k; amplitude [count] and sigma of the
+    main lobe [ns]: of the same shape, or what spreads to it. rng draws the noise.
+    """
+    drawn = tabulate_echoes(np.asarray(time, np.float64), amplitude, sigma)
+    signal = paint_echoes(recording, len(time), drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
+    block = WaveformBlock.from_samples(record_counts(recording, signal, rng), spacing=recording.spacing)
+    truth = EchoTable.build(drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
+    return block, flag_truth(truth, recording)
+
+
+def fine_recording(
+    noise_std: float, sigma: float, *, n_samples: int = 80, spacing: float = 1.0, kappa: float = 0.0
+) -> Recording:
+    """A receiver of 16 bits with FINE counts per unit of amplitude, so that rounding and clipping do not matter.
+
+    noise_std: in units of amplitude, so that the echoes must be given FINE times theirs; sigma [ns] and kappa: of the
+    pulse.
+    """
+    return Recording(
+        n_samples=n_samples,
+        spacing=spacing,
+        bits=16,
+        baseline=5000.0,
+        baseline_spread=0.0,
+        noise_std=FINE * noise_std,
+        pulse=PulseModel(sigma, kappa),
+    )
+
+
+def known_noise(recording: Recording, n: int, least: float = 0.0) -> Noise:
+    """The noise of n waveforms as it is; least: smallest standard deviation to state [count]."""
+    std = max(recording.recorded_noise, least)
+    return Noise(np.full(n, recording.baseline, np.float32), np.full(n, std, np.float32))
+
+
+def known_system(recording: Recording) -> SystemPulse:
+    """What a survey without error would say of the recording; lobes of the pulse are left out."""
+    return SystemPulse(
+        sigma_ref=recording.pulse.sigma,
+        baseline=recording.baseline,
+        baseline_spread=recording.baseline_spread,
+        noise_std=recording.recorded_noise,
+        noise_gain=recording.noise_gain,
+        kappa=recording.pulse.kappa,
+    )

@@ -1,0 +1,178 @@
+"""Echoes to raw counts: lobes painted into waveforms, noise, clipping and rounding, all waveforms at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import Digitizer
+from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
+
+REACH = 5.5
+"""Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""
+
+_ROWS = 2048
+"""Waveforms that get noise at a time: small enough for the cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """How the simulated receiver records: window, levels, noise and system pulse."""
+
+    n_samples: int = 80
+    spacing: float = 1.0
+    """Time between two samples [ns]."""
+    bits: int = 8
+    baseline: float = 12.0
+    """Mean level without signal [count]."""
+    baseline_spread: float = 0.4
+    """Standard deviation of the level between waveforms [count]."""
+    noise_std: float = 1.0
+    """Standard deviation of the noise before rounding [count]."""
+    rho: float = 0.0
+    """Correlation of the noise of neighbouring samples: 0 (white) or m/(m+1), m = 1, 2, ... (binomial filters)."""
+    noise_gain: float = 0.0
+    """Variance that the signal adds, per count of signal [count]."""
+    saturation: int | None = None
+    """Count at which the receiver clips; None: the digitizer's largest."""
+    pulse: PulseModel = field(default_factory=PulseModel)
+
+    def __post_init__(self) -> None:
+        check = {
+            "bits must be 8, 16 or 32": self.bits in (8, 16, 32),
+            "n_samples must be at least 8": self.n_samples >= 8,
+            "spacing must be positive": self.spacing > 0,
+            "noise_std must not be negative": self.noise_std >= 0,
+            "noise_gain must not be negative": self.noise_gain >= 0,
+            "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": abs(self.rho - self.color / (self.color + 1)) < 0.006,
+            "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,
+            "saturation must be a count that the bits can hold": 0 < self.clip < 1 << self.bits,
+        }
+        for message, good in check.items():
+            if not good:
+                raise ConfigError(f"simulated recording: {message}")
+
+    @property
+    def color(self) -> int:
+        """Order m of the binomial filter that gives the noise its correlation."""
+        return round(self.rho / (1 - self.rho)) if 0 <= self.rho < 0.95 else -2
+
+    @property
+    def clip(self) -> int:
+        """Largest count that is ever recorded."""
+        return (1 << self.bits) - 1 if self.saturation is None else self.saturation
+
+    @property
+    def recorded_noise(self) -> float:
+        """Standard deviation of one recorded sample without signal [count]: noise and rounding."""
+        return float(np.hypot(self.noise_std, QUANTISATION_STD))
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample [ns]."""
+        return (self.n_samples - 1) * self.spacing
+
+    @property
+    def digitizer(self) -> Digitizer:
+        """The wave packet descriptor."""
+        return Digitizer(1, self.bits, self.n_samples, self.spacing)
+
+
+def paint_echoes(
+    recording: Recording, n: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray
+) -> np.ndarray:
+    """Signal without baseline and noise, float32 (n, s) [count].
+
+    waveform (m,) must be sorted; time [ns], amplitude [count] and sigma [ns] per echo, (m,).
+    """
+    first = np.searchsorted(waveform, np.arange(n))
+    rank = np.arange(len(waveform)) - first[waveform]
+    jobs = []
+    for number, (start, height, width) in enumerate(spread_lobes(recording.pulse, time, amplitude, sigma)):
+        kappa = recording.pulse.kappa if number == 0 else 0.0
+        behind = (np.expm1(REACH * abs(kappa)) / abs(kappa) if abs(kappa) > 1e-6 else REACH) * width
+        left = np.ceil((behind if kappa < 0 else REACH * width) / recording.spacing).astype(np.int64)
+        right = np.ceil((behind if kappa > 0 else REACH * width) / recording.spacing).astype(np.int64)
+        length = -(-(left + right + 1) // 8) * 8
+        jobs.append((start, height, width, left, length, kappa))
+    pad = max((int(job[4].max(initial=8)) for job in jobs), default=8)
+    stride = recording.n_samples + pad
+    canvas = np.zeros(n * stride + pad, np.float32)
+    for job in jobs:
+        _paint_lobes(canvas, pad, stride, recording, waveform, rank, *job)
+    return canvas[pad:].reshape(n, stride)[:, : recording.n_samples]
+
+
+def _paint_lobes(canvas, pad, stride, recording, waveform, rank, start, height, width, left, length, kappa) -> None:
+    """Add one lobe per echo. Rows of one rank are distinct, so that a gather, an add and a scatter lose nothing;
+    neighbouring rows share only the padding between them, which nobody reads."""
+    position = start / recording.spacing
+    sample = np.floor(position).astype(np.int64) - left
+    inside = (sample > -pad) & (sample < recording.n_samples)
+    key = rank * 4096 + length
+    for value in np.unique(key[inside]):
+        rows = np.flatnonzero(inside & (key == value))
+        w = int(length[rows[0]])
+        windows = np.lib.stride_tricks.as_strided(canvas, (len(canvas) - w + 1, w), (4, 4))
+        offset = (sample[rows] - position[rows]).astype(np.float32)
+        z = np.arange(w, dtype=np.float32) + offset[:, None]
+        z *= (recording.spacing / width[rows]).astype(np.float32)[:, None]
+        if kappa:
+            z = main_lobe(z, kappa)
+        else:
+            z *= z
+            z *= np.float32(-0.5)
+            np.exp(z, out=z)
+        z *= height[rows].astype(np.float32)[:, None]
+        at = pad + waveform[rows].astype(np.int64) * stride + sample[rows]
+        z += windows[at]
+        windows[at] = z
+
+
+def record_counts(
+    recording: Recording, signal: np.ndarray, rng: np.random.Generator, constant: np.ndarray | None = None
+) -> np.ndarray:
+    """Raw counts, unsigned (n, s): signal [count] on its baseline with noise, clipped and rounded.
+
+    constant: level of the waveforms that hold nothing but one count, NaN for the others, (n,).
+    """
+    n, s = signal.shape
+    dtype = {8: np.uint8, 16: np.uint16, 32: np.uint32}[recording.bits]
+    counts = np.empty((n, s), dtype)
+    # Half a count is added once, so that the cast rounds to nearest.
+    level = (recording.baseline + 0.5 + recording.baseline_spread * rng.standard_normal(n)).astype(np.float32)
+    top = recording.clip + 0.5
+    for a in range(0, n, _ROWS):
+        part = signal[a : a + _ROWS]
+        values = _draw_noise(recording, part, rng)
+        values += part
+        values += level[a : a + _ROWS, None]
+        if recording.bits == 32:
+            values = values.astype(np.float64)
+        np.clip(values, 0, top, out=values)
+        counts[a : a + _ROWS] = values
+    if constant is not None:
+        rows = np.flatnonzero(~np.isnan(constant))
+        counts[rows] = np.clip(constant[rows], 0, recording.clip).astype(dtype)[:, None]
+    return counts
+
+
+def _draw_noise(recording: Recording, signal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    n, s = signal.shape
+    noise = rng.standard_normal((n, s + recording.color), dtype=np.float32)
+    for _ in range(recording.color):
+        noise = noise[:, 1:] + noise[:, :-1]
+    if recording.color:
+        taps = np.array([1.0])
+        for _ in range(recording.color):
+            taps = np.convolve(taps, [1.0, 1.0])
+        noise /= np.float32(np.sqrt((taps**2).sum()))
+    if recording.noise_gain:
+        variance = np.float32(recording.noise_std**2) + np.float32(recording.noise_gain) * np.maximum(signal, 0)
+        noise *= np.sqrt(variance)
+    else:
+        noise *= np.float32(recording.noise_std)
+    return noise

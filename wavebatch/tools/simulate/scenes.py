@@ -1,0 +1,210 @@
+"""The scenes: what lies under the laser, as probabilities of echoes, and what draws them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels.physics.radiometry import transmit
+from wavebatch.tools.simulate.canopy import CANOPIES, Canopy
+from wavebatch.tools.simulate.draws import (
+    Drawn,
+    FoldedWidth,
+    HalfBroadened,
+    LogNormal,
+    LogUniform,
+    Mixture,
+    WithGaps,
+    WithinDepth,
+    draw_counts,
+    widen_on_slope,
+)
+from wavebatch.tools.simulate.geometry import GROUND, Flight, Rays
+from wavebatch.tools.simulate.hazards import HAZARDS, draw_hazards
+from wavebatch.tools.simulate.pulses import PulseModel, find_pulse
+from wavebatch.tools.simulate.render import Recording
+
+GROUND_REFLECTS, ROOFS_REFLECT = 0.2, 0.4
+"""Diffuse reflectances in scenes with light."""
+
+LEAST_ROOF = 1.0
+"""Height above the ground from which a surface is a roof [m]."""
+
+AIR_ATTENUATION = 0.22
+"""Of the air in scenes with light, one way [dB/km]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A kind of land: how many echoes its waveforms hold, how strong, wide and far apart they are."""
+
+    name: str
+    meaning: str
+    counts: tuple[float, ...] = (0.0, 1.0)
+    """Probabilities of 0, 1, 2 ... echoes."""
+    amplitude: LogUniform | LogNormal | Mixture = LogNormal(25.0, 0.8, 5.0, 230.0)
+    width: FoldedWidth | HalfBroadened = FoldedWidth(0.35, 0.105)
+    times: WithinDepth | WithGaps = WithinDepth(24.0)
+    """24 ns deep, the decomposer of ALGORITHMS.md 4.3 gets the exact counts that are stated there (.96, .61)."""
+    terrain: str = "flat"
+    """Name of the ground's shape, see simulate.geometry."""
+    divergence: float = 0.0
+    """Full angle of the beam between the 1/e^2 points [mrad]; above 0, slopes widen the echoes."""
+    light: float = 0.0
+    """amplitude sigma range^2 of a white surface that faces the sensor, before the air takes its share [count ns m2].
+    Above 0, echoes are as bright as Lambertian surfaces of GROUND_REFLECTS and ROOFS_REFLECT are.
+    """
+    flight: Flight | None = None
+    """How the scene is flown over; None: as all others are."""
+    hazards: tuple[str, ...] = ()
+    """Names of hazards that replace all of the above."""
+    canopy: Canopy | None = None
+    """A stand of plants that replaces counts, amplitude, width and times."""
+    recording: Recording = field(default_factory=Recording)
+
+    def draw(self, rng: np.random.Generator, n: int, rays: Rays) -> Drawn:
+        """Echoes of n waveforms that came along n rays."""
+        if self.hazards:
+            return draw_hazards(rng, n, self.recording, self.hazards)
+        if self.canopy:
+            return self.canopy.draw(rng, n, self.recording)
+        count = draw_counts(rng, n, self.counts)
+        waveform = np.repeat(np.arange(n), count)
+        time = self.times(rng, count, self.recording)
+        amplitude = self.amplitude(rng, len(waveform))
+        sigma = self.width(rng, np.repeat(count == 1, count), self.recording.pulse.sigma)
+        if self.light:
+            amplitude = _light_surfaces(self.light, rays)[waveform] / self.recording.pulse.sigma
+        if self.divergence:
+            radius = (0.5e-3 * self.divergence * rays.distance)[waveform]
+            sigma, amplitude = widen_on_slope(sigma, amplitude, rays.incidence[waveform], radius)
+        order = np.lexsort((time, waveform)) if len(self.counts) > 2 else slice(None)
+        return Drawn(waveform, time[order], amplitude[order], sigma[order])
+
+
+def _light_surfaces(light: float, rays: Rays) -> np.ndarray:
+    """amplitude times sigma of surfaces that face their ray [count ns], (n,)."""
+    high = rays.ground[:, 2] > GROUND + LEAST_ROOF
+    reflectance = np.where(high, ROOFS_REFLECT, GROUND_REFLECTS)
+    return light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
+
+
+def _scenes(*scenes: Scene) -> dict[str, Scene]:
+    return {scene.name: scene for scene in scenes}
+
+
+SCENES: dict[str, Scene] = _scenes(
+    Scene(
+        "flat",
+        "bare, level ground: one echo of the system's width in every waveform",
+        amplitude=LogNormal(60.0, 0.5, 10.0, 220.0),
+        width=FoldedWidth(0.0, 0.02),
+    ),
+    Scene(
+        "urban",
+        "streets, roofs, few trees: 0, 1, 2, 3 echoes at 5, 85, 8, 2 % (`open/urban` of ALGORITHMS.md 4.3)",
+        counts=(0.05, 0.85, 0.08, 0.02),
+        terrain="blocks",
+    ),
+    Scene(
+        "forest",
+        "canopy over ground: 0 to 5 echoes at 2, 25, 35, 25, 10, 3 % (ALGORITHMS.md 4.3)",
+        counts=(0.02, 0.25, 0.35, 0.25, 0.10, 0.03),
+        terrain="hills",
+    ),
+    Scene(
+        "slope",
+        "bare slopes of 0 to 40 degrees: one echo, widened and weakened by the angle of incidence",
+        amplitude=LogNormal(80.0, 0.3, 20.0, 220.0),
+        width=FoldedWidth(0.0, 0.0),
+        terrain="facets",
+        divergence=1.0,
+    ),
+    Scene(
+        "village",
+        "gable roofs of 0 to 60 degrees on level ground under a green laser: pulse of 1.5 ns, sampled every 0.5 ns, "
+        "beam of 1.1 mrad, 640 m, so that widths tell angles; the ground reflects 20 %, roofs 40 %, the air takes "
+        "0.22 dB/km, the calibration constant is 4 / 1.4e8",
+        width=FoldedWidth(0.0, 0.0),
+        terrain="village",
+        divergence=1.1,
+        light=1.4e8,
+        flight=Flight(height=640.0, half_angle=10.0, look_ahead=0.0),
+        recording=Recording(n_samples=128, spacing=0.5, pulse=PulseModel(sigma=1.5 / FWHM_PER_SIGMA)),
+    ),
+    Scene(
+        "shore",
+        "water-free shore: wet sand that returns 4 to 25 counts beside dry sand, empty waveforms over pools, few reeds",
+        counts=(0.25, 0.67, 0.07, 0.01),
+        amplitude=Mixture(0.5, LogUniform(4.0, 25.0), LogNormal(90.0, 0.4, 30.0, 230.0)),
+        width=FoldedWidth(0.2, 0.03),
+        times=WithinDepth(15.0),
+        terrain="beach",
+    ),
+    Scene(
+        "empty",
+        "water or sky: 80 % of the waveforms hold nothing, the others one echo, seldom more",
+        counts=(0.80, 0.185, 0.012, 0.003),
+    ),
+    Scene(
+        "mixed",
+        "the strip of the release test: 1 to 4 echoes at 60, 24, 12, 4 %, amplitude 8 to 220 log-uniform, "
+        "half of them broadened up to 4 ns, gaps log-uniform 2.5 to 40 ns, noise 1.2",
+        counts=(0.0, 0.60, 0.24, 0.12, 0.04),
+        amplitude=LogUniform(8.0, 220.0),
+        width=HalfBroadened(0.02, 4.0 / 1.9),
+        times=WithGaps(2.5, 40.0),
+        terrain="hills",
+        recording=Recording(noise_std=1.2, pulse=PulseModel(sigma=1.9)),
+    ),
+    Scene(
+        "stiff",
+        "every hazard in equal shares: " + ", ".join(HAZARDS) + "; `stiff.near` and so on hold one of them",
+        hazards=tuple(HAZARDS),
+        recording=Recording(n_samples=96),
+    ),
+)
+"""Every scene by name."""
+
+
+def find_scene(name: str) -> Scene:
+    """The scene called `name`, also `stiff.<hazard>` and `canopy.<stand>`; ConfigError with the nearest name when there
+    is none."""
+    if name in SCENES:
+        return SCENES[name]
+    head, _, hazard = name.partition(".")
+    if head == "stiff" and hazard in HAZARDS:
+        doc = (HAZARDS[hazard].__doc__ or "").strip()
+        return replace(SCENES["stiff"], name=name, meaning=doc, hazards=(hazard,))
+    if head == "canopy" and hazard in CANOPIES:
+        meaning, canopy = CANOPIES[hazard]
+        window = Recording(n_samples=8 * -(-int(canopy.duration + 48.0) // 8))
+        return Scene(name, meaning, canopy=canopy, recording=window)
+    names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
+    raise ConfigError(f"scene {name!r} is unknown; {nearest(name, names)}")
+
+
+def shape_pulse(
+    old: PulseModel,
+    *,
+    pulse: str | None = None,
+    sigma: float | None = None,
+    kappa: float | None = None,
+    ringing: float = 0.0,
+) -> PulseModel:
+    """The system pulse `old` with what is given in its place.
+
+    pulse: name of a shape in PULSES; those of a real sensor bring their own sigma. sigma [ns]: of the main lobe.
+    kappa: skew of the main lobe. ringing: share of the amplitude in lobes 4 and 8 sigma behind the peak.
+    Raises ConfigError for an unknown name or a value that no pulse has.
+    """
+    shape = old if pulse is None else find_pulse(pulse)
+    width = sigma or (shape.sigma if shape.lobes else old.sigma)
+    skew = shape.kappa if kappa is None else kappa
+    if not (0 < width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
+        raise ConfigError(f"pulse: sigma {width} ns must be above 0, kappa {skew} and ringing {ringing} within +-0.5")
+    return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)

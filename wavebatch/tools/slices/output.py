@@ -1,0 +1,117 @@
+"""Segments as CSV or GeoJSON, and pictures of slices."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.figure_file import open_picture
+from wavebatch.tools.slices.segments import Segment, Slice
+
+SEGMENT_SUFFIXES = (".csv", ".geojson")
+_PLACE = ("pulses", "first_pulse", "last_pulse", "first_point")
+_FIGURES = ("length", "slope", "residual", *_PLACE, "theta", "rho", "weight")
+_HEAD = ("line", "segment", "x1", "y1", "z1", "x2", "y2", "z2", *_FIGURES)
+_MOST_PIXELS = 40_000_000
+
+
+class SegmentWriter:
+    """Streams segments to a .csv or .geojson: `write`, then `commit`; as a context manager nothing remains unless
+    committed.
+
+    crs: WKT that goes into the GeoJSON as `crs_wkt`; coordinates are those of the strip. Raises ConfigError for
+    another suffix, InputError where the target exists (without overwrite) or cannot be written.
+    """
+
+    def __init__(self, target: Path, *, crs: str | None = None, overwrite: bool = False) -> None:
+        self.target = Path(target)
+        suffix = self.target.suffix.lower()
+        if suffix not in SEGMENT_SUFFIXES:
+            raise ConfigError(f"{target}: segments are written as .csv or .geojson")
+        if not overwrite:
+            refuse_existing(self.target)
+        self._geojson, self._count = suffix == ".geojson", 0
+        self._draft = Draft(self.target, overwrite=overwrite)
+        if self._geojson:
+            self._put('{"type": "FeatureCollection", "crs_wkt": ' + json.dumps(crs) + ', "features": [')
+        else:
+            self._put(",".join(_HEAD) + "\n")
+
+    def __enter__(self) -> SegmentWriter:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._draft.discard()
+
+    def write(self, segments: Sequence[Segment]) -> None:
+        """Appends segments."""
+        for segment in segments:
+            self._put(self._feature(segment) if self._geojson else _row(segment))
+            self._count += 1
+
+    def commit(self) -> None:
+        """Completes and publishes the file."""
+        if self._geojson:
+            self._put("\n]}\n")
+        self._draft.publish()
+
+    def _feature(self, segment: Segment) -> str:
+        feature = {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": [_round(segment.start), _round(segment.end)]},
+            "properties": {name: getattr(segment, name) for name in ("line", "segment", *_FIGURES)},
+        }
+        return (",\n" if self._count else "\n") + json.dumps(feature)
+
+    def _put(self, text: str) -> None:
+        with reporting(self.target):
+            self._draft.file.write(text.encode())
+
+
+def _row(segment: Segment) -> str:
+    ends = [f"{value:.4f}" for value in (*segment.start, *segment.end)]
+    values = [getattr(segment, name) for name in _FIGURES]
+    texts = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
+    return ",".join([str(segment.line), str(segment.segment), *ends, *texts]) + "\n"
+
+
+def _round(place: Sequence[float]) -> list[float]:
+    return [round(value, 4) for value in place]
+
+
+def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overwrite: bool = False) -> None:
+    """Writes a picture of a slice with its segments; raises as `pictures.open_picture` does."""
+    with open_picture(target, (12, 5), overwrite=overwrite, dpi=120) as figure:
+        axes = figure.subplots()
+        image, extent = _paint(piece)
+        axes.grid(visible=False)
+        shown = axes.imshow(image, extent=extent, origin="lower", aspect="auto", cmap="gray_r", interpolation="nearest")
+        figure.colorbar(shown, label="DN above the level without signal")
+        for segment in segments:
+            ends = np.array(segment.ends)
+            axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
+        plane = piece.geometry == "plane"
+        axes.set_xlabel("along the slice [m]" if plane else "time after the first sample [ns]")
+        axes.set_ylabel("height [m]" if plane else "pulse")
+        axes.set_title(f"scan line {piece.line.number}: {len(piece.line)} pulses, {len(segments)} segments")
+
+
+def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Largest value per pixel, and where the picture lies in its units."""
+    x, y = np.rint(piece.x).astype(np.int64), np.rint(piece.y).astype(np.int64)
+    low_x, low_y = int(x.min()), int(y.min())
+    width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1
+    if width * height > _MOST_PIXELS:
+        raise ConfigError(f"scan line {piece.line.number}: a slice of {width} x {height} pixels is too large to draw")
+    image = np.full(height * width, np.nan, np.float32)
+    np.fmax.at(image, (y - low_y) * width + x - low_x, piece.line.value)
+    step_x = piece.pixel
+    step_y, base = (piece.pixel, piece.base[2]) if piece.geometry == "plane" else (1.0, 0.0)
+    edges_x = ((low_x - 0.5) * step_x, (low_x + width - 0.5) * step_x)
+    edges_y = (base + (low_y - 0.5) * step_y, base + (low_y + height - 0.5) * step_y)
+    return image.reshape(height, width), (*edges_x, *edges_y)

@@ -1,0 +1,195 @@
+"""A scan line as a slice - a vertical plane, or pulses by time - and the straight segments of surfaces in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import HALF_C
+from wavebatch.kernels.geometry.hough import HoughLine, find_lines
+from wavebatch.tools.slices.lines import ScanLine
+
+GEOMETRIES = ("plane", "time")
+_GAP, _PULSES_PER_GAP = 10.0, 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class SliceOptions:
+    """How slices are made and searched."""
+
+    geometry: str = "plane"
+    """`plane`: vertical, in metres; `time`: rows are pulses, columns samples, straight surfaces then bend."""
+    std: float = 2.0
+    """Samples above this many standard deviations of their slice are looked at."""
+    sigma: float = 2.0
+    """Standard deviation of the pulse [ns]."""
+    shortest: float = 20.0
+    """Least length of a segment [pixels]: of one sample's way in a plane, else of one sample or pulse."""
+    most: int = 20
+    """Segments per slice."""
+
+    def __post_init__(self) -> None:
+        if self.geometry not in GEOMETRIES:
+            raise ConfigError(f"geometry {self.geometry!r} is unknown; choose plane or time")
+        if not (self.std > 0 and self.sigma > 0 and self.shortest > 0 and self.most >= 1):
+            raise ConfigError("std, sigma and shortest must be above 0, segments per slice at least 1")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slice:
+    """A scan line in the coordinates in which lines are sought: those of all samples, in pixels (m,)."""
+
+    line: ScanLine
+    geometry: str
+    x: np.ndarray
+    """Plane: along the ground; time: sample."""
+    y: np.ndarray
+    """Plane: height; time: pulse."""
+    pixel: float
+    """Size of a pixel in x [m], or [ns]."""
+    base: np.ndarray
+    """Plane: the point (3,) at x = y = 0 [m]."""
+    axis: np.ndarray
+    """Plane: its horizontal direction (3,), of length 1."""
+    roi: np.ndarray
+    """Samples that are looked at, bool (m,)."""
+
+    def locate(self, end: tuple[float, float]) -> tuple[float, float, float]:
+        """Position of a point of the slice in space [m]."""
+        if self.geometry == "plane":
+            place = self.base + self.pixel * (end[0] * self.axis + np.array([0.0, 0.0, end[1]]))
+        else:
+            rows = np.arange(len(self.line))
+            lines = self.line.origin + end[0] * self.pixel * self.line.direction
+            place = np.array([np.interp(end[1], rows, lines[:, axis]) for axis in range(3)])
+        return tuple(float(value) for value in place)
+
+    def scale(self, end: tuple[float, float]) -> tuple[float, float]:
+        """A point of the slice in the units of its axes: [m] and height [m], or time [ns] and pulse."""
+        if self.geometry == "plane":
+            return end[0] * self.pixel, float(self.base[2] + end[1] * self.pixel)
+        return end[0] * self.pixel, end[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A straight piece of a surface in one slice."""
+
+    line: int
+    """Scan line."""
+    segment: int
+    """From 0, the strongest first."""
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    """Ends in space [m]."""
+    ends: tuple[tuple[float, float], tuple[float, float]]
+    """Ends in the slice: [m] along it and height [m], or time [ns] and pulse."""
+    length: float
+    """Distance of the ends in space [m]."""
+    slope: float
+    """Angle above the horizontal from start to end [deg]."""
+    residual: float
+    """Root mean square distance of the pulses' centroids from the line: [m] across it in a plane, else [ns] in time."""
+    pulses: int
+    first_pulse: int
+    last_pulse: int
+    """Pulses within the scan line that it lies on."""
+    first_point: int
+    """Index in the file of the first point of first_pulse."""
+    theta: float
+    rho: float
+    """Of the line in the slice [deg, pixels]."""
+    weight: float
+    """Sum of intensities [count]."""
+
+
+def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
+    """The slice of a scan line."""
+    limit = options.std * float(line.value.std(dtype=np.float64))
+    roi = line.value > limit
+    zero = np.zeros(3)
+    if options.geometry == "time":
+        x, y, pixel, base, axis = line.time / line.spacing, line.row.astype(np.float64), line.spacing, zero, zero
+    else:
+        pixel = line.spacing * HALF_C
+        base, axis = _find_plane(line, roi)
+        place = line.origin[line.row] - base + line.time[:, None] * line.direction[line.row]
+        x, y = place @ axis / pixel, place[:, 2] / pixel
+    return Slice(line, options.geometry, x, y, pixel, base, axis, roi)
+
+
+def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
+    """The straight segments of a slice, the strongest first."""
+    rows = np.flatnonzero(piece.roi)
+    if len(rows) < 2:
+        return []
+    x, y = piece.x[rows], piece.y[rows]
+    lines = find_lines(
+        x,
+        y,
+        piece.line.value[rows].astype(np.float64),
+        sigma=options.sigma / piece.line.spacing,
+        gap=_choose_gap(piece),
+        shortest=options.shortest,
+        most=options.most,
+    )
+    return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
+
+
+def _find_plane(line: ScanLine, roi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A point of the vertical plane and its direction: the main axis of what is looked at, seen from above."""
+    use = np.flatnonzero(roi) if roi.any() else np.arange(len(line.row))
+    place = line.origin[line.row[use]] + line.time[use, None] * line.direction[line.row[use]]
+    base = place.mean(axis=0)
+    flat = place[:, :2] - base[:2]
+    main = np.linalg.eigh(flat.T @ flat)[1][:, 1]
+    if main[np.argmax(np.abs(main))] < 0:
+        main = -main
+    return base, np.array([main[0], main[1], 0.0])
+
+
+def _choose_gap(piece: Slice) -> float:
+    """Largest hole in a segment [pixels]: ten, or three pulses where they lie further apart."""
+    if piece.geometry == "time":
+        return _GAP
+    step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
+    return max(_GAP, _PULSES_PER_GAP * float(np.median(np.abs(step))))
+
+
+def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> Segment:
+    line = piece.line
+    start, end = piece.locate(found.start), piece.locate(found.end)
+    apart = np.subtract(end, start)
+    pulses = np.unique(line.row[rows])
+    return Segment(
+        line=line.number,
+        segment=number,
+        start=start,
+        end=end,
+        ends=(piece.scale(found.start), piece.scale(found.end)),
+        length=float(np.linalg.norm(apart)),
+        slope=float(np.degrees(np.arctan2(apart[2], np.hypot(apart[0], apart[1])))),
+        residual=_measure_residual(piece, found, rows),
+        pulses=len(pulses),
+        first_pulse=int(pulses[0]),
+        last_pulse=int(pulses[-1]),
+        first_point=int(line.point[pulses[0]]),
+        theta=found.theta,
+        rho=found.rho,
+        weight=found.weight,
+    )
+
+
+def _measure_residual(piece: Slice, found: HoughLine, rows: np.ndarray) -> float:
+    """Spread of the pulses' centroids about the line: the width of the pulse itself does not count."""
+    theta = np.radians(found.theta)
+    off = piece.x[rows] * np.cos(theta) + piece.y[rows] * np.sin(theta) - found.rho
+    if piece.geometry == "time":
+        off = off / max(np.cos(theta), 1e-9)
+    weight = piece.line.value[rows].astype(np.float64)
+    sums = np.bincount(piece.line.row[rows], weight)
+    moments = np.bincount(piece.line.row[rows], weight * off)
+    centroid = moments[sums > 0] / sums[sums > 0]
+    return float(np.sqrt(np.mean(centroid**2)) * piece.pixel)

@@ -1,0 +1,98 @@
+"""The rays of a block: where they begin and end, and what comes back along them, as sums over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.geometry.voxels import accumulate_profile
+from wavebatch.kernels.physics import radiometry
+from wavebatch.tools.voxels.profile import Profiles
+
+MOST_SECTION = 2.0**14
+"""A larger cross section of a ray is nonsense, and unknown [m2]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayTable:
+    """n rays; times are those after sample 0 [ns]."""
+
+    start: np.ndarray
+    """Position at time 0, f8 (n, 3) [m]."""
+    step: np.ndarray
+    """f8 (n, 3) [m/ns]."""
+    begin: np.ndarray
+    end: np.ndarray
+    energy: np.ndarray
+    """Up to the end of each sample, f8 (n, s + 1) [DN ns]."""
+    section: np.ndarray
+    """Cross section up to the end of each sample, f8 (n, s + 1) [m2]; (n, 0) without calibration."""
+    unknown: np.ndarray
+    """Rays with signal of unknown cross section, bool (n,)."""
+
+    def take(self, rows: np.ndarray) -> RayTable:
+        """Some of the rays."""
+        return RayTable(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+
+def trace_profiles(
+    block: WaveformBlock, profiles: Profiles, *, headroom: np.ndarray | float = 0.0, system: SystemPulse | None = None
+) -> RayTable:
+    """The rays of a block with what their profiles say.
+
+    A ray begins half a sample before its first one, or `headroom` [m] (n,) earlier, and ends behind its last signal:
+    what lies behind that got no light that is known of. Rays without any signal end with their waveform.
+    system: calibrated, for cross sections; None: without them.
+    """
+    n, s = profiles.value.shape
+    start = block.origin - block.direction * profiles.offset[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        begin = -0.5 * block.spacing - headroom / measure_lengths(block.direction)
+    behind = s - np.argmax(profiles.value[:, ::-1] > 0, axis=1)
+    section, unknown = np.empty((n, 0)), np.zeros(n, bool)
+    if system is not None:
+        section, unknown = _measure_sections(block, profiles, system, start)
+        section = accumulate_profile(section)
+    return RayTable(
+        start=start,
+        step=block.direction,
+        begin=begin,
+        end=(np.where(profiles.seen, behind, s) - 0.5) * block.spacing,
+        energy=accumulate_profile(profiles.value * profiles.area),
+        section=section,
+        unknown=unknown,
+    )
+
+
+def measure_lengths(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of vectors (n, 3)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y, z = (vectors[:, axis] * vectors[:, axis] for axis in range(3))
+        return np.sqrt(x + y + z)
+
+
+def _measure_sections(
+    block: WaveformBlock, profiles: Profiles, system: SystemPulse, start: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Cross section that each sample stands for, f8 (n, s) [m2], and waveforms of which it is unknown, bool (n,).
+
+    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (ALGORITHMS 5).
+    """
+    section = np.zeros(profiles.value.shape)
+    if block.sensor is None:
+        return section, profiles.seen
+    row, sample = np.nonzero(profiles.value)
+    off = start[row] + block.direction[row] * (sample * block.spacing)[:, None] - block.sensor[row]
+    distance = radiometry.known_distance(measure_lengths(off))
+    with np.errstate(over="ignore", invalid="ignore"):
+        gamma = radiometry.backscatter(
+            system.calibration, distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
+        )
+        value = radiometry.cross_section(gamma, distance, 1e-3 * system.divergence)
+    # A sample without range makes its ray's sum no number: it compares as too large.
+    with np.errstate(invalid="ignore", over="ignore"):
+        unknown = ~(np.bincount(row, value, minlength=len(section)) <= MOST_SECTION)
+    section[row, sample] = np.where(unknown[row], 0.0, value)
+    return section, unknown

@@ -1,0 +1,290 @@
+"""A strip to voxels: block after block deconvolved and summed, then written in order; memory does not grow."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.disk.key_sums import HELD
+from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.kernels.geometry.voxels import fits_keys
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
+from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
+from wavebatch.tools.voxels.output import VoxelSpace, check_target, open_voxels
+from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
+from wavebatch.tools.voxels.rays import trace_profiles
+
+BLOCK_SAMPLES = 1 << 20
+"""Samples that are deconvolved together, unless told otherwise."""
+
+_SAMPLED = 2048
+_LARGEST = 1e6
+_MOST_FITTING = 0.9
+"""Share of the sampled rays that must fit the grid: the others are damage, or the voxels are too small."""
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelOptions:
+    """How a strip becomes voxels."""
+
+    size: float
+    """Of a voxel [m]."""
+    deconvolution: Deconvolution = field(default_factory=Deconvolution)
+    headroom: float | None = None
+    """Way before the first sample of every waveform on which its ray counts too [m]; None: up to the highest return
+    near it."""
+    all_crossed: bool = False
+    """Voxels that rays crossed without any signal are written too."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.size <= _LARGEST:
+            raise ConfigError(f"--size {self.size:g}: the size of a voxel must lie above 0 and up to {_LARGEST:g} m")
+        if self.headroom is not None and not 0 <= self.headroom < 1e5:
+            raise ConfigError(f"--headroom {self.headroom:g}: must lie between 0 and 100000 m")
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelSummary:
+    """What was put into voxels."""
+
+    strip: str
+    output: str
+    size: float
+    voxels: int
+    shape: tuple[int, int, int]
+    """Voxels along x, y and z of the smallest box around them."""
+    origin: tuple[float, float, float]
+    """Lower corner of that box [m]."""
+    waveforms: int
+    with_signal: int
+    anchored: int
+    """Waveforms with signal placed by a return of their packet, the others by the raw location."""
+    clipped: int
+    """Waveforms with samples at the digitizer's limit: their energy is too low."""
+    outside: int
+    """Waveforms left out: their position is no number, or too far from all others."""
+    energy: float
+    """[DN ns]."""
+    method: str
+    pulse_fwhm: float
+    """Full width at half maximum of the Gaussian that is as wide as the system pulse [ns]."""
+    noise: float
+    """Of a sample [DN]."""
+    sensor: str | None = None
+    """Where its positions come from; None without calibration."""
+    unknown: int = 0
+    """Waveforms with signal of unknown cross section."""
+
+
+@dataclass(slots=True)
+class _Counts:
+    """Waveforms so far."""
+
+    waveforms: int = 0
+    with_signal: int = 0
+    anchored: int = 0
+    clipped: int = 0
+
+
+def voxelize_strip(
+    strip: Path,
+    target: Path,
+    options: VoxelOptions,
+    *,
+    system: SavedSurvey | None = None,
+    calibration: Calibration | None = None,
+    sensor: SensorRequest | None = None,
+    direction: str = "auto",
+    headerless: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int, int], object] | None = None,
+    block_size: int | None = None,
+    held: int = HELD,
+) -> VoxelSummary:
+    """Deconvolves the waveforms of a strip and writes what came back from every voxel; the target's suffix says how.
+
+    system: a saved survey in place of one of the strip. calibration: for cross sections; it, or the survey, must know
+    the beam's divergence. progress: called with the number of waveforms done since the last call, and of all.
+    block_size, held: waveforms at a time, and sums in memory; the output does not depend on them.
+    Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
+    """
+    strip, target = Path(strip), Path(target)
+    check_target(target, strip)
+    if not overwrite:
+        refuse_existing(target)
+    with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+        pulse = _find_pulse(reader, scan, system, calibration)
+        source = NOBODY if calibration is None else _find_sensor(reader, scan, sensor)
+        middle = _find_middle(reader, scan, options)
+        ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
+        with _open_grid(reader, middle, options, calibration is not None, held) as grid:
+            counts = _Counts()
+            for block in _read_blocks(reader, scan, block_size):
+                _add_block(grid, counts, source.fill(block), pulse, options, ceiling)
+                if progress is not None:
+                    progress(len(block), scan.packets)
+            meta = _describe(strip, options, pulse, calibration)
+            space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
+            return VoxelSummary(
+                **asdict(counts),
+                **_summarise(grid, options, pulse),
+                strip=str(strip),
+                output=str(target),
+                voxels=_write(grid, target, space, overwrite),
+                sensor=None if calibration is None else source.kind,
+            )
+
+
+def _summarise(grid: VoxelGrid, options: VoxelOptions, pulse: SystemPulse) -> dict[str, Any]:
+    """What the grid says of itself when all is added, and how it was filled."""
+    return {
+        "size": grid.size,
+        "shape": tuple(grid.shape.tolist()),
+        "origin": tuple((grid.low * grid.size).tolist()),
+        "outside": grid.outside,
+        "energy": grid.energy,
+        "unknown": grid.unknown,
+        "method": options.deconvolution.method,
+        "pulse_fwhm": pulse.sigma_ref * FWHM_PER_SIGMA,
+        "noise": pulse.noise_std,
+    }
+
+
+def _find_pulse(
+    reader: StripReader, scan: StripScan, saved: SavedSurvey | None, calibration: Calibration | None
+) -> SystemPulse:
+    """The pulse, saved or learned from the strip, with the calibration."""
+    path = reader.facts.path
+    if not scan.packets:
+        raise InputError(f"{path}: holds no waveform to put into voxels; `wavebatch check` says what it holds")
+    system = survey_sample(read_sample(reader, scan)).system if saved is None else saved.survey.system
+    if calibration is None:
+        return system
+    system = calibration.apply(system)
+    if system.divergence is None:
+        raise ConfigError(
+            "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration or give "
+            "a --system file that has it"
+        )
+    return system
+
+
+def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | None) -> SensorSource:
+    source = find_sensor(reader, scan, request or SensorRequest())
+    if source.kind == "none":
+        raise InputError(
+            f"{reader.facts.path}: nobody knows where the sensor was, without which there are no cross sections: give "
+            "--trajectory or --flight-height, or leave --calibration out"
+        )
+    return source
+
+
+def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
+    """A place in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
+    path, size = reader.facts.path, options.size
+    for said in reader.facts.units:
+        if not said.is_metric:
+            raise InputError(f"{path}: coordinates are {said.describe()}; voxels need metres: project the strip")
+    blocks = list(reader.sample_blocks(scan, _SAMPLED))
+    start = np.concatenate([block.origin for block in blocks])
+    step = np.concatenate([block.direction for block in blocks])
+    end = np.concatenate([np.full(len(block), block.samples.shape[1] * block.spacing) for block in blocks])
+    known = np.isfinite(start).all(axis=1)
+    middle = np.median(start[known], axis=0) if known.any() else np.zeros(3)
+    begin = np.full(len(end), -(options.headroom or 0.0) / HALF_C)
+    while np.mean(fits_keys(start - middle, step, begin, end, size)) < _MOST_FITTING:
+        size *= 2
+        if size > _LARGEST:
+            raise InputError(
+                f"{path}: its coordinates are spread over more than a grid can hold; see what `wavebatch check` says"
+            )
+    if size > options.size:
+        raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
+    return middle
+
+
+def _open_grid(
+    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, held: int
+) -> VoxelGrid:
+    digitizers = reader.facts.digitizers.values()
+    return VoxelGrid(
+        options.size,
+        np.floor(middle / options.size).astype(np.int64),
+        energy_unit(max(digitizer.bits for digitizer in digitizers if digitizer.n_samples)),
+        sections=sections,
+        everything=options.all_crossed,
+        held=held,
+    )
+
+
+def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iterator[WaveformBlock]:
+    """Every packet of the strip once."""
+    for number in range(reader.unit_count()):
+        unit = reader.read_unit(number, scan)
+        longest = int(unit.packets.n_samples.max(initial=1))
+        for block, _ in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
+            yield block
+
+
+def _add_block(
+    grid: VoxelGrid,
+    counts: _Counts,
+    block: WaveformBlock,
+    pulse: SystemPulse,
+    options: VoxelOptions,
+    ceiling: Ceiling | None,
+) -> None:
+    profiles = deconvolve_block(block, pulse, options.deconvolution)
+    rays = trace_profiles(
+        block,
+        profiles,
+        headroom=options.headroom if ceiling is None else ceiling.measure_headroom(block.origin, block.direction),
+        system=pulse if pulse.calibration is not None else None,
+    )
+    grid.add(rays, block.spacing)
+    counts.waveforms += len(block)
+    counts.with_signal += int(profiles.seen.sum())
+    counts.anchored += int((profiles.seen & profiles.anchored).sum())
+    counts.clipped += int(profiles.clipped.sum())
+
+
+def _write(grid: VoxelGrid, target: Path, space: VoxelSpace, overwrite: bool) -> int:
+    """Writes the voxels; their number."""
+    number = 0
+    with open_voxels(target, space, overwrite=overwrite) as writer:
+        for index, columns in grid.pieces():
+            writer.write(index, columns)
+            number += len(index)
+        writer.commit()
+    return number
+
+
+def _describe(
+    strip: Path, options: VoxelOptions, pulse: SystemPulse, calibration: Calibration | None
+) -> dict[str, Any]:
+    """How the voxels were made; the same for every run."""
+    deconvolution = options.deconvolution
+    return {
+        "wavebatch": __version__,
+        "strip": strip.name,
+        "size_m": options.size,
+        "headroom_m": options.headroom,
+        "all_crossed": options.all_crossed,
+        "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
+        "system": describe_system(pulse),
+        "calibration": None if calibration is None else calibration.describe(),
+        "columns": {column.name: {"unit": column.unit, "meaning": column.meaning} for column in COLUMNS},
+    }
