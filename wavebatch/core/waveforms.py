@@ -76,6 +76,8 @@ class WaveformBlock:
     """Position of the sensor at each pulse, f8 (n, 3) [m]; None where nobody knows it."""
     scanner: np.ndarray | None = None
     """Scanner channel of each pulse, u1 (n,); None where points have none: all are 0."""
+    missing: np.ndarray | None = None
+    """Samples that were not recorded (fill between two recordings of a packet), bool (n, s); None where all were."""
 
     def __len__(self) -> int:
         return len(self.samples)
@@ -135,6 +137,7 @@ class WaveformBlock:
             returns=returns,
             sensor=None if self.sensor is None else self.sensor[index],
             scanner=None if self.scanner is None else self.scanner[index],
+            missing=None if self.missing is None else self.missing[index],
         )
 
 
@@ -165,6 +168,8 @@ class SystemPulse:
     """Noise of one sample that thresholds and errors use [count]."""
     noise_by_kind: Mapping[str, float] = field(default_factory=dict)
     """The estimates noise_std was chosen from: quiet, smoothed, tail, core ... [count]."""
+    correlation: tuple[float, ...] = ()
+    """Correlation of the noise of two samples 1, 2, ... spacings apart; empty where it is white."""
     noise_gain: float = 0.0
     """Signal-dependent variance per count of signal (H12) [count]."""
     kappa: float = 0.0
@@ -177,6 +182,8 @@ class SystemPulse:
     """Count at which the survey saw samples clipped; None: only the digitizer's largest count is."""
     acceptance: float = 15.0
     """Least fall of chi2 for which an echo is added."""
+    tail_misfit: tuple[tuple[float, float], ...] = ()
+    """(lag after the peak [ns], share of the amplitude): what the pulse leaves unexplained after strong echoes."""
     misfit: float = 0.0
     """How far strong echoes deviate from the pulse, as a share of them: falls of chi2 that this explains add none."""
     level_variance: float = 0.0

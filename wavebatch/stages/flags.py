@@ -80,6 +80,8 @@ def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: Ech
         return table
     sample = np.arange(block.samples.shape[1]) * block.spacing
     near = np.abs(sample - table.time[rows, None]) <= 1.5 * table.sigma[rows, None]
+    if block.missing is not None:
+        near &= ~block.missing[table.waveform[rows]]
     clipped = ((block.samples[table.waveform[rows]] >= level) & near).any(axis=1)
     saturated = np.zeros(len(table), bool)
     saturated[rows] = clipped

@@ -31,9 +31,14 @@ def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, lim
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
     spread = system.baseline_spread
     if spread > DRIFT * std:
-        mean, _, number = find_levels(signal, std, reach, limit)
+        mean, quiet, number = find_levels(signal, std, reach, limit)
+        if block.missing is not None:
+            quiet &= ~block.missing.T
+            mean, number = quiet_mean(signal, quiet)
     else:
         quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach)
+        if block.missing is not None:
+            quiet &= ~block.missing.T
         mean, number = quiet_mean(signal, quiet)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.baseline + trust * mean

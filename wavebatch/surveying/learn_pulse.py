@@ -6,21 +6,43 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_mode, find_strongest, keep_lone
+from wavebatch.surveying.measure import (
+    ALONE,
+    ENOUGH_TO_LEARN,
+    FEW,
+    MIN_SNR,
+    find_edge,
+    find_strongest,
+    keep_lone,
+    render_own,
+    subtract_echoes,
+)
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""
 
-BEFORE, AFTER = 9.0, 25.0
-"""Samples before and behind an echo that its stack covers."""
+BEFORE, AFTER = 9.0, 40.0
+"""Samples before and after an echo that its stack covers, for a pulse of 2 samples; broader ones in proportion."""
+
+NARROWEST = 0.06
+"""How far the width of an echo that teaches the pulse may be from the lower edge, as a share of it."""
+
+SEPARATE = 5.0
+"""Widths of the pulse to the next echo from which its error does not matter to a stack."""
+
+FIRST_COMPONENTS = 3
+"""Components of the first pulse, which only has to fit well enough for echoes to be told apart."""
+
+MOST_STRONG = 800
+"""Strong echoes in which the misfit of the pulse is measured."""
 
 REACHED = 0.3
 """Misfit of a pulse model, in noise at the strip's strongest amplitudes, that nobody can see."""
@@ -42,28 +64,78 @@ BETTER = 0.97
 
 
 def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, of the most common width (R2).
+    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, as narrow as the pulse (R2).
 
-    The half of them nearest to the mode of the widths: flat targets, whose echoes slopes do not widen.
+    The half of them nearest to the lower edge of the widths: flat targets, whose echoes slopes do not widen.
     """
-    echoes = _find_clear(block, system)
-    distance = np.abs(echoes.sigma - find_mode(echoes.sigma)) if len(echoes) >= FEW else echoes.sigma
-    order = np.argsort(distance, kind="stable")[: max(len(echoes) // 2, ENOUGH_TO_LEARN)]
+    return _nearest_to_edge(_find_clear(block, system))
+
+
+def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
+    """At most half of the echoes, those whose widths are nearest to the lower edge of all, and at most NARROWEST off.
+
+    In a forest hardly an echo has the pulse's width: there it is fewer, but at least ENOUGH_TO_LEARN.
+    """
+    if len(echoes) < FEW:
+        return echoes
+    distance = np.abs(np.log(echoes.sigma / find_edge(echoes.sigma)))
+    order = np.argsort(distance, kind="stable")
+    near = int(np.count_nonzero(distance < NARROWEST))
+    order = order[: max(min(len(echoes) // 2, near), ENOUGH_TO_LEARN)]
     return echoes.take(np.sort(order[:: max(len(order) // MOST_STACKED, 1)]))
 
 
-def find_strong(block: WaveformBlock, system: SystemPulse) -> tuple[EchoTable, EchoTable]:
-    """The strongest fifth of the isolated echoes that are not clipped, and the third fifth.
+def refine_pulse(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, figures: dict[str, float]
+) -> tuple[SystemPulse, EchoTable]:
+    """The pulse learned once more from all echoes that stand clear, also of waveforms with several, and these echoes.
 
-    Without those that targets have widened.
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+        With the pulse learned so far.
+    echoes : EchoTable
+        The block decomposed with it.
+    figures : dict
+        Gets the misfits of the models.
+
+    Notes
+    -----
+    Pulse and echoes are found in turn: with a pulse that is too wide, its narrowest echoes are narrower than it and
+    draw it down. What other echoes of the waveform put under an echo is taken off. Times are those of fits with the
+    pulse, so that the stack is not widened by the scatter of Gaussian fits to a pulse that is none.
     """
+    clear = _find_separate(block, system, echoes)
+    chosen = _nearest_to_edge(echoes.take(clear))
+    if len(chosen) < ENOUGH_TO_LEARN:
+        return system, chosen
+    rows = np.arange(len(chosen))
+    signal = subtract_echoes(block, system, echoes)[chosen.waveform]
+    signal += render_own(block, system, chosen, rows, len(chosen))
+    return _learn(block, system, chosen, signal, figures), chosen
+
+
+def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Rows of clear echoes whose neighbours are at least SEPARATE widths away, or a tenth as high."""
+    top = system.saturation or float(block.samples.max())
+    good = (echoes.amplitude > MIN_SNR * system.noise_std) & (echoes.amplitude > 0.08 * top)
+    good &= (echoes.amplitude < 0.75 * top) & ((echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0)
+    gap = np.diff(echoes.time) / system.sigma_ref
+    close = (np.diff(echoes.waveform) == 0) & (gap < SEPARATE)
+    good[1:] &= ~(close & (echoes.amplitude[:-1] > ALONE * echoes.amplitude[1:]))
+    good[:-1] &= ~(close & (echoes.amplitude[1:] > ALONE * echoes.amplitude[:-1]))
+    return np.flatnonzero(good)
+
+
+def find_strong(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """The strongest two fifths of the isolated echoes that are neither clipped nor widened by their target."""
     echoes = _find_clear(block, system, most=1.0)
     if len(echoes) < FEW:
-        return echoes, echoes
-    low, high, strong = np.quantile(echoes.amplitude, (0.4, 0.6, 0.8))
-    parts = (echoes.amplitude >= strong, (echoes.amplitude >= low) & (echoes.amplitude < high))
-    narrow = echoes.sigma < WIDENED * find_mode(echoes.sigma)
-    return echoes.take(np.flatnonzero(parts[0] & narrow)), echoes.take(np.flatnonzero(parts[1] & narrow))
+        return echoes
+    narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.6)))
+    return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
 def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -> EchoTable:
@@ -86,20 +158,39 @@ def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
     """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
     noise = pooled_noise(block, system)
-    width = system.sigma_ref / block.spacing
     signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
+    if block.missing is not None:
+        signal[block.missing[main.waveform]] = np.nan
+    return _learn(block, system, main, signal, figures, FIRST_COMPONENTS)
+
+
+def _learn(
+    block: WaveformBlock,
+    system: SystemPulse,
+    main: EchoTable,
+    signal: np.ndarray,
+    figures: dict[str, float],
+    most: int = MOST_COMPONENTS,
+) -> SystemPulse:
+    """The pulse of echoes whose signal (m, s), without baseline and other echoes, is given."""
+    width = system.sigma_ref / block.spacing
     before, after = BEFORE * max(width / 2, 1), AFTER * max(width / 2, 1)
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
     stack = stack_pulse(signal, amplitude, time, before, after, QUANTISATION_STD)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width)
+    sums = fit_gaussians(stack, width, most)
     skewed = fit_skewed(stack, width)
     figures["misfit_goal"] = goal
     figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
+    for number in range(1, MOST_COMPONENTS + 1):
+        figures.pop(f"misfit_{number}_gaussians", None)
     for fit in sums:
         figures[f"misfit_{len(fit.components)}_gaussians"] = fit.rms
     best = _simplest([sums[0], skewed, *sums[1:]], goal)
+    if len(best.components) > 1:
+        # All components that were worth fitting: fewer would save nothing, and tiles would disagree on their number.
+        best = sums[-1]
     chosen = _with_pulse(system, best, stack, block.spacing)
     if best.kappa and len(sums) > 1:
         other = _with_pulse(system, _simplest(sums[1:], goal), stack, block.spacing)
@@ -114,7 +205,7 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     right only the strongest echoes of slopes and plants say.
     """
     clear = _find_clear(block, system)
-    clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_mode(clear.sigma)))
+    clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_edge(clear.sigma)))
     clear = clear.take(np.sort(np.argsort(-clear.amplitude, kind="stable")[:MOST_WIDENED]))
     if len(clear) < FEW:
         return pulses[0]
@@ -140,7 +231,8 @@ def _with_pulse(system: SystemPulse, fit: PulseFit, stack: Stack, spacing: float
     """
     width = system.sigma_ref / spacing
     far = np.abs(stack.lag - fit.datum) > 4 * width
-    system = replace(system, ringing=float(np.abs(stack.value[far]).max(initial=0.0)), kappa=fit.kappa)
+    ringing = float(np.abs(stack.value[far]).max(initial=0.0))
+    system = replace(system, ringing=ringing, kappa=fit.kappa, components=())
     if len(fit.components) > 1:
         components = tuple((float(w), float(d) * spacing, float(s) * spacing) for w, d, s in fit.components)
         system = replace(system, components=components)

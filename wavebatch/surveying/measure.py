@@ -7,15 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD, SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.cluster import cut_windows
+from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_matrix
+from wavebatch.kernels.fit.next_echo import propose_echo
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.signal.noise import estimate_noise
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, transpose_samples
+from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.kernels.signal.noise import colour_factors, estimate_noise
+from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
@@ -44,25 +48,39 @@ ENOUGH_TO_LEARN = 50
 FIRST_WIDTH = 2.0
 """First guess of the system pulse's width [samples]."""
 
-ACCEPTANCES = (15.0, 18.0, 22.0, 27.0, 35.0, 45.0, 60.0, 80.0, 120.0)
-"""Thresholds tried for one more echo, in chi2."""
-
-MISFITS = (0.005, 0.01, 0.015, 0.02, 0.03)
-"""Misfits of strong echoes tried, as shares of them."""
-
-MANY_TIMES = 4.0
-"""Split strong echoes, over split ones of middle strength, from which the pulse is what is wrong."""
-
-USEFUL = 0.75
-"""Share of the split echoes that must be left for a raised threshold to have been of no use."""
-
-SPLIT_SHARE = 0.015
-"""Share of the strip's narrowest isolated echoes that may be split."""
-
-NEAR = 3.0
-"""Widths of the system pulse around an echo within which a second one is a split of it."""
-
 MIN_SNR = 20.0
+"""Amplitude over noise of a clear echo."""
+
+REPEATED, LEAST_REPEATED = 0.04, 25
+"""Share, and least number, of the clear echoes that must have nearly one width for it to be the pulse's."""
+
+REPEAT_SPAN = 0.06
+"""How far these widths may lie apart, as a share of them."""
+
+CLIMB = 0.10
+"""How far above the narrowest of them the pulse's width is looked for: three times the scatter of widths at SNR 40."""
+
+UNDITHERED, DITHERED = 0.35, 0.41
+"""Below a quiet noise of 0.35 DN rounding hides how large the noise is: up to 0.3 DN never leave the level's count.
+With the error of rounding that is 0.41 DN."""
+
+LEAST_QUIET = 0.02
+"""Share of quiet samples below which noise comes from residuals of good fits."""
+
+MISFIT_QUANTILE = 0.8
+"""Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
+
+NOISE_PROMISE = 8.0
+"""Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
+
+CORE_REACH = 4.0
+"""Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
+
+TAIL_BEFORE, TAIL_AFTER = 6, 40
+"""Widths of the pulse before and after an echo in which its tail is measured."""
+
+LEAST_TAIL = 0.002
+"""Share of an echo below which its tail is as the pulse says."""
 
 
 def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
@@ -89,13 +107,19 @@ def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
 
 def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
     """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
-    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)))
+    missing = None if block.missing is None else block.missing.T
+    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
+    correlation = tuple(noise.correlation.tolist())
+    seen = noise.std * colour_factors(correlation, width)[0]
+    known = noise.std if noise.share >= LEAST_QUIET else 0.0
+    hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
         sigma_ref=width * block.spacing,
         baseline=noise.level,
         baseline_spread=noise.spread,
-        noise_std=max(noise.std, noise.smoothed_std, QUANTISATION_STD),
-        noise_by_kind={"quiet": noise.std, "quiet_smoothed": noise.smoothed_std},
+        noise_std=max(seen, noise.std, hidden),
+        noise_by_kind={"quiet": known, "quiet_smoothed": noise.smoothed_std, "quiet_pulse": seen},
+        correlation=correlation,
         saturation=saturation,
     )
 
@@ -122,7 +146,7 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
         widths = widths[free]
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
-    return float(np.clip(find_mode(widths), 0.5, 50.0))
+    return float(np.clip(find_edge(widths), 0.5, 50.0))
 
 
 def keep_lone(good: np.ndarray, amplitude: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -149,17 +173,34 @@ def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
     return order[first], second[waveform[first]]
 
 
-def find_mode(widths: np.ndarray) -> float:
-    """Width of the system pulse: centre of the shortest interval that holds a third of the widths.
+def find_edge(widths: np.ndarray) -> float:
+    """Width of the system pulse: the narrowest width that echoes repeat.
 
-    Flat targets give the system width again and again, slopes and vegetation scatter above it; a mode is not moved by
-    them, as a median would be.
+    Slopes and plants only widen echoes, so the pulse is at the lower edge of their widths; the most common width is
+    that of the canopy in a forest. A few narrower ones (spikes, cut echoes) do not move it: an edge is where
+    REPEATED of all echoes lie within REPEAT_SPAN of each other. From there the densest half within CLIMB is taken, so
+    that over level ground, where noise scatters the widths around that of the pulse, it is the centre.
+
+    Parameters
+    ----------
+    widths : (m,)
+        Of clear single echoes, any unit.
+
+    Returns
+    -------
+    float
+        In the unit of the widths.
     """
-    ordered = np.sort(widths.astype(np.float64))
-    hold = max(len(ordered) // 3, 2)
+    ordered = np.log(np.sort(widths.astype(np.float64)))
+    hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
     span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
-    first = int(np.argmin(span))
-    return float(np.median(ordered[first : first + hold]))
+    close = span <= REPEAT_SPAN
+    first = int(np.argmax(close)) if close.any() else int(np.argmin(span))
+    near = ordered[first : np.searchsorted(ordered, ordered[first] + CLIMB, side="right")]
+    half = max(len(near) // 2, min(2, len(near)))
+    inner = near[half - 1 :] - near[: len(near) - half + 1]
+    begin = int(np.argmin(inner))
+    return float(np.exp(np.median(near[begin : begin + half])))
 
 
 def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
@@ -180,32 +221,162 @@ def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     return adaptive(block, noise, system, matched_filter(block, noise, system))
 
 
-def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """The system with noise from the residuals around isolated echoes (R3) and its growth with the signal (H12)."""
-    n, s = block.samples.shape
+def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """What fitted echoes leave of their waveforms.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        n waveforms of s samples.
+    system : SystemPulse
+        Its pulse is the one that was fitted.
+    echoes : EchoTable
+        All echoes of the block.
+
+    Returns
+    -------
+    float32 (n, s)
+        Samples above the baseline less the echoes [count]; NaN where a sample was not recorded.
+    """
     noise = pooled_noise(block, system)
+    residual = block.samples - noise.baseline[:, None]
+    residual -= render_own(block, system, echoes, echoes.waveform, len(block))
+    if block.missing is not None:
+        residual[block.missing] = np.nan
+    return residual
+
+
+def render_own(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rows: np.ndarray, number: int
+) -> np.ndarray:
+    """Models of echoes (m,) added up in `number` rows of the block's length; rows: which row each echo goes to."""
+    spacing = block.spacing
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
+    main = model_parameters(shape, limits, whole)
+    return render_echoes(shape, number, block.samples.shape[1], rows, main[:, 1], main[:, 0], main[:, 2])
+
+
+def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with its noise's growth with the signal, and its noise where there are no quiet samples.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    echoes : EchoTable
+        As decomposed with this system.
+
+    Notes
+    -----
+    Quiet samples decide the noise. Residuals in the core and the tail of echoes also hold what the pulse model misses:
+    they are reported, and they decide only where quiet samples are missing or never leave one count
+    (docs/algorithms.md R3, H10, H12).
+    """
+    n, s = block.samples.shape
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
     alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
     if len(alone) < ENOUGH_TO_LEARN:
         return system
-    spacing = block.spacing
-    time, width = alone.time / spacing, alone.sigma / spacing
+    time, width = alone.time / block.spacing, alone.sigma / block.spacing
     rows = np.arange(len(alone))
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    main = model_parameters(shape, limits, np.stack([alone.amplitude, time, width], axis=1).astype(np.float64))
-    model = render_echoes(shape, len(alone), s, rows, main[:, 1], main[:, 0], main[:, 2])
-    residual = block.samples[alone.waveform] - noise.baseline[alone.waveform][:, None] - model
+    part = block.rows(alone.waveform)
+    model = render_own(block, system, alone, rows, len(alone))
+    residual = subtract_echoes(part, system, replace(alone, waveform=rows.astype(np.int32)))
     lag = (np.arange(s) - time[:, None]) / width[:, None]
+    lag[~np.isfinite(residual)] = np.inf
     kinds = dict(system.noise_by_kind)
-    smoothed = 0.25 * (residual[:, :-2] + 2 * residual[:, 1:-1] + residual[:, 2:]) / SMOOTH_GAIN
     for kind, where in (("core", np.abs(lag) < 2.5), ("tail", (lag > 3) & (lag < 12))):
         kinds[kind] = _robust_std(residual[where])
-        kinds[f"{kind}_smoothed"] = _robust_std(smoothed[where[:, 1:-1]])
-    learned = bool(system.components) or system.kappa != 0
-    used = [value for kind, value in kinds.items() if not (learned and kind == "quiet_smoothed")]
-    std = max([QUANTISATION_STD, *used])
+    std = system.noise_std
+    if kinds["quiet"] < UNDITHERED:
+        weak = alone.amplitude <= np.quantile(alone.amplitude, 1 / 3)
+        kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
+        std = max(DITHERED, kinds["weak_echoes"])
     gain = _noise_gain(residual, model, lag, width, std)
     return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+
+
+def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+    """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    strong : EchoTable
+        The strongest single echoes that no target has widened, one per waveform.
+
+    Returns
+    -------
+    SystemPulse
+        `misfit`: an echo that is added to a strong one must explain more than this share of its energy.
+        `tail_misfit`: by lag, the share of a strong echo that is left before and after it.
+
+    Notes
+    -----
+    Each strong echo is fitted alone; a score test says how much chi2 one more echo would gain. A wrong pulse promises
+    the same share of the energy for all of them, a second target for a few: the share that MISFIT_QUANTILE of them
+    stay below is the pulse's. Receivers compress high amplitudes, so that echoes of middle strength fit better than
+    strong ones (docs/algorithms.md R3, R5).
+    """
+    if len(strong) < FEW:
+        return system
+    rows = np.arange(len(strong), dtype=np.int32)
+    part = block.rows(strong.waveform)
+    noise = pooled_noise(part, system)
+    fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
+    fitted = fitted.take(find_strongest(fitted, len(part))[0])
+    promise = _promise(part, noise, system, fitted)
+    ratio = fitted.amplitude.astype(np.float64) / system.noise_std
+    energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
+    share = (promise - NOISE_PROMISE) / energy
+    misfit = float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0))) if len(share) >= FEW else 0.0
+    return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
+
+
+def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
+    spacing = part.spacing
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
+    main = model_parameters(shape, limits, whole)
+    s = part.samples.shape[1]
+    reach = int(np.ceil(CORE_REACH * system.sigma_ref / spacing))
+    middle = np.rint(whole[:, 1]).astype(np.int64)
+    low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
+    windows, begin = cut_windows(
+        part.samples, noise.baseline, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
+        clip_level(part, system), system.noise_gain, part.missing,
+    )  # fmt: skip
+    main[:, 1] -= begin
+    parameters = main[:, :, None]
+    rows = evaluate_model(windows, parameters, shape)
+    box = Limits(np.array([0.0, -np.inf, limits.low])[:, None], np.array([np.inf, np.inf, limits.high])[:, None])
+    return propose_echo(windows, parameters, rows, gram_matrix(rows), box, limits.ref)[1]
+
+
+def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
+    """(lag [ns], share) where strong echoes leave more than noise, in steps of the pulse's width."""
+    ref = system.sigma_ref / part.spacing
+    taps = gaussian_taps(ref)
+    energy = filter_energy(taps)
+    residual = subtract_echoes(part, system, echoes)[echoes.waveform]
+    left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
+    left /= echoes.amplitude[:, None]
+    lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
+    expected = system.noise_std / np.median(echoes.amplitude) / np.sqrt(energy)
+    profile = []
+    for place in range(-TAIL_BEFORE, TAIL_AFTER):
+        here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
+        if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
+            continue
+        middle = np.median(here)
+        spread = MAD_TO_STD * np.median(np.abs(here - middle)) if len(here) else 0.0
+        share = abs(middle) + 2 * np.sqrt(max(spread**2 - expected**2, 0.0))
+        if share > LEAST_TAIL:
+            profile.append((float(place * system.sigma_ref), float(share)))
+    return tuple(profile)
 
 
 def _robust_std(values: np.ndarray) -> float:
@@ -241,53 +412,5 @@ def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width:
     variance = np.array([np.median(squared[place == i]) for i in range(10) if (place == i).any()]) * MAD_TO_STD**2
     slope, constant = np.polyfit(level, variance, 1)
     scatter = np.std(variance - (constant + slope * level)) / max(np.std(level) * np.sqrt(len(level)), 1e-9)
-    matters = slope * edges[-2] > 0.3 * std**2 and slope > 4 * scatter
-    return float(slope) if matters else 0.0
-
-
-def choose_acceptance(block: WaveformBlock, system: SystemPulse, main: EchoTable) -> SystemPulse:
-    """The system with the least threshold at which its clearest single echoes stay whole (R3).
-
-    main: the echoes that the pulse was learned from. The threshold is raised until at most 1.5 % of them are split,
-    or until raising it hardly changes their number: what is split then are two targets.
-    """
-    if len(main) < ENOUGH_TO_LEARN:
-        return system
-    part, shares = main, []
-    for acceptance in ACCEPTANCES:
-        # What a threshold leaves whole, a higher one does too: only the split ones are tried again.
-        part = _keep_split(block, replace(system, acceptance=acceptance), part)
-        shares.append(len(part) / len(main))
-        if shares[-1] <= SPLIT_SHARE:
-            return replace(system, acceptance=acceptance)
-        if len(shares) > 1 and shares[-1] > USEFUL * shares[-2]:
-            return replace(system, acceptance=ACCEPTANCES[len(shares) - 2])
-    return replace(system, acceptance=ACCEPTANCES[-1])
-
-
-def _keep_split(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Those of single echoes in whose place a decomposition finds several."""
-    part = block.rows(echoes.waveform)
-    found = decompose_sample(part, system)
-    near = np.abs(found.time - echoes.time[found.waveform]) < NEAR * system.sigma_ref
-    return echoes.take(np.flatnonzero(np.bincount(found.waveform[near], minlength=len(part)) > 1))
-
-
-def choose_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable, middle: EchoTable) -> SystemPulse:
-    """The system with the least misfit of strong echoes to the pulse that leaves them whole (R3, R5).
-
-    Receivers compress high amplitudes, and no pulse that weaker echoes taught fits these. strong, middle: the strongest
-    single echoes, and others of middle strength. 0 where less than 1.5 % of the strong ones are split, where it is not
-    many times as many as of the others, which pairs of targets would be alike, or where no misfit helps.
-    """
-    if len(strong) < ENOUGH_TO_LEARN:
-        return system
-    part = _keep_split(block, system, strong)
-    usual = len(_keep_split(block, system, middle)) / max(len(middle), 1)
-    if len(part) / len(strong) <= max(SPLIT_SHARE, MANY_TIMES * usual):
-        return system
-    for misfit in MISFITS:
-        part = _keep_split(block, replace(system, misfit=misfit), part)
-        if len(part) / len(strong) <= max(SPLIT_SHARE, usual):
-            return replace(system, misfit=misfit)
-    return system
+    # Less what chance may add: the weights then come on by degrees, not at a limit that a tile may miss by a hair.
+    return float(max(slope - 3 * scatter, 0.0)) if slope * edges[-2] > 0.3 * std**2 else 0.0

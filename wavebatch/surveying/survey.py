@@ -4,29 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.noise import find_levels
+from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
+from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse, refine_pulse
 from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
     MIN_SNR,
     RESIDUAL_LOOK,
-    choose_acceptance,
-    choose_misfit,
+    SETTLED,
     decompose_sample,
+    find_saturation,
     measure_gaussian,
+    measure_misfit,
     measure_residuals,
     thin_block,
 )
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
+
+REFINEMENTS = 3
+"""Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
+
+STRANGE, STRANGE_NOISE = 6.0, 1.3
+"""Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
 
 COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
@@ -53,77 +64,202 @@ class Survey:
 
 
 def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Survey:
-    """Survey of a strip from blocks sampled over it; the digitizer with the most samples decides.
+    """Survey of a strip from blocks sampled over it.
 
-    Others that record otherwise get pulse and noise of their own, and count in the shares of the scene.
-    learn: also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock
+        Of any descriptors and lengths, in any order.
+    learn : bool
+        Also learn the pulse's shape; without it the pulse is the Gaussian of the isolated echoes' width.
+
+    Returns
+    -------
+    Survey
+        Of the digitizer with the most samples; others have pulse and noise of their own in `system.digitizers`.
+
+    Notes
+    -----
+    A descriptor is not a digitizer: descriptors that differ in the number of samples only are surveyed together,
+    unless their level, noise or clipping differ by more than chance (`find_strangers`).
     """
-    main, *others = join_digitizers(blocks) or [None]
-    if main is None:
+    groups = _group_descriptors(join_digitizers(blocks))
+    if not groups:
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
+    (main, members), *others = groups
     plain = measure_gaussian(main)
+    strangers = find_strangers(members, plain) if len(members) > 1 else {}
+    if strangers:
+        others = [*((block, [block]) for block in members if block.digitizer.index in strangers), *others]
+        members = [block for block in members if block.digitizer.index not in strangers]
+        main = pool_blocks(members)
+        plain = measure_gaussian(main)
     found = _survey(main, plain, learn=learn)
-    return _add_digitizers(found, plain, main, others, learn=learn) if others else found
+    found.figures["descriptors_pooled"] = float(len(members))
+    if not others:
+        return found
+    return _add_digitizers(found, plain, main, others, strangers, learn=learn)
 
 
 def join_digitizers(blocks: Iterable[WaveformBlock]) -> list[WaveformBlock]:
-    """The samples of each digitizer as one block, cut to one length; the largest first.
+    """The samples of each descriptor as one block; the largest first.
 
-    Samples of long waveforms count up to 256 each: it takes many waveforms to learn a pulse.
+    Waveforms of several lengths are filled up to the longest, with the fill marked as missing. Samples of long
+    waveforms count up to 256 each: it takes many waveforms to learn a pulse.
     """
     groups: dict[int, list[WaveformBlock]] = {}
     for block in blocks:
         if len(block):
             groups.setdefault(block.digitizer.index, []).append(block)
-    joined = [_join(group) for _, group in sorted(groups.items())]
-    return sorted(joined, key=lambda block: -_weigh(block.samples.shape[1], len(block)))
+    joined = [pool_blocks(group) for _, group in sorted(groups.items())]
+    return sorted(joined, key=_weigh, reverse=True)
 
 
-def _join(group: list[WaveformBlock]) -> WaveformBlock:
-    """Waveforms of one digitizer as one block: those of the length with most samples, if these are half of all.
+def pool_blocks(group: list[WaveformBlock]) -> WaveformBlock:
+    """Waveforms of blocks (of one kind of digitizer) as one block, without geometry; short ones are filled up."""
+    length = max(block.samples.shape[1] for block in group)
+    digitizer = replace(max(group, key=_weigh).digitizer, n_samples=length)
+    samples = np.concatenate([_fill_up(block.samples, length) for block in group])
+    missing = np.concatenate([_missing(block, length) for block in group])
+    pooled = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
+    return replace(pooled, digitizer=digitizer, missing=missing if missing.any() else None)
 
-    Otherwise those that are long enough, cut to the length that keeps most samples.
+
+def _fill_up(samples: np.ndarray, length: int) -> np.ndarray:
+    """Samples (n, s) with columns added up to `length`, each the waveform's least count, which is no signal."""
+    lack = length - samples.shape[1]
+    return samples if not lack else np.hstack([samples, np.repeat(samples.min(axis=1)[:, None], lack, axis=1)])
+
+
+def _missing(block: WaveformBlock, length: int) -> np.ndarray:
+    """Samples of a block that were not recorded, once it is filled up to `length`: bool (n, length)."""
+    missing = np.ones((len(block), length), bool)
+    missing[:, : block.samples.shape[1]] = False if block.missing is None else block.missing
+    return missing
+
+
+def _weigh(block: WaveformBlock) -> int:
+    """Samples of a block that count for a survey."""
+    return min(block.samples.shape[1], COUNTED) * len(block)
+
+
+def _group_descriptors(joined: list[WaveformBlock]) -> list[tuple[WaveformBlock, list[WaveformBlock]]]:
+    """Descriptors that differ in length only, pooled, with the blocks they were pooled from; the largest first."""
+    kinds: dict[tuple[float, ...], list[WaveformBlock]] = {}
+    for block in joined:
+        digitizer = block.digitizer
+        kinds.setdefault((digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset), []).append(block)
+    groups = [(pool_blocks(members), members) for members in kinds.values()]
+    return sorted(groups, key=lambda group: _weigh(group[0]), reverse=True)
+
+
+def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int, str]:
+    """Descriptors whose waveforms cannot come from the digitizer of the others, by index, with the reason.
+
+    Parameters
+    ----------
+    members : list of WaveformBlock
+        One block per descriptor; all have the same bits, spacing, gain and offset.
+    plain : SystemPulse
+        Noise of all of them together.
+
+    Notes
+    -----
+    The level of a waveform is that of its own quiet samples. A descriptor is a stranger if its mean level is both
+    STRANGE standard errors and half the noise away from that of the others, if its noise differs by STRANGE standard
+    errors and a factor STRANGE_NOISE, or if it is clipped at another count. STRANGE is 6: among 24 descriptors chance
+    does so once in 10^7 strips. Widths are no evidence: long packets see other targets.
     """
-    lengths = np.repeat([block.samples.shape[1] for block in group], [len(block) for block in group])
-    kinds, numbers = np.unique(lengths, return_counts=True)
-    weights = [_weigh(*kind) for kind in zip(kinds.tolist(), numbers.tolist(), strict=True)]
-    length = int(kinds[np.argmax(weights)])
-    if 2 * max(weights) >= sum(weights):
-        kept = [block for block in group if block.samples.shape[1] == length]
-    else:
-        weights = [_weigh(s, int(np.count_nonzero(lengths >= s))) for s in kinds.tolist()]
-        length = int(kinds[np.argmax(weights)])
-        kept = [block for block in group if block.samples.shape[1] >= length]
-    digitizer = replace(group[0].digitizer, n_samples=length)
-    samples = np.concatenate([block.samples[:, :length] for block in kept])
-    block = WaveformBlock.from_samples(samples, spacing=digitizer.spacing, bits=digitizer.bits)
-    return replace(block, digitizer=digitizer)
+    facts = {block.digitizer.index: _describe_level(block, plain) for block in members}
+    strangers = {}
+    for index, own in facts.items():
+        rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
+        reason = _compare_levels(own, rest, plain.noise_std)
+        if reason:
+            strangers[index] = reason
+    # The commonest is never a stranger to the few.
+    strangers.pop(members[0].digitizer.index, None)
+    return strangers
 
 
-def _weigh(length: int, number: int) -> int:
-    """Samples that count for a survey."""
-    return min(length, COUNTED) * number
+class _Level(NamedTuple):
+    """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
+
+    waveforms: int
+    mean: float
+    spread: float
+    std: float
+    samples: int
+    clip: float | None
+
+
+def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
+    """Level and noise of one descriptor, from each waveform's own quiet samples."""
+    signal = transpose_samples(block.samples)
+    level, quiet, number = find_levels(signal, plain.noise_std, int(np.ceil(3 * plain.sigma_ref / block.spacing)))
+    if block.missing is not None:
+        quiet &= ~block.missing.T
+        _, number = quiet_mean(signal, quiet)
+    used = number >= 8
+    deviation = np.where(quiet, signal - level, np.float32(0))[:, used]
+    freedom = max(int((number[used] - 1).sum()), 1)
+    std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
+    mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
+    clip = find_saturation(block.samples, block.digitizer.max_count)
+    return _Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
+
+
+def _compare_levels(own: _Level, rest: list[_Level], noise: float) -> str:
+    """Why a descriptor is a stranger among the rest; empty where it is none."""
+    rest = [level for level in rest if level.waveforms]
+    if own.waveforms < FEW or not rest:
+        return ""
+    weights = np.array([level.waveforms for level in rest], np.float64)
+    mean = float(np.average([level.mean for level in rest], weights=weights))
+    spread = float(np.sqrt(np.average([level.spread**2 for level in rest], weights=weights)))
+    error = float(np.hypot(own.spread, 0.5 * noise) / np.sqrt(own.waveforms) + spread / np.sqrt(weights.sum()))
+    if abs(own.mean - mean) > max(STRANGE * error, 0.5 * noise):
+        return f"its level is {own.mean:.2f} DN, that of the others {mean:.2f} "
+    std = float(np.sqrt(np.average([level.std**2 for level in rest], weights=weights)))
+    ratio = own.std / std
+    # Quiet samples of one waveform are correlated: a tenth of them count.
+    if abs(np.log(ratio)) > max(np.log(STRANGE_NOISE), STRANGE / np.sqrt(0.2 * own.samples)):
+        return f"its noise is {own.std:.2f} DN, that of the others {std:.2f}"
+    clips = {level.clip for level in rest if level.clip is not None}
+    if own.clip is not None and clips and own.clip < min(clips):
+        return f"it is clipped at {own.clip:.0f} DN, the others at {min(clips):.0f}"
+    return ""
 
 
 def _add_digitizers(
-    found: Survey, plain: SystemPulse, main: WaveformBlock, others: list[WaveformBlock], *, learn: bool
+    found: Survey,
+    plain: SystemPulse,
+    main: WaveformBlock,
+    others: list[tuple[WaveformBlock, list[WaveformBlock]]],
+    strangers: Mapping[int, str],
+    *,
+    learn: bool,
 ) -> Survey:
     """The survey of the main digitizer with the others: what each records otherwise, and the scene that all see.
 
     plain: of the main one, as `measure_gaussian` finds it.
     """
-    systems, counts, scenes = {}, [len(main)], [found.figures]
-    for block in others:
+    systems, counts, scenes, decisions = {}, [found.waveforms], [found.figures], []
+    for block, members in others:
         own = found.system
-        if not _records_alike(plain, main, block):
-            systems[block.digitizer.index] = own = _survey_other(found.system, block, learn=learn)
+        strange = strangers.get(block.digitizer.index)
+        if strange or not _records_alike(plain, main, block):
+            own = _survey_other(found.system, block, learn=learn)
+            systems.update({member.digitizer.index: own for member in members})
+            reason = strange or "its bits, spacing, gain, offset, level, noise or pulse differ from the main one's"
+            decisions.append(Decision(f"digitizer {block.digitizer.index}", True, reason))
         counts.append(len(block))
         scenes.append(_describe(block, own, decompose_sample(block, own)))
     figures = dict(found.figures)
     for name in ("empty_share", "single_share", "overlapped_share", "echoes_per_waveform", "saturated_share"):
         figures[name] = float(np.average([scene[name] for scene in scenes], weights=counts))
     system = replace(found.system, digitizers=systems)
-    return Survey(system, sum(counts), figures, _decide(system, main.spacing, figures))
+    return Survey(system, sum(counts), figures, (*_decide(system, main.spacing, figures), *decisions))
 
 
 def _records_alike(plain: SystemPulse, main: WaveformBlock, block: WaveformBlock) -> bool:
@@ -148,7 +284,7 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
         return own.system
     noise = measure_gaussian(block, system.sigma_ref / block.spacing)
-    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "saturation")
+    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "correlation", "saturation")
     return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
 
 
@@ -168,12 +304,17 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         if len(main) >= ENOUGH_TO_LEARN:
             system = learn_pulse(block, system, main, figures)
         part = thin_block(block, RESIDUAL_LOOK)
+        for _ in range(REFINEMENTS):
+            last = system.sigma_ref
+            system, chosen = refine_pulse(part, system, decompose_sample(part, system), figures)
+            if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
+                break
         system = measure_residuals(part, system, decompose_sample(part, system))
-        system = choose_acceptance(block, system, main)
-        system = choose_misfit(block, system, *find_strong(block, system))
-    echoes = decompose_sample(block, system)
-    system = replace(system, width_scatter=_measure_scatter(block, system, echoes))
-    figures.update(_describe(block, system, echoes))
+        system = measure_misfit(block, system, find_strong(block, system))
+    part = thin_block(block, RESIDUAL_LOOK)
+    echoes = decompose_sample(part, system)
+    system = replace(system, width_scatter=_measure_scatter(part, system, echoes))
+    figures.update(_describe(part, system, echoes))
     return Survey(system, len(block), figures, _decide(system, block.spacing, figures))
 
 

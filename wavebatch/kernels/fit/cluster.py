@@ -137,11 +137,13 @@ def cut_windows(
     length: int,
     clip: float | None = None,
     noise_gain: float = 0.0,
+    missing: np.ndarray | None = None,
 ) -> tuple[Windows, np.ndarray]:
     """Windows of `length` samples that hold [low, high) of their waveforms, and the sample each begins at (m,).
 
     samples: raw counts (n, s), contiguous. Samples outside [low, high) are put out of reach of every pulse.
     clip: raw count from which a sample counts as clipped; noise_gain: variance per count of signal (H12).
+    missing: samples that were not recorded, bool (n, s).
     """
     n, s = samples.shape
     length = min(length, s)
@@ -161,6 +163,8 @@ def cut_windows(
     position = np.arange(length, dtype=np.float32)
     outside = position < (low - begin).astype(np.float32)[:, None]
     outside |= position >= (high - begin).astype(np.float32)[:, None]
+    if missing is not None:
+        outside |= missing[waveform[:, None], begin[:, None] + np.arange(length)]
     x = np.where(outside, OUTSIDE, position)
     y[outside] = 0
     weight = _weigh(y, std[waveform], noise_gain) if noise_gain > 0 else None

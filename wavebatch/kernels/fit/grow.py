@@ -88,6 +88,7 @@ class _Work(NamedTuple):
     std: np.ndarray
     clusters: Clusters
     settings: Settings
+    missing: np.ndarray | None = None
 
 
 class _Step(NamedTuple):
@@ -112,12 +113,13 @@ def decompose_clusters(
     candidates: Candidates,
     clusters: Clusters,
     settings: Settings,
+    missing: np.ndarray | None = None,
 ) -> Iterator[Solution]:
     """Solutions of all clusters, those with the same number of echoes together.
 
     samples: raw counts (n, s); baseline, std: (n,). Every cluster appears in exactly one solution.
     """
-    work = _Work(samples, baseline, std, clusters, settings)
+    work = _Work(samples, baseline, std, clusters, settings, missing)
     trials: list[Problem] = []
     parents: list[Solution] = []
     k = 0
@@ -219,6 +221,7 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         length,
         settings.clip,
         settings.noise_gain,
+        work.missing,
     )
     start = problem.start.copy()
     start[:, 1] -= begin[:, None]

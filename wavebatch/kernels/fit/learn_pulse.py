@@ -20,6 +20,14 @@ GAIN = 0.10
 TRIAL_EVALUATIONS = 25
 """Evaluations after which the starts of one more component are compared."""
 
+DEEPEST = 0.3
+"""Largest negative weight of a component: an undershoot. Deeper ones only cancel another component, and such a pair
+fits the stack but not an echo that its target has widened."""
+
+EARLIEST = 2.0
+"""Widths of the pulse before its peak where a component may still lie: what comes earlier is a layer of constant height
+above the ground (canopy, crop), which looks like a pulse before the pulse."""
+
 LEAST_BIN = 5
 """Samples that a bin of the stack needs."""
 
@@ -45,7 +53,7 @@ def stack_pulse(
     """
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
     lag = np.arange(signal.shape[1]) - time[:, None]
-    used = (lag >= -before) & (lag <= after)
+    used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     values = (signal / amplitude[:, None])[used]
     bins = np.floor((lag[used] + before) / STEP).astype(np.int64)
     order = np.argsort(bins, kind="stable")
@@ -74,8 +82,8 @@ class PulseFit(NamedTuple):
     """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
 
 
-def fit_gaussians(stack: Stack, width: float) -> list[PulseFit]:
-    """Sums of 1, 2, ... Gaussians fitted to the stack, one more as long as the misfit falls by a tenth or more."""
+def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> list[PulseFit]:
+    """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more as long as the misfit falls by a tenth or more."""
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
     fits: list[PulseFit] = []
@@ -86,7 +94,7 @@ def fit_gaussians(stack: Stack, width: float) -> list[PulseFit]:
         if fits and fit.rms > (1 - GAIN) * fits[-1].rms:
             return fits
         fits.append(fit)
-        if len(fits) == MOST_COMPONENTS:
+        if len(fits) == most:
             return fits
         parameters = _add_component(stack, weight, parameters, residual)
 
@@ -130,7 +138,7 @@ def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
 def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200) -> np.ndarray:
     """The sum of Gaussians fitted from a start, in at most `most` evaluations."""
     width = abs(start[2])
-    low = np.tile([-1.0, stack.lag[0], 0.35 * width], len(start) // 3)
+    low = np.tile([-DEEPEST, -EARLIEST * width, 0.35 * width], len(start) // 3)
     high = np.tile([2.0, stack.lag[-1], 12.0 * width], len(start) // 3)
     result = scipy.optimize.least_squares(
         lambda p: (_sum(p, stack.lag) - stack.value) * weight,
@@ -159,7 +167,8 @@ def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, res
 
 def _as_fit(parameters: np.ndarray, rms: float) -> PulseFit:
     components = parameters.reshape(-1, 3)
-    main = int(np.argmax(components[:, 0] * (np.abs(components[:, 1]) < 3 * components[:, 2] + 3)))
+    # Stacks are aligned at the peak: the main component is the one that makes most of it.
+    main = int(np.argmax(components[:, 0] * np.exp(-0.5 * (components[:, 1] / components[:, 2]) ** 2)))
     order = np.r_[main, np.delete(np.arange(len(components)), main)]
     components = components[order]
     weight, delay, _ = components[0]

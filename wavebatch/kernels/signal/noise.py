@@ -1,4 +1,8 @@
-"""Noise of integer waveforms: level, standard deviation and spread of baselines, pooled over thousands (H10, H11)."""
+"""Noise of integer waveforms: level, variance, correlation and spread of baselines, pooled over thousands.
+
+Called by the survey and by the noise stages. Before a change: variance and correlation are those of deviations from
+each waveform's own quiet mean, corrected for that mean (docs/algorithms.md H10, H11).
+"""
 
 from __future__ import annotations
 
@@ -33,6 +37,8 @@ class PooledNoise(NamedTuple):
     """Standard deviation of the true baseline between waveforms."""
     share: float
     """Share of quiet samples."""
+    correlation: np.ndarray = np.empty(0)
+    """Correlation of quiet samples 1, 2, ... apart (k,)."""
 
 
 def first_level(signal: np.ndarray) -> tuple[float, float]:
@@ -51,12 +57,41 @@ def first_level(signal: np.ndarray) -> tuple[float, float]:
     return level, max(float(np.sqrt(np.mean(below * below))), QUANTISATION_STD)
 
 
-def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> PooledNoise:
-    """Pooled noise of raw signal (s, n): standard deviation of quiet samples, right for rounded data (H10).
+LAGS = 12
+"""Lags of the noise's correlation that are measured: beyond them a drift of the baseline takes over."""
 
-    reach: samples next to a signal that are not quiet. limit: a smoothed sample further from the level than this many
-    standard deviations is signal.
+LEAST_PAIRS = 2000
+"""Pairs of quiet samples from which a correlation is measured."""
+
+
+def estimate_noise(
+    signal: np.ndarray, reach: int, limit: float = 4.0, missing: np.ndarray | None = None
+) -> PooledNoise:
+    """Level, variance and correlation of quiet samples, right for rounded data.
+
+    Parameters
+    ----------
+    signal : float32 (s, n)
+        Raw counts, one waveform per column [count].
+    reach : int
+        Samples next to a signal that are not quiet.
+    limit : float
+        A smoothed sample further from the level than this many standard deviations is signal.
+    missing : bool (s, n), optional
+        Samples that were not recorded.
+
+    Returns
+    -------
+    PooledNoise
+
+    Notes
+    -----
+    docs/algorithms.md H10 (rounding) and H11 (correlation).
     """
+    if missing is not None:
+        signal = np.where(missing, np.float32(np.nan), signal)
+        level = np.nan_to_num(np.nanmedian(signal, axis=0))
+        signal = np.where(missing, level, signal)
     if not signal.size:
         return PooledNoise(0.0, QUANTISATION_STD, QUANTISATION_STD, 0.0, 0.0)
     signal = signal.astype(np.float32)
@@ -66,6 +101,8 @@ def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> Pooled
     for _ in range(ROUNDS):
         width = limit * np.hypot(SMOOTH_GAIN * std, spread) + 0.25
         quiet = find_quiet(signal - np.float32(level), width, reach)
+        if missing is not None:
+            quiet &= ~missing
         mean, number = quiet_mean(signal - np.float32(level), quiet)
         if not number.any():
             return PooledNoise(level, std, std, 0.0, 0.0)
@@ -73,8 +110,56 @@ def estimate_noise(signal: np.ndarray, reach: int, limit: float = 4.0) -> Pooled
         deviation = np.where(quiet, signal - np.float32(level), np.float32(0))
         std, spread = _split_variance(deviation, number)
     if spread > DRIFT * std:
-        return _estimate_drifting(signal, reach, limit) or PooledNoise(level, std, std, spread, float(quiet.mean()))
-    return PooledNoise(level, std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()))
+        return _estimate_drifting(signal, reach, limit, missing) or PooledNoise(
+            level, std, std, spread, float(quiet.mean())
+        )
+    correlation = correlate_quiet(signal, quiet, std)
+    return PooledNoise(level, std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()), correlation)
+
+
+def correlate_quiet(signal: np.ndarray, quiet: np.ndarray, std: float, lags: int = LAGS) -> np.ndarray:
+    """Correlation of quiet samples at lags 1, 2, ...
+
+    Parameters
+    ----------
+    signal : float32 (s, n)
+        Raw counts.
+    quiet : bool (s, n)
+        Samples without signal.
+    std : float
+        Standard deviation of a quiet sample [count].
+    lags : int
+        Largest lag [samples].
+
+    Returns
+    -------
+    float64 (k,)
+        k <= lags; empty where there are too few pairs. What the mean of a waveform's few quiet samples takes away is
+        added again: without this every correlation is too low by the variance of that mean.
+    """
+    number = quiet.sum(axis=0)
+    several = number >= 4 * lags
+    if not several.any():
+        return np.empty(0)
+    part, used = signal[:, several], quiet[:, several]
+    mean = np.where(used, part, 0).sum(axis=0, dtype=np.float64) / number[several]
+    deviation = np.where(used, part - mean.astype(np.float32), np.float32(0))
+    found = []
+    for lag in range(min(lags, len(part) - 1) + 1):
+        pairs = np.count_nonzero(used[lag:] & used[: len(used) - lag]) if lag else np.count_nonzero(used)
+        if pairs < LEAST_PAIRS:
+            break
+        head, tail = deviation[lag:], deviation[: len(deviation) - lag]
+        found.append(np.einsum("sn,sn->", head, tail, dtype=np.float64) / pairs)
+    if len(found) < 2:
+        return np.empty(0)
+    covariance = np.array(found)
+    # The variance of the mean is sum(covariance at all lags) / samples; two rounds settle it.
+    share = float(np.mean(1 / number[several]))
+    raw = covariance.copy()
+    for _ in range(3):
+        covariance = raw + share * max(covariance[0] + 2 * covariance[1:].sum(), 0.0)
+    return covariance[1:] / max(covariance[0], std * std)
 
 
 def find_levels(
@@ -94,13 +179,18 @@ def find_levels(
     return level, quiet, number
 
 
-def _estimate_drifting(signal: np.ndarray, reach: int, limit: float) -> PooledNoise | None:
+def _estimate_drifting(
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None = None
+) -> PooledNoise | None:
     """As `estimate_noise` for baselines that scatter by more than the noise; None without quiet samples."""
     quartile = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
     below = signal[signal < quartile] - np.broadcast_to(quartile, signal.shape)[signal < quartile]
     std = max(float(np.sqrt(np.mean(below * below))) / BELOW_QUARTILE, QUANTISATION_STD) if len(below) else 1.0
     for _ in range(ROUNDS):
         levels, quiet, number = find_levels(signal, std, reach, limit)
+        if missing is not None:
+            quiet &= ~missing
+            number = quiet.sum(axis=0, dtype=np.int32)
         several = number >= 8
         if not several.any():
             return None
@@ -108,7 +198,8 @@ def _estimate_drifting(signal: np.ndarray, reach: int, limit: float) -> PooledNo
     known = levels[several].astype(np.float64)
     scatter = np.mean((known - known.mean()) ** 2) - std**2 * np.mean(1 / number[several])
     spread = float(np.sqrt(max(scatter, 0.0)))
-    return PooledNoise(float(known.mean()), std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()))
+    smoothed, correlation = _smoothed_std(signal, quiet, std), correlate_quiet(signal, quiet, std)
+    return PooledNoise(float(known.mean()), std, smoothed, spread, float(quiet.mean()), correlation)
 
 
 def _split_variance(deviation: np.ndarray, number: np.ndarray) -> tuple[float, float]:
@@ -136,3 +227,40 @@ def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
     deviation = np.where(inside, smoothed - mean, 0).astype(np.float64)
     freedom = np.maximum(number - 1, 0).sum()
     return float(np.sqrt(np.sum(deviation * deviation) / freedom) / SMOOTH_GAIN) if freedom else std
+
+
+def colour_factors(correlation: tuple[float, ...] | np.ndarray, width: float) -> tuple[float, float, float, float]:
+    """Errors of a fitted pulse in coloured noise over those in white noise of the same variance.
+
+    Parameters
+    ----------
+    correlation : (k,)
+        Of the noise at lags 1, 2, ... [samples].
+    width : float
+        Gaussian standard deviation of the pulse [samples].
+
+    Returns
+    -------
+    (alone, amplitude, time, width)
+        Each 1 for white noise. The first is that of the amplitude of a pulse of known time and width: the factor by
+        which noise seems larger to a matched filter. The others are those of a fit of all three.
+
+    Notes
+    -----
+    A least-squares fit with white weights has the covariance (J'J)^-1 J'RJ (J'J)^-1; J holds the derivatives of the
+    pulse, R the correlation matrix (docs/algorithms.md H11).
+    """
+    rho = np.asarray(correlation, np.float64)
+    if not len(rho):
+        return 1.0, 1.0, 1.0, 1.0
+    reach = int(np.ceil(4 * width)) + 1
+    z = np.arange(-reach, reach + 1) / width
+    bell = np.exp(-0.5 * z * z)
+    joint = np.stack([bell, bell * z, bell * z * z], axis=1)
+    weights = np.linalg.solve(joint.T @ joint, joint.T)
+    lag = np.abs(np.subtract.outer(np.arange(len(z)), np.arange(len(z))))
+    matrix = np.r_[1.0, rho, np.zeros(len(z))][np.minimum(lag, len(rho) + 1)]
+    alone = bell / (bell @ bell)
+    rows = (alone, *weights)
+    least = 0.05
+    return tuple(float(np.sqrt(max((row @ matrix @ row) / (row @ row), least))) for row in rows)

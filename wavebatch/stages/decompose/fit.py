@@ -169,7 +169,9 @@ def fit_candidates(
 ) -> EchoTable:
     """Candidates in ns -> clusters -> fits -> flagged table in ns."""
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
-    solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
+    solutions = decompose_clusters(
+        block.samples, noise.baseline, noise.std, candidates, clusters, settings, block.missing
+    )
     return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
 
 
@@ -189,6 +191,8 @@ def find_clusters(
     present, row = np.unique(candidates.waveform, return_inverse=True)
     signal = transpose_samples(block.samples[present])
     signal -= noise.baseline[present]
+    if block.missing is not None:
+        signal[block.missing[present].T] = 0
     clusters = cluster_candidates(
         candidates._replace(waveform=row),
         smooth_121(signal),

@@ -13,6 +13,8 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
     """Signal above the baseline, float32 (s, n)."""
     signal = transpose_samples(block.samples)
     signal -= noise.baseline
+    if block.missing is not None:
+        signal[block.missing.T] = 0
     return signal
 
 
