@@ -10,6 +10,7 @@ import numpy as np
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
+from wavebatch.kernels.signal.noise import colour_factors
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -30,6 +31,20 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
     A survey looks at a sample of the strip: the few clipped echoes of a strip may lie outside it.
     """
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
+
+
+@lru_cache(maxsize=8)
+def _factors(correlation: tuple[float, ...], width: float) -> np.ndarray:
+    alone, *fitted = colour_factors(correlation, width)
+    return np.array(fitted) / max(alone, 1.0)
+
+
+def error_factors(system: SystemPulse, spacing: float) -> np.ndarray:
+    """Errors of amplitude, time and width (3,) in coloured noise, over those that a fit says with `noise_std`.
+
+    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less of noise that changes slowly.
+    """
+    return _factors(system.correlation, system.sigma_ref / spacing)
 
 
 class ShapeLimits(NamedTuple):

@@ -22,6 +22,7 @@ from wavebatch.stages.pulse_tables import (
     ShapeLimits,
     clip_level,
     describe_echoes,
+    error_factors,
     model_parameters,
     pulse_shape,
     shape_limits,
@@ -266,6 +267,7 @@ def describe_solutions(
     waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
+    errors *= error_factors(system, block.spacing)
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1
