@@ -9,7 +9,14 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseMeasures, PulseShape, measure_pulse
+from wavebatch.kernels.fit.pulse_shape import (
+    GAUSSIAN,
+    NO_SKEW,
+    PulseMeasures,
+    PulseShape,
+    evaluate_pulse,
+    measure_pulse,
+)
 from wavebatch.kernels.signal.noise import colour_factors
 
 
@@ -34,9 +41,18 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
 
 
 @lru_cache(maxsize=8)
-def _factors(correlation: tuple[float, ...], width: float) -> np.ndarray:
-    alone, *fitted = colour_factors(correlation, width)
-    return np.array(fitted) / max(alone, 1.0)
+def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
+    """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
+
+    To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
+    """
+    if not correlation:
+        return np.ones(4)
+    reach = int(np.ceil(5 * width)) + 1
+    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
+    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
+    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
+    return np.array(colour_factors(correlation, *(np.asarray(row)[:, 0] for row in rows)))
 
 
 def error_factors(system: SystemPulse, spacing: float) -> np.ndarray:
@@ -44,7 +60,11 @@ def error_factors(system: SystemPulse, spacing: float) -> np.ndarray:
 
     `noise_std` is what coloured noise does to amplitudes; times and widths suffer less of noise that changes slowly.
     """
-    return _factors(system.correlation, system.sigma_ref / spacing)
+    if not system.correlation:
+        return np.ones(3)
+    shape = pulse_shape(system, spacing)
+    alone, *fitted = noise_factors(shape, shape_limits(system, spacing).ref, system.correlation)
+    return np.array(fitted) / max(alone, 1.0)
 
 
 class ShapeLimits(NamedTuple):

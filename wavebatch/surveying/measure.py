@@ -12,14 +12,15 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import cut_windows
 from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_matrix
 from wavebatch.kernels.fit.next_echo import propose_echo
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.noise import colour_factors, estimate_noise
+from wavebatch.kernels.signal.noise import estimate_noise, residual_noise
 from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, noise_factors, pulse_shape, shape_limits
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
@@ -63,6 +64,15 @@ CLIMB = 0.10
 UNDITHERED, DITHERED = 0.35, 0.41
 """Below a quiet noise of 0.35 DN rounding hides how large the noise is: up to 0.3 DN never leave the level's count.
 With the error of rounding that is 0.41 DN."""
+
+WEAK = 60.0
+"""Amplitude, over DITHERED, up to which the misfit of a learned pulse is less than rounding."""
+
+LEAST_WINDOW = 6
+"""Samples outside of echoes from which a waveform counts for the noise."""
+
+OUTSIDE_REACH = 4.0
+"""Widths of an echo around it that are its own, not noise."""
 
 LEAST_QUIET = 0.02
 """Share of quiet samples below which noise comes from residuals of good fits."""
@@ -110,7 +120,7 @@ def _gaussian_system(block: WaveformBlock, width: float, saturation: float | Non
     missing = None if block.missing is None else block.missing.T
     noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
     correlation = tuple(noise.correlation.tolist())
-    seen = noise.std * colour_factors(correlation, width)[0]
+    seen = noise.std * noise_factors(GAUSSIAN, width, correlation)[0]
     known = noise.std if noise.share >= LEAST_QUIET else 0.0
     hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
@@ -258,7 +268,7 @@ def render_own(
 
 
 def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
-    """The system with its noise's growth with the signal, and its noise where there are no quiet samples.
+    """The system with the noise that fits leave outside of their echoes, and its growth with the signal.
 
     Parameters
     ----------
@@ -269,11 +279,13 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
 
     Notes
     -----
-    Quiet samples decide the noise. Residuals in the core and the tail of echoes also hold what the pulse model misses:
-    they are reported, and they decide only where quiet samples are missing or never leave one count
+    Samples outside of all echoes decide, once the pulse with its tail is taken off: many strips have no other quiet
+    ones, and what the digitizer does after an echo is noise to a weak echo there. Residuals in the core of echoes also
+    hold the pulse's misfit, which is none: they decide only where quiet samples never leave one count
     (docs/algorithms.md R3, H10, H12).
     """
     n, s = block.samples.shape
+    system = _measure_outside(block, system, echoes)
     alone = echoes.take(np.flatnonzero((echoes.count(n)[echoes.waveform] == 1) & (echoes.flags == 0)))
     alone = alone.take(np.flatnonzero(alone.amplitude > 10 * system.noise_std))
     if len(alone) < ENOUGH_TO_LEARN:
@@ -286,15 +298,72 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     lag = (np.arange(s) - time[:, None]) / width[:, None]
     lag[~np.isfinite(residual)] = np.inf
     kinds = dict(system.noise_by_kind)
-    for kind, where in (("core", np.abs(lag) < 2.5), ("tail", (lag > 3) & (lag < 12))):
-        kinds[kind] = _robust_std(residual[where])
+    kinds["core"] = _robust_std(residual[np.abs(lag) < 2.5])
     std = system.noise_std
-    if kinds["quiet"] < UNDITHERED:
-        weak = alone.amplitude <= np.quantile(alone.amplitude, 1 / 3)
+    weak = alone.amplitude < WEAK * DITHERED
+    if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
-        std = max(DITHERED, kinds["weak_echoes"])
+        std = max(std, kinds["weak_echoes"])
     gain = _noise_gain(residual, model, lag, width, std)
     return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
+
+
+def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> SystemPulse:
+    """The system with noise and correlation of what is left outside of all clear echoes.
+
+    Weak echoes are neither taken off nor left out: a threshold that was too low would find them in the noise and make
+    it smaller still. What real ones add is cut off.
+    """
+    strongest = np.zeros(len(block))
+    np.maximum.at(strongest, echoes.waveform, echoes.amplitude)
+    clear = (echoes.amplitude > 8 * system.noise_std) & (echoes.amplitude > 0.05 * strongest[echoes.waveform])
+    clear = echoes.take(np.flatnonzero(clear))
+    residual = subtract_echoes(block, system, clear)
+    used = np.isfinite(residual)
+    used &= ~_cover(block, clear)
+    ref = system.sigma_ref / block.spacing
+    seen, calm = _pulse_noise(residual, used, ref)
+    found = residual_noise(residual[calm], used[calm])
+    if found is None or not seen:
+        return system
+    std, correlation = found[0], tuple(found[1].tolist())
+    hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
+    kinds = {**system.noise_by_kind, "outside": std, "outside_pulse": seen}
+    return replace(system, noise_std=max(seen, std, hidden), noise_by_kind=kinds, correlation=correlation)
+
+
+def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+    """Samples within OUTSIDE_REACH widths of an echo, bool (n, s)."""
+    n, s = block.samples.shape
+    reach = OUTSIDE_REACH * echoes.sigma / block.spacing
+    first = np.clip(np.ceil(echoes.time / block.spacing - reach), 0, s).astype(np.int64)
+    last = np.clip(np.floor(echoes.time / block.spacing + reach) + 1, 0, s).astype(np.int64)
+    steps = np.zeros((n, s + 1), np.int32)
+    np.add.at(steps, (echoes.waveform, first), 1)
+    np.add.at(steps, (echoes.waveform, last), -1)
+    return np.cumsum(steps[:, :-1], axis=1) > 0
+
+
+def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[float, np.ndarray]:
+    """Noise of a pulse's amplitude, as that of a sample of white noise, and the calm half of the waveforms (k,).
+
+    The median over the waveforms of the power that a matched filter finds in them: echoes too weak to be fitted raise
+    it in some of them only. 0 where too few have enough samples.
+    """
+    taps = gaussian_taps(width)
+    weight = used.T.astype(np.float32)
+    left = filter_symmetric(np.where(used, residual, 0).T.astype(np.float32), taps)
+    energy = filter_symmetric(weight, taps * taps)
+    whole = (energy > 0.8 * filter_energy(taps)) & used.T
+    number = whole.sum(axis=0)
+    rows = np.flatnonzero(number >= LEAST_WINDOW)
+    if len(rows) < FEW:
+        return 0.0, rows
+    power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
+    # Median of chi2 with k degrees of freedom, over k; not fewer than 8, since what drifts is alike in all waveforms.
+    freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 8.0)
+    typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
+    return float(np.sqrt(typical)), rows[power <= np.quantile(power, 0.6)]
 
 
 def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:

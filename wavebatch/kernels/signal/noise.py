@@ -60,6 +60,9 @@ def first_level(signal: np.ndarray) -> tuple[float, float]:
 LAGS = 12
 """Lags of the noise's correlation that are measured: beyond them a drift of the baseline takes over."""
 
+CLIPPED = 3.5
+"""Robust standard deviations at which residuals are cut off."""
+
 LEAST_PAIRS = 2000
 """Pairs of quiet samples from which a correlation is measured."""
 
@@ -229,15 +232,55 @@ def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
     return float(np.sqrt(np.sum(deviation * deviation) / freedom) / SMOOTH_GAIN) if freedom else std
 
 
-def colour_factors(correlation: tuple[float, ...] | np.ndarray, width: float) -> tuple[float, float, float, float]:
+def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> tuple[float, np.ndarray] | None:
+    """Standard deviation and correlation of what fits leave outside of their echoes.
+
+    Parameters
+    ----------
+    residual : float32 (n, s)
+        Waveforms less baseline and echoes [count].
+    used : bool (n, s)
+        Samples that count.
+    lags : int
+        Largest lag [samples].
+
+    Returns
+    -------
+    (std, correlation (k,)) or None
+        None where fewer than LEAST_PAIRS samples count.
+
+    Notes
+    -----
+    Values are limited to CLIPPED robust standard deviations, so that weak echoes nobody fitted do not count as noise.
+    No mean of a waveform is taken off: what its baseline is wrong by is noise to its amplitudes.
+    """
+    values = residual[used]
+    if len(values) < LEAST_PAIRS:
+        return None
+    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    limit = CLIPPED * max(0.5 * (high - low), QUANTISATION_STD)
+    deviation = np.where(used, np.clip(residual - np.float32(middle), -limit, limit), np.float32(0))
+    variance = np.sum(deviation * deviation, dtype=np.float64) / len(values)
+    found = []
+    for lag in range(1, min(lags, residual.shape[1] - 1) + 1):
+        pairs = np.count_nonzero(used[:, lag:] & used[:, :-lag])
+        if pairs < LEAST_PAIRS:
+            break
+        found.append(np.einsum("ns,ns->", deviation[:, lag:], deviation[:, :-lag], dtype=np.float64) / pairs)
+    return float(np.sqrt(variance)), np.array(found) / max(variance, 1e-12)
+
+
+def colour_factors(
+    correlation: tuple[float, ...] | np.ndarray, pulse: np.ndarray, by_time: np.ndarray, by_width: np.ndarray
+) -> tuple[float, float, float, float]:
     """Errors of a fitted pulse in coloured noise over those in white noise of the same variance.
 
     Parameters
     ----------
     correlation : (k,)
         Of the noise at lags 1, 2, ... [samples].
-    width : float
-        Gaussian standard deviation of the pulse [samples].
+    pulse, by_time, by_width : (s,)
+        The pulse and its derivatives at every sample.
 
     Returns
     -------
@@ -253,14 +296,10 @@ def colour_factors(correlation: tuple[float, ...] | np.ndarray, width: float) ->
     rho = np.asarray(correlation, np.float64)
     if not len(rho):
         return 1.0, 1.0, 1.0, 1.0
-    reach = int(np.ceil(4 * width)) + 1
-    z = np.arange(-reach, reach + 1) / width
-    bell = np.exp(-0.5 * z * z)
-    joint = np.stack([bell, bell * z, bell * z * z], axis=1)
+    joint = np.stack([pulse, by_time, by_width], axis=1).astype(np.float64)
     weights = np.linalg.solve(joint.T @ joint, joint.T)
-    lag = np.abs(np.subtract.outer(np.arange(len(z)), np.arange(len(z))))
-    matrix = np.r_[1.0, rho, np.zeros(len(z))][np.minimum(lag, len(rho) + 1)]
-    alone = bell / (bell @ bell)
-    rows = (alone, *weights)
+    lag = np.abs(np.subtract.outer(np.arange(len(joint)), np.arange(len(joint))))
+    matrix = np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
+    rows = (joint[:, 0], *weights)
     least = 0.05
     return tuple(float(np.sqrt(max((row @ matrix @ row) / (row @ row), least))) for row in rows)
