@@ -71,7 +71,7 @@ WEAK = 60.0
 LEAST_WINDOW = 6
 """Samples outside of echoes from which a waveform counts for the noise."""
 
-OUTSIDE_REACH = 4.0
+OUTSIDE_REACH = 3.0
 """Widths of an echo around it that are its own, not noise."""
 
 LEAST_QUIET = 0.02
@@ -360,8 +360,8 @@ def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[
     if len(rows) < FEW:
         return 0.0, rows
     power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
-    # Median of chi2 with k degrees of freedom, over k; not fewer than 8, since what drifts is alike in all waveforms.
-    freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 8.0)
+    # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
+    freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 4.0)
     typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
     return float(np.sqrt(typical)), rows[power <= np.quantile(power, 0.6)]
 

@@ -114,7 +114,7 @@ def adaptive(
     width_prior: float = 0.1,
     max_iterations: int = 40,
     tolerance: float = 0.5,
-    significance: float = 5.0,
+    significance: float = 4.5,
 ) -> EchoTable:
     """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
 
