@@ -229,6 +229,11 @@ def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
     assert "do not overlap on any clock" in done.stderr
 
 
+@pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", "\x7f\"\\.las"])
+def test_a_calibration_of_a_strip_of_any_name_comes_back(name):
+    assert parse_calibration(format_calibration(replace(FOUND, strip=name)), "cal").strip == name
+
+
 def test_calibration_files():
     again = parse_calibration(format_calibration(FOUND), "cal")
     assert replace(again, strip=FOUND.strip) == replace(FOUND)

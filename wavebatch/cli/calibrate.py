@@ -71,16 +71,16 @@ def calibrate(
     )
     write_text(output, format_calibration(found), overwrite=overwrite)
     for target in found.targets:
-        said = f"constant {target['constant']:.4g}, spread {100 * target['spread']:.1f} %, incidence " \
-            f"{target['incidence_deg']:.1f} deg" if "constant" in target else "too few, left out"  # fmt: skip
-        talk(f"{target['name']}: reflectance {target['reflectance']:g}, {target['echoes']} echoes, {said}")
-    constants = [target["constant"] for target in found.targets if "constant" in target]
+        said = f"constant {target.constant:.4g}, spread {100 * target.spread:.1f} %, incidence " \
+            f"{target.incidence_deg:.1f} deg" if target.constant is not None else "too few, left out"  # fmt: skip
+        talk(f"{target.name}: reflectance {target.reflectance:g}, {target.echoes} echoes, {said}")
+    constants = [target.constant for target in found.targets if target.constant is not None]
     ratio = max(constants) / min(constants)
     if ratio > 1 + 6 * max(reflectance_error, LEAST_DOUBT) and not found.channels:  # channels may differ
         talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
     for channel in found.channels:
-        error, spread = 100 * channel["relative_error"], 100 * channel["spread"]
-        numbers = f"constant {channel['constant']:.4g} +- {error:.1f} %, spread {spread:.1f} %"
-        where = f"digitizer {channel['digitizer']}, scanner channel {channel['scanner']}"
-        talk(f"{where}: {channel['echoes']} echoes, {numbers}")
+        error, spread = 100 * channel.relative_error, 100 * channel.spread
+        numbers = f"constant {channel.constant:.4g} +- {error:.1f} %, spread {spread:.1f} %"
+        where = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
+        talk(f"{where}: {channel.echoes} echoes, {numbers}")
     talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
