@@ -26,7 +26,7 @@ from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, sample_size
 from wavebatch.surveying.flat_ground import measure_level
-from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""
@@ -97,7 +97,7 @@ class Prepared:
     layout: OutputLayout
     report: RunReport
     """Timing of the preparation."""
-    sensor: SensorSource = NOBODY
+    sensor: SensorSource = UNKNOWN
 
     @property
     def system(self) -> SystemPulse:
@@ -185,7 +185,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             surveyed = time.perf_counter()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
-            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else NOBODY
+            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
@@ -199,7 +199,7 @@ def prepare_strip(job: StripJob) -> Prepared:
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
     """The choice with the widths of level ground, where angles are taken and no saved survey says them."""
     parameters = angle_parameters(job.chain)
-    if parameters is None or sensor is NOBODY or job.request.system is not None:
+    if parameters is None or sensor is UNKNOWN or job.request.system is not None:
         return choice
     system = choice.survey.system
     used = system if job.calibration is None else job.calibration.apply(system)

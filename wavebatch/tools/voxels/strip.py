@@ -19,7 +19,7 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import read_sample, survey_sample
-from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
@@ -127,7 +127,7 @@ def voxelize_strip(
         refuse_existing(target)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         pulse = _find_pulse(reader, scan, system, calibration)
-        source = NOBODY if calibration is None else _find_sensor(reader, scan, sensor)
+        source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
         middle = _find_middle(reader, scan, options)
         ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
         with _open_grid(reader, middle, options, calibration is not None, held) as grid:
