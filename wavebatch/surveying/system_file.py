@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
+from wavebatch.files.text_file import write_text
 from wavebatch.files.toml_file import TomlTable, check_number, format_toml, parse_toml, read_toml_text, shorten
 from wavebatch.surveying import Decision, Survey
 
@@ -112,36 +112,6 @@ def format_survey(saved: SavedSurvey) -> str:
 def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
     """Write a survey file, whole or not at all; raises InputError where it exists or cannot be written."""
     write_text(path, format_survey(saved), overwrite=overwrite)
-
-
-def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """Write a text file that appears whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        A device or a pipe (/dev/null, /dev/stdout) gets the text directly; this needs `overwrite`.
-    text : str
-    overwrite : bool
-        Whether an existing file is replaced.
-
-    Raises
-    ------
-    InputError
-        Where the file exists or cannot be written.
-    """
-    data = text.encode(errors="replace")  # the name of a strip can be any bytes
-    if overwrite and is_stream(path):
-        with reporting(path), open_stream(path) as stream:
-            stream.write(data)
-        return
-    draft = Draft(path, overwrite=overwrite)
-    try:
-        with reporting(path):
-            draft.file.write(data)
-        draft.publish()
-    finally:
-        draft.discard()
 
 
 def load_survey(path: Path | str) -> SavedSurvey:
