@@ -5,10 +5,11 @@ How one strip flows through the modules:
 1. `files.inputs` lists the strips. `preflight` checks memory and the names of the outputs, before anything is read.
 2. `run` keeps the workers busy: `processes` on this machine, or a `dask_cluster`. It opens a `strip_task` per strip,
    writes results in order, and keeps a strip that fails from stopping the others.
-3. `strip_task` sends the preparation, then unit after unit, to the workers. It writes their rows and publishes the cloud.
+3. `strip_task` sends the preparation, then unit after unit, to the workers, writes their rows and publishes
+   the cloud.
 4. `unit` is what runs in a worker: scan and survey of the strip, then one unit from packets to rows.
    `output_rows` makes the rows of the unit's echoes.
 5. `neighbour_pass` fills columns that need the points around an echo, tile by tile, once all rows are there.
 6. `counts` adds up what was read and written; a cloud whose counts do not add up is not written.
-   `explain` adds remarks, `report_file` writes the report next to the cloud. The report means that the cloud is complete.
+   `explain` adds remarks, `report_file` writes the report next to the cloud: it means that the cloud is complete.
 """
