@@ -97,7 +97,7 @@ def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     assert "KNOWN" not in angle and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
     (remark,) = report(tmp_path / "out")["remarks"]
     assert f"incidence_angle: none of {counts['echoes']} echoes has one" in remark
-    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse of", "max_error is 10"):
+    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse from", "max_error is 10"):
         assert number in remark
     assert remark in done.stderr
     told = f"no-data for {angle['UNCERTAIN']} of {counts['echoes']} echoes: more uncertain than max_error"

@@ -7,7 +7,7 @@ Before you change it: `a + b` must be exact and independent of order, so histogr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -96,17 +96,7 @@ class RunReport:
     """Seconds by task, summed over all processes."""
 
     def __add__(self, other: RunReport) -> RunReport:
-        return RunReport(
-            counts=_add(self.counts, other.counts),
-            passed_through=_add(self.passed_through, other.passed_through),
-            flags=_add(self.flags, other.flags),
-            no_data=_add_reasons(self.no_data, other.no_data),
-            remarks=tuple(sorted({*self.remarks, *other.remarks})),
-            echoes_per_waveform=self.echoes_per_waveform + other.echoes_per_waveform,
-            amplitude=self.amplitude + other.amplitude,
-            echo_width=self.echo_width + other.echo_width,
-            timing=_add(self.timing, other.timing),
-        )
+        return RunReport(**{f.name: _add(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
 
     @classmethod
     def of_echoes(cls, per_waveform: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray) -> RunReport:
@@ -213,12 +203,11 @@ def count_flags(flags: np.ndarray) -> dict[str, int]:
     return {name: number for name, number in numbers.items() if number}
 
 
-def _add(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: a.get(name, 0) + b.get(name, 0) for name in {**a, **b}}
-
-
-def _add_reasons(a: Mapping[str, Mapping[str, int]], b: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
-    return {column: _add(a.get(column, {}), b.get(column, {})) for column in {**a, **b}}
+def _add(a: Any, b: Any) -> Any:
+    """The sum of two fields: mappings by key, lines of text without repeats, numbers and arrays as they are."""
+    if isinstance(a, Mapping):
+        return {name: _add(a[name], b[name]) if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
+    return tuple(sorted({*a, *b})) if isinstance(a, tuple) else a + b
 
 
 def _histogram_json(bins: LogBins, counts: np.ndarray) -> dict[str, Any]:

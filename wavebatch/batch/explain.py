@@ -109,10 +109,7 @@ def explain_absence(prepared: Prepared) -> dict[str, str]:
         The reason by column.
     """
     chain, system = prepared.job.chain, prepared.system
-    lacks = {
-        NoData.NOT_CALIBRATED: system.calibration is None,
-        NoData.NO_DIVERGENCE: system.divergence is None,
-    }
+    lacks = {NoData.NOT_CALIBRATED: system.calibration is None, NoData.NO_DIVERGENCE: system.divergence is None}
     reasons = {}
     for column, needs in _NEEDS.items():
         if column not in chain.makes:

@@ -42,13 +42,6 @@ PART_POINTS = 1 << 18
 """Most points of a tile that are processed at a time, to bound memory where very many lie in one place."""
 
 _ENTRY = np.dtype([("row", "<i8"), ("xyz", "<i4", 3), ("ray", "<f4", 3)])
-_REASONS = {
-    Gap.KNOWN: NoData.KNOWN,
-    Gap.FEW_NEIGHBOURS: NoData.FEW_NEIGHBOURS,
-    Gap.NO_PLANE: NoData.NO_PLANE,
-    Gap.TOO_STEEP: NoData.TOO_STEEP,
-    Gap.UNCERTAIN: NoData.UNCERTAIN,
-}
 
 Found = tuple[np.ndarray, np.ndarray, RunReport]
 """Rows i8 (m,), ascending; the values found for them, as `_found_dtype` has them; and the timing."""
@@ -167,7 +160,7 @@ class SecondPass:
 
     def count_reasons(self, echoes: int) -> dict[str, dict[str, int]]:
         """Count the echoes by reason for RunReport.no_data, once all rows were read."""
-        counts = {reason.name: int(self._gaps[gap]) for gap, reason in _REASONS.items()}
+        counts = {NoData[gap.name].name: int(self._gaps[gap]) for gap in Gap if gap != Gap.NO_RAY}
         counts[NoData.NO_RAY.name] = echoes - sum(counts.values())
         return {self._found.dtype.names[0]: {name: number for name, number in counts.items() if number}}
 

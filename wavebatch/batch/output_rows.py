@@ -159,7 +159,6 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
         raise _bug(unit, "an echo lies in a packet of another unit")
     point = echoes.table.attributes["point"]
     table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
-    per_packet = np.append(table.count(len(owned) - 1), 0)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
     rows = _place_rows(unit, members, table, np.where(point >= 0, point, echoes.nearest), found, owned)
@@ -182,10 +181,7 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
         matched=(rows.echo < 0) | np.append(point >= 0, False)[rows.echo],
         time=np.append(table.time, np.nan)[rows.echo],
     )
-    inside = owned[members.packet]
-    report = _count_packets(unit, table, per_packet, owned)
-    report += _count_returns(inside, per_packet[members.packet] > 0, found)
-    return output, report + _count_rows(output, rows.reason, flags)
+    return output, _count(unit, table, members.packet, found, owned[members.packet], rows.reason, flags)
 
 
 def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
@@ -223,14 +219,8 @@ def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tu
     flags = np.where(found, np.append(table.flags, np.uint16(0))[echo], reason).astype(np.uint16)
     output = layout.rows(np.asarray(unit.points), columns={**_columns(table, echo, layout), "echo_flags": flags})
 
-    owned = np.append(unit.packets.owned, False)
-    per_packet = np.append(table.count(len(owned) - 1), 0)
-    inside = unit.packet_of_point >= 0
-    has_echoes = per_packet[unit.packet_of_point] > 0
-    mine = owned[table.waveform]
-    report = _count_packets(unit, table if mine.all() else table.take(mine), per_packet, owned)
-    report += _count_returns(inside, has_echoes, found)
-    return output, report + _count_rows(output, np.where(found, np.uint16(0), reason), flags)
+    packet = unit.packet_of_point
+    return output, _count(unit, table, packet, found, packet >= 0, np.where(found, np.uint16(0), reason), flags)
 
 
 def _bug(unit: Unit, what: str) -> StageError:
@@ -305,30 +295,42 @@ def _columns(table: EchoTable, echo: np.ndarray, layout: OutputLayout) -> dict[s
     return columns
 
 
-def _count_packets(unit: Unit, table: EchoTable, per_packet: np.ndarray, owned: np.ndarray) -> RunReport:
-    """Counts of the unit's points, of the packets it owns, and of the echoes in these."""
+def _count(
+    unit: Unit,
+    table: EchoTable,
+    packet: np.ndarray,
+    found: np.ndarray,
+    inside: np.ndarray,
+    reason: np.ndarray,
+    flags: np.ndarray,
+) -> RunReport:
+    """The report of a unit.
+
+    packet, found, inside: of the points (k,) that are counted as returns: row of unit.packets, whether an echo matches,
+    whether it is counted. reason, flags: of the output rows (m,).
+    """
+    owned = unit.packets.owned
+    per_packet = np.append(table.count(len(owned)), 0)
+    has_echoes = per_packet[packet] > 0
+    mine = owned[table.waveform]
+    table = table if mine.all() else table.take(mine)
     counts = {
         "points_in": len(unit.points),
-        "points_with_waveform": int(np.count_nonzero(unit.packet_of_point >= 0)),
-        "points_without_waveform": int(np.count_nonzero(unit.point_flags & np.uint16(EchoFlag.NO_WAVEFORM))),
-        "points_broken": int(np.count_nonzero(unit.point_flags & np.uint16(EchoFlag.BROKEN_PACKET))),
-        "waveforms": int(np.count_nonzero(owned)),
+        "points_with_waveform": unit.packet_of_point >= 0,
+        "points_without_waveform": unit.point_flags & np.uint16(EchoFlag.NO_WAVEFORM),
+        "points_broken": unit.point_flags & np.uint16(EchoFlag.BROKEN_PACKET),
+        "waveforms": owned,
         "echoes": len(table),
-        "added_echoes": int(np.count_nonzero(table.attributes["point"] < 0)),
+        "added_echoes": table.attributes["point"] < 0,
+        "matched_returns": inside & found,
+        "no_echo_returns": inside & ~has_echoes,
+        "unmatched_returns": inside & has_echoes & ~found,
+        "points_out": len(flags),
     }
-    account = RunReport(counts=counts, no_data=count_reasons(table.attributes))
-    return account + RunReport.of_echoes(per_packet[owned], table.amplitude, table.sigma)
-
-
-def _count_returns(inside: np.ndarray, has_echoes: np.ndarray, found: np.ndarray) -> RunReport:
-    """Counts of the points inside packets: their echo was found, only other echoes were, or none."""
-    counts = {
-        "matched_returns": int(np.count_nonzero(inside & found)),
-        "no_echo_returns": int(np.count_nonzero(inside & ~has_echoes)),
-        "unmatched_returns": int(np.count_nonzero(inside & has_echoes & ~found)),
-    }
-    return RunReport(counts=counts)
-
-
-def _count_rows(output: np.ndarray, reason: np.ndarray, flags: np.ndarray) -> RunReport:
-    return RunReport(counts={"points_out": len(output)}, passed_through=count_flags(reason), flags=count_flags(flags))
+    report = RunReport(
+        counts={name: n if isinstance(n, int) else int(np.count_nonzero(n)) for name, n in counts.items()},
+        passed_through=count_flags(reason),
+        flags=count_flags(flags),
+        no_data=count_reasons(table.attributes),
+    )
+    return report + RunReport.of_echoes(per_packet[:-1][owned], table.amplitude, table.sigma)

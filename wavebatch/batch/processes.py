@@ -43,21 +43,19 @@ class Workers:
         keep_freed_memory()
         self._before = set(multiprocessing.active_children())
         self._pool: ProcessPoolExecutor | None = None
-        self._own = owning_scratch()
+        self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
 
     def __enter__(self) -> Workers:
-        self._scratch = self._own.__enter__()
+        self._scratch = self._stack.enter_context(owning_scratch())
         return self
 
     def __exit__(self, kind: type | None, *error: object) -> None:
-        try:
+        with self._stack:
             if kind is None:
                 self._shut(cancel=False)
             else:
                 self.kill()
-        finally:
-            self._own.__exit__(None, None, None)
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""

@@ -62,12 +62,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         "request": {
             "chain": job.request.describe(job.chain) or effective(job.chain),
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
-            "sensor": {
-                "trajectory": trajectory,
-                "crs": sensor.crs,
-                "lever_arm": None if sensor.lever_arm is None else list(sensor.lever_arm),
-                "height": sensor.height,
-            },
+            "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
         },
     }

@@ -16,21 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
 from wavebatch.batch.explain import find_remarks
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.processes import Workers
-from wavebatch.batch.report_file import (
-    build_document,
-    cloud_path,
-    describe_chain,
-    describe_job,
-    describe_strip,
-    read_current,
-    report_path,
-    write_json,
-)
 from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_unit
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
@@ -102,12 +93,12 @@ class StripTask:
         packet_file = self.facts.packet_file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
-        self._described = describe_job(job, take_fingerprint(job.path, packet_file))
+        self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
         if options.resume:
-            return read_current(job, options.folder, self._described)
+            return report_file.read_current(job, options.folder, self._described)
         if not options.overwrite:
-            refuse_existing(cloud_path(job, options.folder))
-            refuse_existing(report_path(job, options.folder))
+            refuse_existing(report_file.cloud_path(job, options.folder))
+            refuse_existing(report_file.report_path(job, options.folder))
         return None
 
     @property
@@ -160,15 +151,15 @@ class StripTask:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         described = self._described
-        provenance = {**described, **describe_chain(prepared), **describe_strip(prepared, described)}
-        self._writer = CloudWriter(
-            prepared.layout,
-            cloud_path(self.job, options.folder),
-            provenance=provenance,
-            overwrite=options.overwrite or options.resume,
-        )
+        provenance = {
+            **described,
+            **report_file.describe_chain(prepared),
+            **report_file.describe_strip(prepared, described),
+        }
+        cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
+        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
-            self._second = SecondPass(prepared.second_step, prepared.layout, cloud_path(self.job, options.folder))
+            self._second = SecondPass(prepared.second_step, prepared.layout, cloud)
 
     def _fill(self) -> None:
         """Write the rows that waited for the second pass."""
@@ -202,14 +193,15 @@ class StripTask:
         self._report += RunReport(remarks=find_remarks(self.prepared, self._report))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
-        cloud, report = cloud_path(job, options.folder), report_path(job, options.folder)
+        cloud = report_file.cloud_path(job, options.folder)
+        report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
         if replaces:
             report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
         self._writer.commit()
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
-        document = build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
-        write_json(report, document, overwrite=replaces)
+        document = report_file.build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
+        report_file.write_json(report, document, overwrite=replaces)
         self.warnings = document["warnings"]
         self.prepared.scan.close()
         return self._report

@@ -213,7 +213,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
 
 
 def _check_section(section: float, found: Calibration, name: str) -> None:
-    """Raise ConfigError where C_cal does not follow from the other two: somebody changed one of them by hand."""
+    """Raise ConfigError where C_cal does not follow from the other two: one was changed by hand."""
     expected = found.section_constant
     if expected is None or abs(section - expected) > 1e-3 * expected:
         wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"

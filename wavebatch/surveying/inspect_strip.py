@@ -7,7 +7,7 @@ cannot be opened.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +41,7 @@ class Findings:
 
     def to_json(self) -> dict[str, Any]:
         """Return the findings as plain values."""
-        lists = {"problems": list(self.problems), "notes": list(self.notes)}
-        return {"file": self.file, "clean": self.is_clean, "summary": self.summary, **lists}
-
-
-@dataclass(slots=True)
-class _Samples:
-    """Extremes of some waveforms of a strip."""
-
-    waveforms: int = 0
-    least: int | None = None
-    largest: int | None = None
-    at_limit: int = 0
-    lengths: set[int] = field(default_factory=set)
+        return {"clean": self.is_clean, **without_nan(asdict(self))}
 
 
 def describe_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
@@ -79,18 +67,11 @@ def describe_strip(path: Path | str, *, direction: str = "auto", headerless: boo
     """
     with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan(tolerant=True) as scan:
         facts = reader.facts
-        samples = _sample(reader, scan)
         return {
             **_describe_file(facts),
             **_describe_points(scan),
             "packets": _describe_packets(facts, scan),
-            "samples": {
-                "waveforms_read": samples.waveforms,
-                "least": samples.least,
-                "largest": samples.largest,
-                "waveforms_at_limit": samples.at_limit,
-                "lengths": sorted(samples.lengths),
-            },
+            "samples": _describe_samples(reader, scan),
             "vectors": {
                 "direction": scan.direction,
                 "evidence": scan.direction_evidence,
@@ -144,7 +125,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     facts = reader.facts
     problems = [*scan.problems, *scan.warnings, *facts.warnings]
     try:
-        _sample(reader, scan)
+        _describe_samples(reader, scan)
     except InputError as error:
         problems.append(_without_name(path, error))
     notes = [*_note_descriptors(facts, scan), *audit_header(reader, scan)]
@@ -166,17 +147,21 @@ def _without_name(path: Path, error: Exception) -> str:
     return " ".join(str(error).split()).removeprefix(f"{path}: ")
 
 
-def _sample(reader: StripReader, scan: StripScan) -> _Samples:
+def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
     """Extremes of waveforms spread over the strip; of none where no packet can be used."""
-    found = _Samples()
+    rows = []
     for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
-        least, largest = int(block.samples.min()), int(block.samples.max())
-        found.least = min(least, least if found.least is None else found.least)
-        found.largest = max(largest, found.largest or 0)
-        found.waveforms += len(block)
-        found.lengths.add(block.samples.shape[1])
-        found.at_limit += int(np.count_nonzero((block.samples == block.digitizer.max_count).any(axis=1)))
-    return found
+        at_limit = (block.samples == block.digitizer.max_count).any(axis=1)
+        extremes = int(block.samples.min()), int(block.samples.max())
+        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), block.samples.shape[1]))
+    numbers, least, largest, limited, lengths = zip(*rows, strict=True) if rows else ((),) * 5
+    return {
+        "waveforms_read": sum(numbers),
+        "least": min(least, default=None),
+        "largest": max(largest, default=None),
+        "waveforms_at_limit": sum(limited),
+        "lengths": sorted(set(lengths)),
+    }
 
 
 def _describe_file(facts: StripFacts) -> dict[str, Any]:

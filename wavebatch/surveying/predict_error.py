@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
@@ -54,10 +55,9 @@ class Prediction:
 
     def to_json(self) -> dict[str, object]:
         """Return the numbers under names with units; None where not finite."""
-        values = {"range_error_m": self.range_error, "bound_m": self.bound, "factor": self.factor}
-        values["completeness"] = self.completeness
-        numbers = {name: float(f"{value:.6g}") if np.isfinite(value) else None for name, value in values.items()}
-        return {"chain": self.name, **numbers}
+        values = {"range_error_m": self.range_error, "bound_m": self.bound}
+        values |= {"factor": self.factor, "completeness": self.completeness}
+        return {"chain": self.name, **without_nan({name: float(f"{value:.6g}") for name, value in values.items()})}
 
 
 def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[str, Chain]) -> list[Prediction]:

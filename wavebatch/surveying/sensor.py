@@ -177,11 +177,14 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     try:
         offset, clocks = solve_offset(known, start, stop)
         known = known.shifted(offset).between(start - MARGIN, stop + MARGIN)
-        angle = _disagreement(known, rays)
+        ahead = rays.point - known.at(rays.time)
+        distance = np.sqrt((ahead * ahead).sum(axis=1))
+        angle = _disagreement(ahead, distance, rays)
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
-    farther, error, vectors_error = _compare_ranges(known, rays)
+    farther, error, vectors_error = _compare_ranges(distance, rays)
+    distance = distance[np.isfinite(distance)]
     facts = {
         "file": request.trajectory.name,
         "clocks": clocks,
@@ -196,7 +199,7 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     return SensorSource(
         "trajectory",
         known,
-        distance=_median_distance(known, rays),
+        distance=round(float(np.median(distance)), 2) if len(distance) else None,
         error=error,
         farther=farther,
         vectors_error=vectors_error,
@@ -204,32 +207,23 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     )
 
 
-def _compare_ranges(known: Trajectory, rays: Rays) -> tuple[float | None, float, float | None]:
+def _compare_ranges(distance: np.ndarray, rays: Rays) -> tuple[float | None, float, float | None]:
     """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
     the error of the latter; None, 0 and None where the vectors give no position."""
     path = estimate_path(rays, "direction vectors")
     if path is None:
         return None, 0.0, None
-    lengths = [rays.point - where.at(rays.time) for where in (known, path.trajectory)]
-    longer = np.sqrt((lengths[0] ** 2).sum(axis=1)) - np.sqrt((lengths[1] ** 2).sum(axis=1))
+    longer = distance - np.sqrt(((rays.point - path.trajectory.at(rays.time)) ** 2).sum(axis=1))
     longer = longer[np.isfinite(longer)]
     if not len(longer):
         return None, 0.0, None
     return round(float(np.median(longer)), 3), float(np.sqrt(np.mean(longer**2))), round(path.error, 6)
 
 
-def _median_distance(known: Trajectory, rays: Rays) -> float | None:
-    off = rays.point - known.at(rays.time)
-    distance = np.sqrt((off * off).sum(axis=1))
-    distance = distance[np.isfinite(distance)]
-    return round(float(np.median(distance)), 2) if len(distance) else None
-
-
-def _disagreement(known: Trajectory, rays: Rays) -> float:
+def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: Rays) -> float:
     """Median angle between packet vectors and rays from the trajectory [rad]; InputError where it is too large."""
-    ahead = rays.point - known.at(rays.time)
     with np.errstate(all="ignore"):
-        ahead /= np.sqrt((ahead * ahead).sum(axis=1))[:, None]
+        ahead = ahead / distance[:, None]
         unit = rays.direction / np.sqrt((rays.direction**2).sum(axis=1))[:, None]
         cosine = np.clip(np.einsum("ni,ni->n", ahead, unit), -1.0, 1.0)
     cosine = cosine[np.isfinite(cosine)]
