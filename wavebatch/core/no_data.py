@@ -37,10 +37,7 @@ class NoData(IntEnum):
 
 
 REASONS: dict[NoData, tuple[str, str]] = {
-    NoData.NO_SENSOR: (
-        "nobody knows where the sensor was",
-        "give --trajectory, or --flight-height",
-    ),
+    NoData.NO_SENSOR: ("nobody knows where the sensor was", "give --trajectory, or --flight-height"),
     NoData.NOT_CALIBRATED: (
         "the strip is not calibrated",
         "give --calibration (of `wavebatch calibrate`), or ask for relative_backscatter instead",

@@ -87,12 +87,7 @@ class WaveformBlock:
 
     @classmethod
     def from_samples(
-        cls,
-        samples: np.ndarray,
-        *,
-        spacing: float = 1.0,
-        bits: int | None = None,
-        first: int = 0,
+        cls, samples: np.ndarray, *, spacing: float = 1.0, bits: int | None = None, first: int = 0
     ) -> WaveformBlock:
         """A block without geometry from raw counts (n, s): for simulation, tests and use from Python."""
         samples = np.ascontiguousarray(samples)

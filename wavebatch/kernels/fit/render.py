@@ -11,13 +11,7 @@ ROWS = 8192
 
 
 def render_echoes(
-    shape: PulseShape,
-    n: int,
-    s: int,
-    waveform: np.ndarray,
-    time: np.ndarray,
-    amplitude: np.ndarray,
-    width: np.ndarray,
+    shape: PulseShape, n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
 ) -> np.ndarray:
     """Signal (n, s), float32, of echoes sorted by waveform; times and widths in samples (m,)."""
     signal = np.zeros((n, s), np.float32)

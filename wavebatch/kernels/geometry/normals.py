@@ -81,13 +81,7 @@ class Surroundings:
 
 
 def measure_normals(
-    points: np.ndarray,
-    ray: np.ndarray,
-    around: Surroundings,
-    *,
-    radius: float,
-    min_points: int,
-    max_error: float,
+    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
     """Angle between ray and surface normal, and its standard deviation, f4 (n,) [deg]; and what became of each point.
 
