@@ -11,9 +11,8 @@ from wavebatch.kernels.fit.least_squares import (
     Windows,
     evaluate_model,
     fit_windows,
-    gram_matrix,
-    parameter_errors,
 )
+from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 
 NOISE = 1.0

@@ -4,7 +4,7 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseShape, evaluate_pulse
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse
 
 SHAPES = {
     "gaussian": PulseShape(),
@@ -72,12 +72,6 @@ def test_all_functions_are_continuous_through_no_skew(kappa):
         evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0), evaluate(GAUSSIAN, z, 0.0, 1.0), strict=True
     ):
         np.testing.assert_allclose(skewed, gauss, atol=6 * kappa + 1e-6)
-
-
-def test_no_skew_is_a_gaussian():
-    assert PulseShape(kappa=0.5 * NO_SKEW).is_gaussian
-    assert not PulseShape(kappa=0.01).is_gaussian
-    assert not PulseShape(components=((0.1, 2.0, 0.0),)).is_gaussian
 
 
 @pytest.mark.parametrize("kappa", [0.3, -0.3, 1.0])

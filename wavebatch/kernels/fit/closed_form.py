@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit.cluster import solve_parabola
+from wavebatch.kernels.fit.cluster import fit_parabola
 
 
 def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -24,11 +24,7 @@ def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndar
     safe = np.where(used, y, 1.0)
     weight = np.where(used, y * y, 0.0)
     x = np.arange(-middle, y.shape[1] - middle, dtype=np.float64)
-    log = weight * np.log(safe)
-    # Not a matrix product: its sums depend on how many rows there are.
-    moments = [np.sum(weight * x**p, axis=1) for p in range(5)]
-    right = [np.sum(log * x**p, axis=1) for p in range(3)]
-    c0, c1, c2 = solve_parabola(moments, right)
+    c0, c1, c2 = fit_parabola(weight, x, np.log(safe), axis=1)
     holds = c2 < 0
     c2 = np.where(holds, c2, -1.0)
     time = -c1 / (2 * c2)

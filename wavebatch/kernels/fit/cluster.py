@@ -194,9 +194,7 @@ def estimate_starts(
     weight = np.where((at == sample[None] + offsets[:, None]) & (y > floor), used * used, 0.0)
     log = np.log(np.maximum(used, 1e-12))
     x = offsets[:, None].astype(np.float64)
-    moments = [np.sum(weight * x**p, axis=0) for p in range(5)]
-    right = [np.sum(weight * log * x**p, axis=0) for p in range(3)]
-    c0, c1, c2 = solve_parabola(moments, right)
+    c0, c1, c2 = fit_parabola(weight, x, log, axis=0)
     good = (c2 < -1e-4) & np.isfinite(c1)
     safe = np.where(good, c2, -1.0)
     shift = -c1 / (2 * safe)
@@ -238,8 +236,11 @@ def _filtered_norm(taps: list[np.ndarray]) -> np.ndarray:
     return np.sqrt(sum(tap * tap for tap in joined))
 
 
-def solve_parabola(s: list[np.ndarray], b: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coefficients of the weighted parabola from its moments s (five) and right-hand sides b (three), by Cramer."""
+def fit_parabola(weight: np.ndarray, x: np.ndarray, y: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:
+    """Coefficients"""
+    s = [np.sum(weight * x**p, axis=axis) for p in range(5)]
+    product = weight * y
+    b = [np.sum(product * x**p, axis=axis) for p in range(3)]
     m0 = s[2] * s[4] - s[3] * s[3]
     m1 = s[1] * s[4] - s[2] * s[3]
     m2 = s[1] * s[3] - s[2] * s[2]

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit.least_squares import (
-    Windows,
-    add_ridge,
-    evaluate_model,
-    gram_matrix,
-    parameter_units,
-    solve_symmetric,
-)
+from wavebatch.kernels.fit.least_squares import Windows, evaluate_model
+from wavebatch.kernels.fit.normal_equations import add_ridge, gram_matrix, parameter_units, solve_symmetric
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 
 LEAST_WIDTH = 0.1

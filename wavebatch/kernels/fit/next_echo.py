@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit.least_squares import Limits, Windows, add_ridge, parameter_units
-from wavebatch.kernels.fit.residual_test import hermite_moments
+from wavebatch.core.units import SQRT_PI
+from wavebatch.kernels.fit.least_squares import Fit, Limits, Windows
+from wavebatch.kernels.fit.normal_equations import add_ridge, parameter_units
+from wavebatch.kernels.fit.problem import Problem, Settings
+from wavebatch.kernels.fit.residual_test import find_misfits, hermite_moments
+from wavebatch.kernels.signal.filters import gaussian_taps
 
 LEAST_NEW = 0.03
 """Share of a new echo's energy that the present echoes must not be able to explain."""
@@ -35,7 +39,7 @@ def propose_echo(
     rows, gram: of the fit, at or near its minimum.
     """
     m, _, k = parameters.shape
-    taps = np.exp(-0.5 * (np.arange(int(np.ceil(3 * width)) + 1) / width) ** 2)
+    taps = gaussian_taps(width)
     inside = (windows.x >= 0).astype(np.float32)
     spread = _correlate(rows, taps).astype(np.float64)
     energy = _correlate(inside, taps**2).astype(np.float64)
@@ -84,3 +88,36 @@ def _split_flat(
     start[at, :, echo] = np.stack([half, time - apart, narrow], axis=1)
     start[at, :, -1] = np.stack([half, time + apart, narrow], axis=1)
     promise[at] = gain[at, echo]
+
+
+def propose_trials(
+    settings: Settings, windows: Windows, fit: Fit, accepted: np.ndarray, begin: np.ndarray, limits: Limits
+) -> Problem | None:
+    """Trials with one echo more for the accepted fits that leave something unexplained, and the rows of those.
+
+    accepted: of fits that have not converged nobody knows yet what they leave.
+    """
+    if not settings.grow or fit.parameters.shape[2] >= settings.max_echoes or not accepted.any():
+        return None
+    misfit = find_misfits(windows, fit.parameters, fit.rows, settings.gate_residual, settings.gate_hermite)
+    at = np.flatnonzero(misfit & accepted)
+    if not len(at):
+        return None
+    box = Limits(limits.low[at], limits.high[at])
+    start, gain = propose_echo(
+        windows.take(at), fit.parameters[at], fit.rows[at], fit.gram[at], box, settings.width_ref
+    )
+    least = _least_fall(settings, windows.std[at], fit.parameters[at])
+    hopeful = gain > 0.5 * least
+    at, start, least = at[hopeful], start[hopeful], least[hopeful]
+    if not len(at):
+        return None
+    start[:, 1] += begin[at][:, None]
+    return Problem(at, start, fit.cost[at] - least)
+
+
+def _least_fall(settings: Settings, std: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Fall of chi2 (m,) that one more echo needs: the acceptance, and what a misfit of the pulse itself may explain."""
+    amplitude, _, width = parameters.transpose(1, 0, 2)
+    energy = SQRT_PI * (amplitude * amplitude * width).sum(axis=1) / (std * std)
+    return settings.acceptance + settings.misfit**2 * energy

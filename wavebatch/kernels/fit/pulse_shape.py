@@ -8,6 +8,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels.signal.runs import lobe_edges
 
 NO_SKEW = 1e-6
 """Below this |kappa| a pulse is treated as symmetric."""
@@ -41,11 +42,6 @@ class PulseShape(NamedTuple):
     components: tuple[tuple[float, float, float], ...] = ()
     power: float = 2.0
     table: PulseTable | None = None
-
-    @property
-    def is_gaussian(self) -> bool:
-        """True when the plain Gaussian is the whole model."""
-        return abs(self.kappa) < NO_SKEW and not self.components and self.power == 2.0 and self.table is None
 
 
 GAUSSIAN = PulseShape()
@@ -225,14 +221,7 @@ def _make_rising(half_width: np.ndarray) -> np.ndarray:
 def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float, float]:
     """Height and place of the peak, full width at half maximum of its lobe, and the middle of that."""
     top = int(np.argmax(pulse))
-    below = pulse < 0.5 * pulse[top]
-    right = top + int(np.argmax(below[top:]))
-    left = top - int(np.argmax(below[top::-1]))
-
-    def cross(a: int, b: int) -> float:
-        return x[a] + (x[b] - x[a]) * (0.5 * pulse[top] - pulse[a]) / (pulse[b] - pulse[a])
-
-    begin, end = cross(left + 1, left), cross(right - 1, right)
+    begin, end = lobe_edges(x, pulse, 0.5 * pulse[top])
     return float(pulse[top]), float(x[top]), end - begin, 0.5 * (begin + end)
 
 

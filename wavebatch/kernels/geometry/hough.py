@@ -147,11 +147,11 @@ def _settle(
     """The segment near the line `start`, or None, and the pixels to take off."""
     angle, rho = start
     normal = np.array([np.cos(angle), np.sin(angle)])
-    middle, along = rho * normal, np.array([-normal[1], normal[0]])
+    middle, along = rho * normal, _across(normal)
     first = tried = rows[np.abs((points[rows] - middle) @ normal) <= band]
     ends = (0.0, 0.0)
     for _ in range(ROUNDS):
-        inside = rows[np.abs((points[rows] - middle) @ np.array([-along[1], along[0]])) <= band]
+        inside = rows[np.abs((points[rows] - middle) @ _across(along)) <= band]
         inside, ends = _longest_run(inside, (points[inside] - middle) @ along, gap)
         if len(inside) < 2:
             return None, first
@@ -166,9 +166,14 @@ def _settle(
     return _Run(middle, along, ends, tried), tried
 
 
+def _across(along: np.ndarray) -> np.ndarray:
+    """A direction turned left by 90 degrees."""
+    return np.array([-along[1], along[0]])
+
+
 def _measure_spread(apart: np.ndarray, weight: np.ndarray, along: np.ndarray) -> float:
     """Spread of pixels about their line: the median of its quarters', so that one bright spot does not count."""
-    place, off = apart @ along, apart @ np.array([-along[1], along[0]])
+    place, off = apart @ along, apart @ _across(along)
     low, high = place.min(), place.max()
     part = np.minimum(4 * (place - low) / max(high - low, 1e-12), 3).astype(np.int64)
     sums = np.bincount(part, weight, 4)
@@ -201,7 +206,7 @@ def _longest_run(rows: np.ndarray, place: np.ndarray, gap: float) -> tuple[np.nd
 
 def _describe(run: _Run, centre: np.ndarray, weight: np.ndarray) -> HoughLine:
     middle = run.middle + centre
-    normal = np.array([-run.along[1], run.along[0]])
+    normal = _across(run.along)
     theta = np.degrees(np.arctan2(normal[1], normal[0]))
     if not -90 <= theta < 90:
         normal, theta = -normal, (theta + 270) % 180 - 90

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.core.units import MAD_TO_STD
+
 OWN = 0.5
 """Pulses whose first and last return lie at least this far apart [m] know their own direction."""
 _SURE = 2.0
@@ -51,5 +53,5 @@ def _fit_slopes(tangent: np.ndarray, slopes: np.ndarray, wanted: np.ndarray) -> 
         terms = np.stack([np.ones(len(tangent)), tangent], axis=1)
         factors = np.linalg.lstsq(terms[use], slopes[use], rcond=None)[0]
         off = np.linalg.norm(slopes - terms @ factors, axis=1)
-        use = off <= _CLIP * max(1.4826 * float(np.median(off)), 1e-6)
+        use = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-6)
     return factors[0] + wanted[:, None] * factors[1]

@@ -51,8 +51,6 @@ class SensorFit(NamedTuple):
     """Angle that the directions cover [rad]."""
     residual: float
     """Root mean square of the angular residuals per component, at weight 1 [rad]."""
-    flipped: float
-    """Share of the directions that pointed to the sensor; they were turned."""
     pulses: int
 
     @property
@@ -67,7 +65,7 @@ def sensor_at(fit: SensorFit, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
     order = len(fit.coefficients) - 1
     slope = np.stack([k * tau ** max(k - 1, 0) / fit.half for k in range(order + 1)], axis=1)
-    return _powers(tau, order) @ fit.coefficients, slope @ fit.coefficients
+    return np.vander(tau, order + 1, increasing=True) @ fit.coefficients, slope @ fit.coefficients
 
 
 def range_error(fit: SensorFit, time: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -77,7 +75,7 @@ def range_error(fit: SensorFit, time: np.ndarray, direction: np.ndarray) -> np.n
     """
     order = len(fit.coefficients) - 1
     tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
-    along = (_powers(tau, order)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
+    along = (np.vander(tau, order + 1, increasing=True)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
     variance = np.einsum("ni,ij,nj->n", along, fit.covariance, along)
     return np.sqrt(np.maximum(variance, 0.0) + _unknown_motion(fit) ** 2)
 
@@ -107,14 +105,13 @@ def fit_sensor(
         half = max(0.5 * float(time.max() - time.min()), 1e-9)
         origin = np.median(point[used], axis=0)
     ground = point[used] - origin
-    powers = _powers((time - centre) / half, order)
+    powers = np.vander((time - centre) / half, order + 1, increasing=True)
     if len(used) < LEAST_PULSES:
         return _nothing(centre, half, order, len(used))
     with np.errstate(all="ignore"):
         start = _solve_lines(powers, ground, unit, weight)
         ahead = ground - powers @ start
-        reverse = np.einsum("ni,ni->n", unit, ahead) < 0
-        unit = np.where(reverse[:, None], -unit, unit)
+        unit = np.where((np.einsum("ni,ni->n", unit, ahead) < 0)[:, None], -unit, unit)
         found, normal, residual = _solve_angles(powers, ground, unit, weight, start)
         ahead = ground - powers @ found
         distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
@@ -122,8 +119,8 @@ def fit_sensor(
     covariance = np.full(normal.shape, np.nan)
     if _condition(normal) < 1e14:
         covariance = residual**2 * np.linalg.inv(normal)
-    condition, share = _condition(normal[:3, :3]), float(reverse.mean())
-    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, share, len(used))
+    condition = _condition(normal[:3, :3])
+    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, len(used))
 
 
 def fit_best(
@@ -143,23 +140,10 @@ def fit_best(
     return best if best is not None and least < LARGEST_ERROR * best.distance else None
 
 
-def pairs_of_returns(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Point, direction and weight of pulses with two returns (n, 3): the farther they are apart, the better.
-
-    The point is the middle, whose errors do not go with those of the direction.
-    """
-    apart = last - first
-    return 0.5 * (first + last), apart, np.einsum("ni,ni->n", apart, apart)
-
-
-def _powers(tau: np.ndarray, order: int) -> np.ndarray:
-    return np.stack([tau**k for k in range(order + 1)], axis=1)
-
-
 def _nothing(centre: float, half: float, order: int, pulses: int) -> SensorFit:
     size = 3 * (order + 1)
     empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
-    return SensorFit(centre, half, *empty, np.inf, np.nan, 0.0, np.nan, 0.0, pulses)
+    return SensorFit(centre, half, *empty, np.inf, np.nan, 0.0, np.nan, pulses)
 
 
 def _condition(normal: np.ndarray) -> float:

@@ -12,12 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.kernels.signal.runs import lobe_edges
 
 STEEPEST = np.radians(80.0)
 """Angles beyond it are not known (H14)."""
-
-FWHM_PER_TAU = 3.3946780749849567
-"""Full width at half maximum of t^2 exp(-t), in tau; of the printed t exp(-t) the paper has 3.5."""
 
 PAPER_TAU = 3.5
 
@@ -156,14 +154,8 @@ def spread_pulse(
 
 def direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
     """Width of a curve of height 1 at `level`, between the first and the last crossing beside its peak."""
-    top = int(np.argmax(curve))
-    right = top + int(np.argmax(curve[top:] < level))
-    left = top - int(np.argmax(curve[top::-1] < level))
-
-    def cross(a: int, b: int) -> float:
-        return time[a] + (time[b] - time[a]) * (level - curve[a]) / (curve[b] - curve[a])
-
-    return float(cross(right - 1, right) - cross(left + 1, left))
+    begin, end = lobe_edges(time, curve, level)
+    return float(end - begin)
 
 
 def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:

@@ -44,6 +44,18 @@ def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tup
     return middle + mean, np.sqrt(np.maximum(second / total - mean**2, 0.0))
 
 
+def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, float]:
+    """Edges"""
+    top = int(np.argmax(curve))
+    right = top + int(np.argmax(curve[top:] < level))
+    left = top - int(np.argmax(curve[top::-1] < level))
+
+    def cross(a: int, b: int) -> float:
+        return x[a] + (x[b] - x[a]) * (level - curve[a]) / (curve[b] - curve[a])
+
+    return cross(left + 1, left), cross(right - 1, right)
+
+
 def walk_down(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, level: np.ndarray, step: int) -> np.ndarray:
     """Position (m,) at which the signal (s, n) falls to the level (m,) when one walks from a peak by steps of +-1.
 
