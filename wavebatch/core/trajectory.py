@@ -19,7 +19,7 @@ ADJUSTED = 1e9
 """Adjusted standard GPS time is standard GPS time minus this [s] (LAS 1.4, global encoding bit 0)."""
 
 LONGEST_GAP = 1.0
-"""Gaps between two positions up to this are always bridged [s]: files have from 1 to 500 positions per second."""
+"""Gaps between two positions up to this are always bridged [s]."""
 
 GAP_STEPS = 5.0
 """Gaps up to this many usual steps are bridged too."""

@@ -1,4 +1,7 @@
-"""Closed-form Gaussians: a weighted parabola through the logarithms of the samples around a peak (Guo 2011)."""
+"""Closed-form Gaussians: a weighted parabola through the logarithms of the samples around a peak (Guo 2011).
+
+Used by the fast stages as the fit, or as the start of one. Cheap, but wrong for echoes that overlap.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,31 @@ from wavebatch.kernels.fit.cluster import fit_parabola
 
 
 def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Amplitude, time after the middle sample, width and whether the closed form holds, each (m,).
+    """Gaussians through the samples around peaks, without iterations.
 
-    y: signal (m, 2 r + 1) with the peak in the middle, 0 where there is no sample; used are the contiguous samples
-    from the peak outwards that are at least `fraction` of it. ln y = c0 + c1 x + c2 x^2 with weights y^2;
-    s = sqrt(-1 / (2 c2)), t = -c1 / (2 c2), A = exp(c0 - c1^2 / (4 c2)) (ALGORITHMS 4.1). It does not hold where
-    c2 >= 0 or the peak lies two samples or more away.
+    Parameters
+    ----------
+    y : float (m, 2 r + 1), count
+        Signal with the peak in the middle; 0 where there is no sample.
+    fraction : float
+        Used are the contiguous samples around the peak that are at least this share of it.
+
+    Returns
+    -------
+    amplitude : float64 (m,), count
+    time : float64 (m,), samples
+        After the middle sample.
+    width : float64 (m,), samples
+    holds : bool (m,)
+        False where the parabola opens upwards or its peak lies two samples or more away; the values are void there.
+
+    Notes
+    -----
+    ln y = c0 + c1 x + c2 x^2 with weights y^2; s = sqrt(-1 / (2 c2)), t = -c1 / (2 c2), A = exp(c0 - c1^2 / (4 c2)).
+
+    References
+    ----------
+    Guo (2011), IEEE Signal Processing Magazine 28(5); docs/algorithms.md 4.1.
     """
     middle = y.shape[1] // 2
     y = y.astype(np.float64)

@@ -1,4 +1,8 @@
-"""Decomposition of waveforms into echoes: clusters fitted in batches, grown where the residual asks for it."""
+"""Decomposition of waveforms into echoes: clusters fitted in batches, grown where the residual asks for it.
+
+Called by stages/decompose. Round k fits all clusters with k echoes: those given by candidates, and trials from round
+k - 1. What a cluster gets (window length, attempts) depends on the cluster alone, never on its batch.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,8 @@ from wavebatch.kernels.fit.problem import Problem, Settings, Solution
 
 
 class _Work(NamedTuple):
+    """The data of a decomposition, the same for every batch."""
+
     samples: np.ndarray
     baseline: np.ndarray
     std: np.ndarray
@@ -23,7 +29,7 @@ class _Work(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What came of one batch."""
+    """Result of one batch."""
 
     solution: Solution
     refused: np.ndarray
@@ -31,10 +37,11 @@ class _Step(NamedTuple):
     proposal: Problem | None
     """Trials with one echo more, each for a row of the solution."""
     parents: np.ndarray
-    """Those rows of the solution."""
+    """These rows of the solution."""
     unfinished: Problem
-    """What needs more iterations, with the parameters reached."""
+    """Problems that need more iterations, with the parameters reached."""
     unfinished_rows: np.ndarray
+    """Their rows in the problem."""
 
 
 def decompose_clusters(
@@ -45,9 +52,29 @@ def decompose_clusters(
     clusters: Clusters,
     settings: Settings,
 ) -> Iterator[Solution]:
-    """Solutions of all clusters, those with the same number of echoes together.
+    """Fits and grows all clusters.
 
-    samples: raw counts (n, s); baseline, std: (n,). Every cluster appears in exactly one solution.
+    Parameters
+    ----------
+    samples : uint (n, s), count
+        Raw counts, contiguous.
+    baseline, std : float32 (n,), count
+        Level and noise of each waveform.
+    candidates : Candidates
+        Start values.
+    clusters : Clusters
+        Windows, and which candidates belong to each.
+    settings : Settings
+        Options.
+
+    Yields
+    ------
+    Solution
+        Clusters with the same number of echoes; every cluster appears in exactly one solution.
+
+    References
+    ----------
+    docs/algorithms.md 2.3 and 4.2.
     """
     work = _Work(samples, baseline, std, clusters, settings)
     trials: list[Problem] = []
@@ -74,38 +101,39 @@ def decompose_clusters(
 
 
 def _join(parts: list) -> tuple:
-    """Named tuples of arrays one behind the other."""
+    """Named tuples of arrays joined field by field."""
     return type(parts[0])(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
 
 
 _LONG = (64, 80, 96, 128, 160, 192, 256, 384, 512, 768, 1024, 2048, 4096, 65536)
 
 FINE_LENGTHS = np.array([8, 12, 16, 20, 24, 28, 32, 40, 48, *_LONG])
-"""Window lengths of problems with one or two echoes: many problems, each window hardly longer than it must be."""
+"""Window lengths of problems with one or two echoes: these are many, so windows are hardly longer than they must be."""
 
 COARSE_LENGTHS = np.array([16, 32, 48, *_LONG])
-"""Window lengths of problems with more echoes: few problems, in as few batches as possible."""
+"""Window lengths of problems with more echoes: these are few, so they go into as few batches as possible."""
 
 LAST_LENGTHS = np.array([48, 96, 192, 512, 1024, 4096, 65536])
-"""Window lengths of the stragglers."""
+"""Window lengths of the second attempt, with still fewer problems."""
 
 UNRESOLVED = 0.25
 """Distance, in its errors, below which two echoes are one. Larger values lose pairs that chi2 proves: at 1, a quarter
-of those 1.5 widths apart with a ratio of 0.5."""
+of the pairs 1.5 widths apart with an amplitude ratio of 0.5.
+"""
 
 PATIENCE = 5
-"""Iterations of the first attempt; what has not converged then goes on together with others of any length."""
+"""Iterations of the first attempt: most problems converge in it, the others then go on together."""
 
 
 CENSORED = 40
-"""Iterations that a problem with clipped samples may have where others have only a few: its start is far off (H6)."""
+"""Iterations of problems with clipped samples where others have only PATIENCE: their starts are far off
+
+Source: docs/algorithms.md H6.
+"""
 
 
 def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
-    """The problem in batches of one window length.
-
-    Which attempt and which length a cluster gets depends on the cluster alone, never on its batch.
-    """
+    """Solves the problem in batches of one window length, in two attempts."""
     longest = work.samples.shape[1]
     rows = np.arange(len(problem.cluster))
     most = work.settings.max_iterations
@@ -133,7 +161,7 @@ def _solve(work: _Work, problem: Problem) -> Iterator[_Step]:
 
 
 def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, iterations: int, last: bool) -> _Step:
-    """Fits problems in windows of one length; last: what has not converged ends here too."""
+    """Fits problems in windows of one length. In the last attempt every problem ends, converged or not."""
     settings, cluster = work.settings, problem.cluster
     waveform, low, high = (field[cluster] for field in work.clusters[:3])
     windows, begin = cut_windows(
@@ -173,7 +201,7 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
 
 
 def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, begin: np.ndarray) -> Solution:
-    """What all fits of a batch found, in samples of the waveform."""
+    """What the fits of a batch found, in samples of the waveform."""
     errors = parameter_errors(fit.parameters, windows.std, fit.rows, fit.gram)
     parameters = fit.parameters.copy()
     parameters[:, 1] += begin[:, None]
@@ -194,7 +222,7 @@ def _limits(settings: Settings, first: np.ndarray, behind: np.ndarray) -> Limits
 
 
 def _is_resolved(solution: Solution) -> np.ndarray:
-    """True (m,) where no two neighbouring echoes are so close that their distance is unknown (H1)."""
+    """True (m,) where no two neighbouring echoes are closer than their errors allow (docs/algorithms.md H1)."""
     order = np.argsort(solution.parameters[:, 1], axis=1)
     time = np.take_along_axis(solution.parameters[:, 1], order, axis=1)
     error = np.take_along_axis(solution.errors[:, 1], order, axis=1)

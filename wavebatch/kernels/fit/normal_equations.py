@@ -1,32 +1,76 @@
-"""X"""
+"""Normal equations of many small least-squares problems: products, solutions and parameter errors.
+
+Used by every fit here. Equations are in units in which each basis function has the same scale, so that the condition
+number is that of the overlap alone: float32 products are then exact enough, float64 solves are needed
+(docs/algorithms.md H2). Each reduction stays within one problem, so that results do not depend on the batch.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 RIDGE = 1e-9
-"""Added to the diagonal of the scaled normal equations: an echo outside its window must not make them singular."""
+"""Added to the diagonal of the scaled equations: an echo outside its window must not make them singular."""
 
 STEEP = 1e3
-"""Variance inflation by overlap from which normal equations are taken in float64."""
+"""Variance inflation by overlap from which products are taken in float64 (docs/algorithms.md H2)."""
 
 
 def gram_matrix(rows: np.ndarray) -> np.ndarray:
-    """Inner products of the rows of each problem, float64 (m, p, p)."""
+    """Inner products of the rows of each problem.
+
+    Parameters
+    ----------
+    rows : float32 (m, p, L)
+        Rows of `evaluate_model`.
+
+    Returns
+    -------
+    float64 (m, p, p)
+        Products summed in float32.
+    """
     return (rows @ rows.transpose(0, 2, 1)).astype(np.float64)
 
 
 def parameter_units(parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """What one unit of each row's coefficient is worth: 1 for amplitude, s/A for time and width (m, 3, k)."""
+    """What one unit of each row's coefficient means: 1 for amplitude, width / amplitude for time and width.
+
+    Parameters
+    ----------
+    parameters : float64 (m, 3, k)
+        Amplitude, time, width.
+    std : float64 (m,), count
+        Noise; amplitudes below half of it count as that.
+
+    Returns
+    -------
+    float64 (m, 3, k)
+    """
     units = np.ones(parameters.shape)
     units[:, 1] = units[:, 2] = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
     return units
 
 
 def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """One standard deviation of each parameter from the normal equations (m, 3, k).
+    """One standard deviation of each parameter, from the normal equations.
 
-    Where echoes overlap so much that float32 products would not do, the products are taken in float64 (H2).
+    Where echoes overlap so much that float32 products are not exact enough, they are taken again in float64.
+
+    Parameters
+    ----------
+    parameters : float64 (m, 3, k)
+        Amplitude [count], time and width [samples].
+    std : float64 (m,), count
+        Noise of one sample.
+    rows : float32 (m, 3 k + 1, L)
+        Rows of `evaluate_model` at the parameters.
+    gram : float64 (m, 3 k + 1, 3 k + 1)
+        Their products.
+
+    Returns
+    -------
+    float64 (m, 3, k)
+        In the units of the parameters.
     """
     functions = gram[:, :-1, :-1]
     variance = invert_diagonal(add_ridge(functions.copy()))
@@ -41,7 +85,24 @@ def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, 
 
 
 def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions (m, p) of symmetric systems (m, p, p); by cofactors for p = 3, where problems are many and tame."""
+    """Solutions of symmetric systems; by cofactors for p = 3, where problems are many and well conditioned.
+
+    Parameters
+    ----------
+    matrix : float64 (m, p, p)
+        Symmetric matrices.
+    right : float64 (m, p)
+        Right-hand sides.
+
+    Returns
+    -------
+    float64 (m, p)
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A matrix is singular (p other than 3); see `add_ridge`.
+    """
     if matrix.shape[1] != 3:
         return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
     cofactors, determinant = _cofactors(matrix)
@@ -56,7 +117,7 @@ def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def invert_diagonal(matrix: np.ndarray) -> np.ndarray:
-    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p)."""
+    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p), float64."""
     if matrix.shape[1] != 3:
         return np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2).copy()
     (xx, _, _, yy, _, zz), determinant = _cofactors(matrix)
@@ -79,7 +140,7 @@ def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 
 
 def add_ridge(gram: np.ndarray) -> np.ndarray:
-    """The matrices (m, p, p) with a diagonal that no overlap can make singular; changed in place."""
+    """The matrices (m, p, p) with a ridge on the diagonal, so that no overlap makes them singular; changed in place."""
     diagonal = np.einsum("mpp->mp", gram)
     diagonal *= 1 + RIDGE
     diagonal += RIDGE
