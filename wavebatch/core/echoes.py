@@ -76,11 +76,7 @@ class Column:
     """False for quantities that are LAS fields already (x, y, z) or that are not written to files."""
 
 
-def _columns(*columns: Column) -> dict[str, Column]:
-    return {column.name: column for column in columns}
-
-
-COLUMNS: dict[str, Column] = _columns(
+_COLUMNS = (
     Column("amplitude", "f4", "DN", "peak of the echo above the baseline"),
     Column("echo_time", "f4", "ns", "centre of the echo after the first sample of its packet"),
     Column("echo_width", "f4", "ns", "full width at half maximum"),
@@ -114,6 +110,8 @@ COLUMNS: dict[str, Column] = _columns(
     Column("ray_y", "f4", "-", "north component of the unit vector away from the sensor", extra_bytes=False),
     Column("ray_z", "f4", "-", "upward component of the unit vector away from the sensor", extra_bytes=False),
 )
+
+COLUMNS: dict[str, Column] = {column.name: column for column in _COLUMNS}
 """Every column by its name."""
 
 RAY = ("ray_x", "ray_y", "ray_z")

@@ -77,7 +77,19 @@ class Trajectory:
         return replace(self, time=self.time + seconds)
 
     def between(self, start: float, stop: float, step: float = 0.04) -> Trajectory:
-        """The part within [start, stop] and one position beyond each end, with about one position per `step` [s]."""
+        """The part that covers [start, stop], thinned.
+
+        Parameters
+        ----------
+        start, stop : float, s
+            One position beyond each end is kept.
+        step : float, s
+            Wanted time between positions.
+
+        Returns
+        -------
+        Trajectory
+        """
         first = max(int(np.searchsorted(self.time, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.time, stop)) + 1, len(self.time))
         first = max(min(first, last - 2), 0)

@@ -1,7 +1,7 @@
-"""From candidate echoes to clusters of overlapping echoes, each with a window of samples to fit; and start values.
+"""From candidate echoes to clusters of overlapping echoes, each with a window of samples to fit.
 
-Used by stages/decompose and stages/detect before `grow`. Windows of neighbouring clusters must not overlap: a window
-that reaches into its neighbour finds false echoes there (9 % false splits instead of 0.9 %).
+Used by stages/decompose before `grow`; `find_runs` also by stages/detect. Windows of neighbouring clusters must not
+overlap: a window that reaches into its neighbour finds false echoes there (9 % false splits instead of 0.9 %).
 """
 
 from __future__ import annotations
@@ -198,15 +198,11 @@ def cut_windows(
     begin : int64 (m,)
         Sample at which each window begins.
     """
-    n, s = samples.shape
+    s = samples.shape[1]
     length = min(length, s)
     begin = np.minimum(low, s - length)
-    flat = samples.reshape(-1)
-    views = np.lib.stride_tricks.as_strided(
-        flat, (n * s - length + 1, length), (flat.itemsize, flat.itemsize), writeable=False
-    )
-    raw = views[waveform * s + begin]
-    y = raw.astype(np.float32)
+    views = np.lib.stride_tricks.sliding_window_view(samples.reshape(-1), length)
+    y = views[waveform * s + begin].astype(np.float32)
     clipped = None
     if clip is not None:
         clipped = y >= clip
@@ -229,120 +225,3 @@ def _weigh(y: np.ndarray, std: np.ndarray, noise_gain: float) -> np.ndarray:
     padded = np.pad(y, ((0, 0), (2, 2)), mode="edge")
     smooth = (padded[:, :-4] + padded[:, 4:] + 4 * (padded[:, 1:-3] + padded[:, 3:-1]) + 6 * padded[:, 2:-2]) / 16
     return 1 / np.sqrt(1 + np.float32(noise_gain) * np.maximum(smooth, 0) / (std * std).astype(np.float32)[:, None])
-
-
-def estimate_starts(
-    smoothed: np.ndarray, waveform: np.ndarray, sample: np.ndarray, width: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Start values of peaks: a log-parabola through five smoothed samples, weighted by the signal.
-
-    Parameters
-    ----------
-    smoothed : float32 (s, n), count
-        Signal filtered with [1 2 1]/4; the width of the filter is taken off the result.
-    waveform, sample : int64 (m,)
-        Place of each peak.
-    width : float, samples
-        Width where the parabola fails; the time is the sample itself there.
-
-    Returns
-    -------
-    amplitude, time, width : float64 (m,), count, samples, samples
-    """
-    s, n = smoothed.shape
-    flat = smoothed.reshape(-1)
-    offsets = np.arange(-2, 3)
-    at = np.clip(sample[None] + offsets[:, None], 0, s - 1)
-    y = flat[at * n + waveform].astype(np.float64)
-    peak = y[2]
-    floor = 0.05 * peak
-    used = np.maximum(y, floor[None])
-    weight = np.where((at == sample[None] + offsets[:, None]) & (y > floor), used * used, 0.0)
-    log = np.log(np.maximum(used, 1e-12))
-    x = offsets[:, None].astype(np.float64)
-    c0, c1, c2 = fit_parabola(weight, x, log, axis=0)
-    good = (c2 < -1e-4) & np.isfinite(c1)
-    safe = np.where(good, c2, -1.0)
-    shift = -c1 / (2 * safe)
-    good &= np.abs(shift) < 1.5
-    variance = -1 / (2 * safe)
-    time = sample + np.where(good, shift, 0.0)
-    narrow = np.sqrt(np.maximum(variance - 0.5, 0.1))
-    amplitude = np.where(good, np.exp(np.clip(c0 - c1 * c1 / (4 * safe), -20, 20)), peak)
-    amplitude *= np.where(good, np.sqrt(1 + 0.5 / narrow**2), 1.1)
-    return amplitude, time, np.where(good, narrow, width)
-
-
-def start_errors(amplitude: np.ndarray, width: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations of amplitude and width that `estimate_starts` finds for isolated Gaussian echoes.
-
-    Parameters
-    ----------
-    amplitude, width : float (m,), count, samples
-        Of the echoes.
-    std : float (m,), count
-        Noise of one unfiltered sample.
-
-    Returns
-    -------
-    amplitude_err, width_err : float64 (m,), count, samples
-
-    Notes
-    -----
-    To first order in the noise, for peaks that lie on a sample. Broad echoes, of which five samples cover only the top,
-    have errors many times the Cramer-Rao bound.
-    """
-    spread = width * width + 0.5
-    places = np.arange(-2.0, 3.0).tolist()
-    shape = [np.exp(-0.5 * x * x / spread) for x in places]
-    s0, s2, s4 = (sum(y * y * x**p for x, y in zip(places, shape, strict=True)) for p in (0, 2, 4))
-    determinant = s0 * s4 - s2 * s2
-    # Of the parabola c0 + c2 x^2: width sqrt(-1 / (2 c2) - 1/2), amplitude exp(c0) sqrt(1 + 1 / (2 width^2)).
-    gain = spread * spread / (width * determinant)
-    by_width = [gain * y * (s0 * x * x - s2) for x, y in zip(places, shape, strict=True)]
-    loss = 0.5 / (width * spread)
-    by_height = [
-        y * (s4 - s2 * x * x) / determinant - loss * part for x, y, part in zip(places, shape, by_width, strict=True)
-    ]
-    noise = std / amplitude * np.sqrt(spread) / width
-    return amplitude * noise * _filtered_norm(by_height), noise * _filtered_norm(by_width)
-
-
-def _filtered_norm(taps: list[np.ndarray]) -> np.ndarray:
-    """Gain of white noise through the [1 2 1]/4 filter and then `taps`: root of the sum of squares."""
-    wide = [0.0, 0.0, *taps, 0.0, 0.0]
-    joined = ((a + 2.0 * b + c) * 0.25 for a, b, c in zip(wide, wide[1:], wide[2:], strict=False))
-    return np.sqrt(sum(tap * tap for tap in joined))
-
-
-def fit_parabola(weight: np.ndarray, x: np.ndarray, y: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:
-    """Coefficients c0, c1, c2 of weighted parabolas y = c0 + c1 x + c2 x^2, by Cramer's rule.
-
-    Sums and not matrix products, because the sums of a matrix product depend on the number of rows.
-
-    Parameters
-    ----------
-    weight, x, y : float64, of shapes that broadcast
-        Weights, abscissae and values.
-    axis : int
-        Axis along which a parabola runs.
-
-    Returns
-    -------
-    tuple of float64 arrays
-        c0, c1 and c2; 0 where the system is singular.
-    """
-    s = [np.sum(weight * x**p, axis=axis) for p in range(5)]
-    product = weight * y
-    b = [np.sum(product * x**p, axis=axis) for p in range(3)]
-    m0 = s[2] * s[4] - s[3] * s[3]
-    m1 = s[1] * s[4] - s[2] * s[3]
-    m2 = s[1] * s[3] - s[2] * s[2]
-    determinant = s[0] * m0 - s[1] * m1 + s[2] * m2
-    inverse = 1 / np.where(np.abs(determinant) > 1e-12, determinant, np.inf)
-    c0 = (b[0] * m0 - b[1] * m1 + b[2] * m2) * inverse
-    n1 = s[0] * s[4] - s[2] * s[2]
-    n2 = s[0] * s[3] - s[1] * s[2]
-    c1 = (-b[0] * m1 + b[1] * n1 - b[2] * n2) * inverse
-    c2 = (b[0] * m2 - b[1] * n2 + b[2] * (s[0] * s[2] - s[1] * s[1])) * inverse
-    return c0, c1, c2

@@ -188,7 +188,7 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         finished |= ~windows.clipped.any(axis=1)
     solution = _solution(cluster, windows, fit, begin)
     accepted = finished & ~fit.hopeless & (~new | ((solution.cost < problem.target) & _is_resolved(solution)))
-    # Fits that have not converged yet may still explain what their residual shows.
+    # A fit that has not converged may still explain what its residual shows.
     proposal = propose_trials(settings, windows, fit, accepted & fit.converged, begin, limits)
     parents = np.empty(0, np.int64)
     if proposal is not None:
@@ -211,12 +211,12 @@ def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, begin: np.ndarray
     return Solution(cluster, parameters, errors, misfit, fit.cost, fit.converged, fit.at_bound)
 
 
-def _limits(settings: Settings, first: np.ndarray, behind: np.ndarray) -> Limits:
-    """Amplitude from 0; time within 3 samples of the window [first, behind); width as set: arrays (m, 3, 1)."""
+def _limits(settings: Settings, first: np.ndarray, end: np.ndarray) -> Limits:
+    """Amplitude from 0; time within 3 samples of the window [first, end); width as set: arrays (m, 3, 1)."""
     low = np.empty((len(first), 3, 1))
     high = np.empty_like(low)
     low[:, 0], high[:, 0] = 0.0, 1e9
-    low[:, 1, 0], high[:, 1, 0] = first - 3.0, behind + 2.0
+    low[:, 1, 0], high[:, 1, 0] = first - 3.0, end + 2.0
     low[:, 2], high[:, 2] = settings.width_low, settings.width_high
     return Limits(low, high)
 

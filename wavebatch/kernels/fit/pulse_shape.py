@@ -245,7 +245,19 @@ class PulseMeasures(NamedTuple):
 
 
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
-    """Peak, its delay and full width at half maximum of a pulse, for widths from `low` to `high` [samples]."""
+    """Peak, its delay and full width at half maximum of a pulse, over a range of widths.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        Model of the pulse.
+    low, high : float, samples
+        Smallest and largest width.
+
+    Returns
+    -------
+    PulseMeasures
+    """
     widths = np.linspace(low, high, 200)
     step = low / 100
     reach = max([6 * high, *(abs(delay) + high for _, delay, _ in shape.components)])

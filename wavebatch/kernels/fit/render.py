@@ -36,7 +36,7 @@ def render_echoes(
     """
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
-    # Parts end with a waveform: so the order in which its echoes are added does not depend on the others.
+    # Parts end with a waveform, so that the order in which its echoes are added does not depend on the others.
     borders = np.append(np.unique(np.searchsorted(waveform, waveform[::ROWS])), len(waveform))
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         part = slice(begin, end)

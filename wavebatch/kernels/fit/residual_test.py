@@ -98,7 +98,7 @@ def residual_moments(
             inside = (at >= 0) & (at < s)
             cut = not inside.all()
             values = read(part, np.clip(at, 0, s - 1) if cut else at)
-            # Centres are taken off in double precision: what is left is small.
+            # Centres are subtracted in double precision; float32 is then enough for the small rest.
             z = np.arange(-size, size + 1, dtype=np.float32) - (time[part] - middle).astype(np.float32)[:, None]
             z *= (1 / width[part]).astype(np.float32)[:, None]
             pulse, by_time, by_width = evaluate_unit(z)

@@ -235,12 +235,5 @@ def _describe(run: _Run, centre: np.ndarray, weight: np.ndarray) -> HoughLine:
     theta = np.degrees(np.arctan2(normal[1], normal[0]))
     if not -90 <= theta < 90:
         normal, theta = -normal, (theta + 270) % 180 - 90
-    ends = [middle + place * run.along for place in run.ends]
-    return HoughLine(
-        float(theta),
-        float(middle @ normal),
-        (float(ends[0][0]), float(ends[0][1])),
-        (float(ends[1][0]), float(ends[1][1])),
-        float(weight[run.rows].sum()),
-        run.rows,
-    )
+    start, end = (tuple((middle + place * run.along).tolist()) for place in run.ends)
+    return HoughLine(float(theta), float(middle @ normal), start, end, float(weight[run.rows].sum()), run.rows)

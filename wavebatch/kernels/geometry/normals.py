@@ -27,6 +27,7 @@ LEAST_KEPT = 0.6
 """Smallest share of the neighbours that must lie in the plane."""
 
 _LARGEST_CHUNK = 4096
+"""Points that are handled at a time at most."""
 
 
 class Gap(IntEnum):
@@ -35,10 +36,15 @@ class Gap(IntEnum):
     NO_RAY = 0
     """No waveform, no echo, or a direction of length 0."""
     KNOWN = 1
+    """It has an angle."""
     FEW_NEIGHBOURS = 2
+    """Fewer than min_points neighbours."""
     NO_PLANE = 3
+    """The neighbours form no plane that the point lies in."""
     TOO_STEEP = 4
+    """The ray nearly lies in the plane."""
     UNCERTAIN = 5
+    """The angle is less certain than max_error."""
 
 
 def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
@@ -62,8 +68,8 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
     cell = [np.floor(xyz[:, axis] / side) for axis in range(3)]
     lot = row.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     order = np.lexsort((lot, *cell))
-    new = np.ones(len(order), bool)
-    new[1:] = False
+    new = np.zeros(len(order), bool)
+    new[:1] = True
     for values in cell:
         new[1:] |= values[order[1:]] != values[order[:-1]]
     start = np.flatnonzero(new)
@@ -99,7 +105,7 @@ class Surroundings:
         """
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
-        # The tree rounds distances as its own boxes make it; the exact test below is the same in every tree.
+        # Rounded distances differ from tree to tree; the exact test below is the same in every tree.
         tree = scipy.spatial.cKDTree(points)
         near = tree.sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
         key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])

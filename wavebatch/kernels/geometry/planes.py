@@ -110,7 +110,7 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         near = off <= limit[at]
         changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
         kept[rows] = near
-        # What is left out is little: taking it off costs less than adding up all the rest.
+        # Few points are left out: to subtract them costs less than to add up all the others.
         out = np.flatnonzero(changed[local] & ~near)
         left_out = _sum_moments(x[:, rows[out]], local[out], len(active))
         active, moved = active[changed | tight], active[changed]
@@ -162,7 +162,7 @@ def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndar
     scatter = np.maximum(flat, 0.0) * kept / np.maximum(kept - 3.0, 1.0) + LEAST_SPREAD**2
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         tilts = [scatter / (kept * np.maximum(spread, 0.0)) for spread in (low, high)]
-        # A ray along the normal sees both tilts alike, one far off it only the tilt in its own direction.
+        # Both tilts matter for a ray along the normal; for a ray far off it only the tilt towards the ray does.
         blur = np.minimum(0.5 * (tilts[0] + tilts[1]), 1.0)
         weights = [part * part + blur for part in (short, long)]
         variance = (weights[0] * tilts[0] + weights[1] * tilts[1]) / (weights[0] + weights[1])

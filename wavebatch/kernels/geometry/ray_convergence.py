@@ -143,16 +143,14 @@ def fit_sensor(
     used = np.flatnonzero(np.isfinite(lengths) & (lengths > 0) & np.isfinite(point).all(axis=1) & np.isfinite(time))
     unit = direction[used] / lengths[used, None]
     weight = np.ones(len(used)) if weight is None else np.asarray(weight, np.float64)[used]
-    time, origin = np.asarray(time, np.float64)[used], np.zeros(3)
-    centre, half = 0.0, 1.0
-    if len(used):
-        centre = 0.5 * float(time.min() + time.max())
-        half = max(0.5 * float(time.max() - time.min()), 1e-9)
-        origin = np.median(point[used], axis=0)
+    time = np.asarray(time, np.float64)[used]
+    if len(used) < LEAST_PULSES:
+        return _nothing(order, len(used))
+    centre = 0.5 * float(time.min() + time.max())
+    half = max(0.5 * float(time.max() - time.min()), 1e-9)
+    origin = np.median(point[used], axis=0)
     ground = point[used] - origin
     powers = np.vander((time - centre) / half, order + 1, increasing=True)
-    if len(used) < LEAST_PULSES:
-        return _nothing(centre, half, order, len(used))
     with np.errstate(all="ignore"):
         start = _solve_lines(powers, ground, unit, weight)
         ahead = ground - powers @ start
@@ -195,10 +193,11 @@ def fit_best(
     return best if best is not None and least < LARGEST_ERROR * best.distance else None
 
 
-def _nothing(centre: float, half: float, order: int, pulses: int) -> SensorFit:
+def _nothing(order: int, pulses: int) -> SensorFit:
+    """A fit that is not sound."""
     size = 3 * (order + 1)
     empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
-    return SensorFit(centre, half, *empty, np.inf, np.nan, 0.0, np.nan, pulses)
+    return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, pulses)
 
 
 def _condition(normal: np.ndarray) -> float:

@@ -104,7 +104,21 @@ def sort_into_tiles(tiles: Tiles, xyz: np.ndarray, buffer: float) -> tuple[np.nd
 
 
 def is_inside(tiles: Tiles, number: int, xyz: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) lie in the tile `number`, bool (n,)."""
+    """Whether points lie in one tile; every point lies in exactly one.
+
+    Parameters
+    ----------
+    tiles : Tiles
+        All tiles.
+    number : int
+        Number of the tile.
+    xyz : float64 (n, 3), m
+        Points.
+
+    Returns
+    -------
+    bool (n,)
+    """
     inside = np.ones(len(xyz), bool)
     for axis in range(3):
         inside &= (xyz[:, axis] >= tiles.low[number, axis]) & (xyz[:, axis] < tiles.high[number, axis])

@@ -53,7 +53,7 @@ def fits_keys(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.nd
         a, b = (np.floor((start + step * time[:, None]) / size) for time in (begin, end))
         for axis, bits in enumerate(KEY_BITS):
             limit = float(1 << (bits - 1)) - 1  # one voxel of margin
-            # Comparisons with what is no number are false.
+            # Comparisons with NaN are false, so that such rays are not good.
             good &= (np.abs(a[:, axis]) < limit) & (np.abs(b[:, axis]) < limit)
             good &= np.abs(b[:, axis] - a[:, axis]) <= MOST_STEPS
     return good
@@ -105,7 +105,17 @@ def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np
 
 
 def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> list[slice]:
-    """Slices of the rays that `cross_voxels` can handle at a time in bounded memory; parameters as there."""
+    """Slices of the rays that `cross_voxels` can handle at a time in bounded memory.
+
+    Parameters
+    ----------
+    start, step, begin, end, size
+        As for `cross_voxels`.
+
+    Returns
+    -------
+    list of slice
+    """
     number = 3 + (np.abs(step) * ((end - begin)[:, None] / size)).sum(axis=1)
     slices, at = [], 0
     most = np.maximum.accumulate(number)

@@ -118,8 +118,8 @@ def spread_variance(table: WidthTable, width: np.ndarray) -> np.ndarray:
     Interpolated is what the pulse itself adds to the variance; beyond the last entry it stays constant.
     """
     width = np.asarray(width, np.float64)
-    own = table.width**2 - table.spread**2
-    variance = width * width - np.interp(width, table.width, own)
+    of_pulse = table.width**2 - table.spread**2
+    variance = width * width - np.interp(width, table.width, of_pulse)
     return np.where(width > table.width[-1], np.nan, variance) if table.cut else variance
 
 
@@ -242,7 +242,21 @@ def spread_pulse(
 
 
 def direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
-    """Width of a curve of height 1 at `level`: between the crossings nearest to its peak, in the unit of `time`."""
+    """Width of a curve at a level, between the crossings nearest to its peak.
+
+    Parameters
+    ----------
+    time : float64 (s,), ns
+        Abscissa.
+    curve : float64 (s,)
+        Of height 1.
+    level : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    float, ns
+    """
     begin, end = lobe_edges(time, curve, level)
     return float(end - begin)
 

@@ -52,5 +52,19 @@ def receive_power(
 
 
 def spread_cross_section(reflectance: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
-    """Cross section [m2] of a diffuse surface that fills the footprint: 4 rho pi R^2 beta^2 / 4."""
+    """Cross section of a diffuse surface that fills the footprint: 4 rho pi R^2 beta^2 / 4.
+
+    Parameters
+    ----------
+    reflectance : float
+        rho.
+    distance : float (m,), m
+        R, from the sensor.
+    divergence : float, rad
+        Full angle beta of the beam.
+
+    Returns
+    -------
+    float64 (m,), m2
+    """
     return 4.0 * reflectance * np.pi * (distance * divergence) ** 2 / 4.0

@@ -1,7 +1,7 @@
 """From amplitude and width to backscatter: calibration, cross section, reflectance and their errors.
 
 Used by the stages attribute.cross_section and others and by the calibration (docs/algorithms.md 5). Everything is
-float64, because the range enters with its fourth power (H13). Unknown inputs are NaN and give NaN.
+float64, because the range enters with its fourth power (docs/algorithms.md H13). Unknown inputs are NaN and give NaN.
 """
 
 from __future__ import annotations

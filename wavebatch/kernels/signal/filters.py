@@ -54,9 +54,7 @@ def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
     """
     s = len(signal)
     total = np.float32(taps[0]) * signal
-    for i, tap in enumerate(taps[1:], start=1):
-        if i >= s:
-            break
+    for i, tap in enumerate(taps[1:s], start=1):
         part = np.float32(tap) * signal
         total[i:] += part[:-i]
         total[:-i] += part[i:]

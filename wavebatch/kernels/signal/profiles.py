@@ -96,7 +96,7 @@ def keep_signal(
     run = np.cumsum(starts) - 1
     number, owner = int(starts.sum()), row[starts]
     high = np.where(value > floor[row], value, 0.0)
-    # Sums sample after sample: the same whatever else is in the block.
+    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
     whole, kept = (np.bincount(run, part, minlength=number) for part in (value, high))
     good = (whole >= least[owner]) & (kept > 0)
     scale = np.where(good, whole / np.where(kept > 0, kept, 1.0), 0.0)

@@ -13,8 +13,8 @@ def list_samples(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.n
     """Run and position (waveform * s + sample) of every sample in runs, int64."""
     length = ends - starts
     run = np.repeat(np.arange(len(starts)), length)
-    behind = np.cumsum(length) - length
-    return run, np.arange(len(run)) - (behind - starts)[run]
+    before = np.cumsum(length) - length
+    return run, np.arange(len(run)) - (before - starts)[run]
 
 
 def highest_samples(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -63,7 +63,7 @@ def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tup
     weight = np.maximum(signal.reshape(-1)[sample * n + place // s], 0).astype(np.float64)
     middle = 0.5 * (starts + ends - 1) - starts // s * s
     lag = sample - middle[run]
-    # Sums sample after sample: the same whatever else is in the block.
+    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
     total, first, second = (np.bincount(run, weight * lag**p, minlength=len(starts)) for p in range(3))
     total = np.where(total > 0, total, 1.0)
     mean = first / total

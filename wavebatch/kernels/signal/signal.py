@@ -131,7 +131,21 @@ def widen(mask: np.ndarray, reach: int) -> np.ndarray:
 
 
 def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int) -> np.ndarray:
-    """Samples, bool (s, n), further than `reach` from every smoothed sample that leaves +-limit."""
+    """Samples far from any signal.
+
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    limit : float or float (n,), count
+        A smoothed sample beyond +-limit is signal.
+    reach : int, samples
+        Samples this near to signal are not quiet.
+
+    Returns
+    -------
+    bool (s, n)
+    """
     smoothed = smooth_121(signal)
     return ~widen(np.abs(smoothed) > limit, reach)
 
