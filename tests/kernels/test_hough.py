@@ -1,4 +1,4 @@
-"""Lines in images: position and angle to the acceptance of ALGORITHMS.md 1.3 (T8), segments, scan lines."""
+"""Lines in images: position and angle to the acceptance of docs/algorithms.md 1.3 (T8), segments, scan lines."""
 
 import numpy as np
 import pytest

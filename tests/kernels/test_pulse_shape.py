@@ -58,7 +58,7 @@ def test_samples_that_take_no_part_get_nothing(shape):
 
 @pytest.mark.parametrize("kappa", [1e-2, 1e-3, 1e-4, -1e-3])
 def test_skew_moves_a_gaussian_by_0_580_of_its_size(kappa):
-    """max |z^3| exp(-z^2/2) / 2 = 0.5797 at z = sqrt(3); the 0.548 of ALGORITHMS.md H4 is too small."""
+    """max |z^3| exp(-z^2/2) / 2 = 0.5797 at z = sqrt(3); the 0.548 of docs/algorithms.md H4 is too small."""
     z = np.arange(-6, 6, 0.01)
     skewed = evaluate(PulseShape(kappa=kappa), z, 0.0, 1.0)[0][:, 0]
     gauss = np.exp(-0.5 * z * z)

@@ -214,8 +214,7 @@ class EchoTable:
     @classmethod
     def empty(cls) -> EchoTable:
         """A table without echoes."""
-        none = np.empty(0)
-        return cls.build(none, none, none, none)
+        return cls.build(*np.empty((4, 0)))
 
     def take(self, rows: np.ndarray) -> EchoTable:
         """The echoes at `rows` (indices or mask), in that order."""
@@ -237,8 +236,7 @@ class EchoTable:
 
     def with_flags(self, flag: EchoFlag, where: np.ndarray) -> EchoTable:
         """A new table in which `flag` is also set for the echoes where `where`, bool (m,), is true."""
-        flags = self.flags | np.where(where, np.uint16(flag), np.uint16(0))
-        return replace(self, flags=flags.astype(np.uint16))
+        return replace(self, flags=self.flags | np.where(where, np.uint16(flag), np.uint16(0)))
 
     def count(self, n: int) -> np.ndarray:
         """Number of echoes in each of the n waveforms of a block, int64 (n,)."""

@@ -116,7 +116,15 @@ def cluster_candidates(
     last = np.r_[first[1:], len(waveform)] - 1
     outer_low = np.maximum(np.minimum(low[first] - margin, sample[first] - reach), 0)
     outer_high = np.minimum(np.maximum(furthest[last] + margin, sample[last] + 1 + reach), s)
-    _separate(outer_low, outer_high, waveform, sample, low, furthest, first, last)
+    # Windows of neighbours are cut half-way between their signals, or their candidates where the signals meet.
+    here, there = last[:-1], first[1:]
+    meet = waveform[here] == waveform[there]
+    apart = low[there] >= furthest[here]
+    middle = np.where(apart, low[there] + furthest[here], sample[there] + sample[here] + 1) // 2
+    middle = np.clip(middle, sample[here] + 1, np.maximum(sample[there], sample[here] + 1))
+    outer_low[1:] = np.where(meet, np.maximum(outer_low[1:], middle), outer_low[1:])
+    outer_high[:-1] = np.where(meet, np.minimum(outer_high[:-1], middle), outer_high[:-1])
+    np.minimum(outer_low, sample[first], out=outer_low)
     return Clusters(waveform[first], outer_low, outer_high, first, last - first + 1)
 
 
@@ -133,31 +141,8 @@ def _find_extents(
     return np.where(inside, starts[run] - base, sample), np.where(inside, ends[run] - base, sample + 1)
 
 
-def _separate(
-    outer_low: np.ndarray,
-    outer_high: np.ndarray,
-    waveform: np.ndarray,
-    sample: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    first: np.ndarray,
-    last: np.ndarray,
-) -> None:
-    """Cuts windows of neighbouring clusters half-way between their signals, or their candidates, in place."""
-    here, there = last[:-1], first[1:]
-    meet = waveform[here] == waveform[there]
-    apart = low[there] >= high[here]
-    middle = np.where(apart, low[there] + high[here], sample[there] + sample[here] + 1) // 2
-    middle = np.clip(middle, sample[here] + 1, np.maximum(sample[there], sample[here] + 1))
-    outer_low[1:] = np.where(meet, np.maximum(outer_low[1:], middle), outer_low[1:])
-    outer_high[:-1] = np.where(meet, np.minimum(outer_high[:-1], middle), outer_high[:-1])
-    np.minimum(outer_low, sample[first], out=outer_low)
-
-
 def _limit_joins(joined: np.ndarray, most: int) -> np.ndarray:
     """Joins (m - 1,) in which every run is cut after `most` members."""
-    if not len(joined):
-        return joined
     position = np.arange(1, len(joined) + 1)
     begin = np.maximum.accumulate(np.where(joined, 0, position))
     return joined & ((position - begin) % most != 0)

@@ -27,13 +27,10 @@ def find_pulses(gps_time: np.ndarray) -> np.ndarray:
     int64 (n,)
     """
     n = len(gps_time)
-    index = np.arange(n)
-    if not n:
-        return index
-    start = np.flatnonzero(np.append(True, gps_time[1:] != gps_time[:-1]))
+    start = np.flatnonzero(np.append(True, gps_time[1:] != gps_time[:-1])[:n])
     length = np.diff(np.append(start, n))
     alone = np.repeat((length >= LONGEST_PULSE) | (gps_time[start] == 0), length)
-    return np.where(alone, index, np.repeat(start, length))
+    return np.where(alone, np.arange(n), np.repeat(start, length))
 
 
 def find_nearest(
@@ -114,12 +111,9 @@ def number_returns(
         False for pulses of which no point has a ray: their numbers mean nothing.
     """
     m = len(pulse)
-    if not m:
-        none = np.empty(0, np.int64)
-        return none, none, np.empty(0, bool)
     has_ray = np.any(direction != 0, axis=1)
     grouped = np.lexsort((~has_ray, pulse))
-    is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])
+    is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])[:m]
     group = np.empty(m, np.int64)
     group[grouped] = np.cumsum(is_first) - 1
     head = grouped[is_first][group]

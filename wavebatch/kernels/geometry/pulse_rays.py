@@ -31,10 +31,8 @@ def group_pulses(time: np.ndarray, number: np.ndarray) -> np.ndarray:
     -------
     int64 (k,)
     """
-    if not len(time):
-        return np.empty(0, np.int64)
     new = (time[1:] != time[:-1]) | (number[1:] <= number[:-1])
-    return np.concatenate([[0], np.flatnonzero(new) + 1])
+    return np.flatnonzero(np.append(True, new)[: len(time)])
 
 
 def fit_rays(xyz: np.ndarray, starts: np.ndarray, angle: np.ndarray, source: np.ndarray) -> np.ndarray:
