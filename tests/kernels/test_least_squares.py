@@ -279,7 +279,7 @@ def test_hopeless_problems_are_given_up_and_others_are_not(rng):
     np.testing.assert_array_equal(fit.parameters[1::2], free.parameters[1::2])
 
 
-def test_too_few_iterations_are_told(rng):
+def test_too_few_iterations_are_reported(rng):
     truth = draw(rng, 10, 2, apart=3.0)
     start = truth.copy()
     start[:, 1] += 1.5

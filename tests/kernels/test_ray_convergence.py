@@ -1,4 +1,4 @@
-"""Sensor positions from rays: the table of docs/algorithms.md 5.1 (T19), flipped vectors, pairs, what cannot be known."""
+"""Sensor positions from rays: the table of docs/algorithms.md 5.1 (T19), flipped vectors, pairs, unknowns."""
 
 import numpy as np
 import pytest
