@@ -174,8 +174,8 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
     ("words", "code", "message"),
     [
         ("--packet 99999", 2, "there is no packet 99999; packets are 0 to"),
-        ("--packet 5:3", 2, "there is no packet 5:3"),
-        ("--packet x", 2, "neither a number nor FIRST:BEHIND"),
+        ("--packet 5:3", 2, "'5:3' is empty; END is the number after the last one"),
+        ("--packet x", 2, "neither a number nor FIRST:END"),
         (f"--packet 0:{MOST + 1}", 2, f"{MOST} fit"),
         ("--point 99999", 2, "there is no point 99999"),
         ("--gps-time 3", 2, "no pulse lies within"),
