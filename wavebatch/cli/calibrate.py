@@ -10,18 +10,8 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, talk
-from wavebatch.cli.options import (
-    common_options,
-    direction_option,
-    file_option,
-    output_option,
-    read_sensor,
-    read_system,
-    sensor_options,
-    strip_argument,
-    system_option,
-)
 
 LEAST_DOUBT = 0.03
 """Smallest relative error that a target is credited with: constants of targets that differ by more than six times
@@ -29,20 +19,20 @@ this, or six times the stated error, give a note."""
 
 
 @click.command()
-@strip_argument
-@file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV with "
-             "reflectance and x, y, radius or vertices.")
-@output_option("Calibration file to write.", "CAL.toml")
+@shared.strip_argument
+@shared.file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV "
+                    "with reflectance and x, y, radius or vertices.")
+@shared.output_option("Calibration file to write.", "CAL.toml")
 @click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
               help="Relative standard deviation of the reflectances of the targets.")
 @click.option("--attenuation", type=click.FloatRange(0.0, 100.0), default=0.22, show_default=True, metavar="DB/KM",
               help="Attenuation of the air, one way [dB/km].")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
-@system_option
-@sensor_options
-@direction_option
-@common_options("overwrite")
+@shared.system_option
+@shared.sensor_options
+@shared.direction_option
+@shared.common_options("overwrite")
 def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **options: Any) -> None:
     """Find the calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
 
@@ -57,10 +47,10 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
     from wavebatch.surveying.system_file import write_text
     from wavebatch.surveying.targets import calibrate_strip, load_targets
 
-    sensor = read_sensor(options)
+    sensor = shared.read_sensor(options)
     if not overwrite:
         refuse_existing(output)
-    loaded, saved = load_targets(targets), read_system(options)
+    loaded, saved = load_targets(targets), shared.read_system(options)
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
     found = calibrate_strip(strip, loaded, sensor=sensor, system=saved.survey.system if saved else None, **figures)

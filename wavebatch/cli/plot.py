@@ -12,24 +12,12 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, talk
-from wavebatch.cli.options import (
-    chain_options,
-    clouds_argument,
-    common_options,
-    from_options,
-    output_option,
-    parse_floats,
-    parse_span,
-    strip_argument,
-    strip_options,
-    system_option,
-    together,
-)
 from wavebatch.core.errors import ConfigError
 
-_output = output_option("Picture to write: .png, .svg or .pdf.")
-_flags = together(
+_output = shared.output_option("Picture to write: .png, .svg or .pdf.")
+_flags = shared.together(
     click.option("--flags-with", multiple=True, metavar="NAMES",
                  help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
     click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
@@ -39,10 +27,14 @@ _flags = together(
 def _read_range(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
-    low, high = parse_floats(text, "LOW:HIGH")
+    low, high = shared.parse_floats(text, "LOW:HIGH")
     if not low < high or high - low == float("inf"):
         raise click.BadParameter(f"{text!r} does not go up from one finite number to another")
     return low, high
+
+
+def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
 
 
 @click.group(cls=NearestGroup)
@@ -54,10 +46,10 @@ def plot() -> None:
 
 
 @plot.command()
-@strip_argument
+@shared.strip_argument
 @_output
 @click.option("--packet", "packets", multiple=True, metavar="N|FIRST:END",
-              callback=lambda context, parameter, texts: tuple(map(parse_span, texts)),
+              callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
               help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
               "over the strip]")
 @click.option("--point", "points", multiple=True, type=int, metavar="N",
@@ -70,10 +62,10 @@ def plot() -> None:
               help="Most waveforms of --flags-with or of the default.")
 @click.option("--times", "shown", callback=_read_range, metavar="LOW:HIGH",
               help="Part of the waveforms to show [ns].  [default: all]")
-@chain_options
-@system_option
-@strip_options
-@common_options("overwrite", "quiet")
+@shared.chain_options
+@shared.system_option
+@shared.strip_options
+@shared.common_options("overwrite", "quiet")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
     """Draw waveforms of STRIP with their fit, residual and echoes.
 
@@ -89,7 +81,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
     check_picture(output, overwrite=options["overwrite"])
-    wanted = from_options(Wanted, options, flags=read_flags(options["flags_with"]))
+    wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
     views, chain = _view(strip, wanted, options)
     from wavebatch.tools.plots.draw_waveform import draw_waveforms
 
@@ -118,7 +110,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 
 
 @plot.command()
-@clouds_argument
+@shared.clouds_argument
 @_output
 @click.option("--column", required=True, help="Extra dimension or standard field; echo_flags counts flags.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
@@ -127,7 +119,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @_flags
-@common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "quiet")
 def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
     """Draw a histogram of a column of CLOUDs of any size.
 
@@ -175,16 +167,16 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 
 @plot.command(name="map")
-@clouds_argument
+@shared.clouds_argument
 @_output
 @click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
-@click.option("--bounds", metavar="W,S,E,N", help="Part to show: west, south, east, north [m].  [default: all]",
-              callback=lambda context, parameter, text: parse_floats(text, "WEST,SOUTH,EAST,NORTH") if text else None)
+@click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
+              help="Part to show: west, south, east, north [m].  [default: all]")
 @_flags
-@common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
 

@@ -7,6 +7,7 @@ Only reads and checks options, starts the batch and turns its result into an exi
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from dataclasses import replace
@@ -33,24 +34,15 @@ EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
-class Size(click.ParamType):
-    """Bytes, as 800M, 2G or a plain number."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The number of bytes."""
-        if isinstance(value, int):
-            return value
-        text = str(value).strip().upper().removesuffix("IB").removesuffix("B")
-        number, unit = (text[:-1], text[-1]) if text and text[-1] in "KMGT" else (text, "")
-        try:
-            size = float(number) * _UNITS[unit]
-            if size > 0:
-                return int(size)
-        except (ValueError, OverflowError):
-            pass
-        return self.fail(f"{value!r} is not a size such as 800M or 2G", param, ctx)
+def _read_size(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
+    """Bytes from `800M`, `2G` or a plain number."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([KMGT]?)(I?B)?", text.strip().upper())
+    size = int(float(found[1]) * _UNITS[found[2]]) if found else 0
+    if not size:
+        raise click.BadParameter(f"{text!r} is not a size such as 800M or 2G")
+    return size
 
 
 @click.command()
@@ -80,7 +72,7 @@ class Size(click.ParamType):
 @click.option("--scheduler", metavar="ADDRESS",
               help="Use the workers of this dask cluster instead of --jobs, e.g. tcp://10.0.0.1:8786. They must see "
               "strips and DIR under the same paths, and have the same wavebatch.")
-@click.option("--memory", type=Size(), metavar="SIZE", help="Most memory of all processes together, e.g. 2G.")
+@click.option("--memory", callback=_read_size, metavar="SIZE", help="Most memory of all processes together, e.g. 2G.")
 @click.option("--block-size", type=click.IntRange(1), metavar="N",
               help="Waveforms processed at once. The result does not depend on it.  [default: by their length]")
 @click.option("--resume", is_flag=True, help="Skip strips whose output is complete and up to date; redo the others.")

@@ -12,16 +12,8 @@ from typing import Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_summary, talk
-from wavebatch.cli.options import (
-    common_options,
-    direction_option,
-    file_option,
-    from_options,
-    output_option,
-    parse_span,
-    strip_argument,
-)
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -33,10 +25,10 @@ _SURVEYED = 2000
 
 
 @click.command(name="slice")
-@strip_argument
-@output_option("Write the segments: .csv or .geojson.", required=False)
-@file_option("--png", text="Draw the first slice of --lines.")
-@click.option("--lines", callback=lambda context, parameter, text: parse_span(text) if text else (0, None),
+@shared.strip_argument
+@shared.output_option("Write the segments: .csv or .geojson.", required=False)
+@shared.file_option("--png", text="Draw the first slice of --lines.")
+@click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
               help="plane: slices are vertical planes; time: rows are pulses, columns times; flat surfaces bend.")
@@ -47,8 +39,8 @@ _SURVEYED = 2000
 @click.option("--shortest", default=20.0, show_default=True, metavar="PIXELS",
               help="Least length of a segment [pixels of one sample].")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
-@direction_option
-@common_options("overwrite", "json", "quiet")
+@shared.direction_option
+@shared.common_options("overwrite", "json", "quiet")
 def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png: Path | None, **options: Any) -> None:
     """Find the straight surface lines in the scan lines of STRIP.
 
@@ -66,7 +58,7 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
         sigma = options["sigma"]
         if sigma is None:
             sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
-        settings = from_options(SliceOptions, options, sigma=sigma)
+        settings = shared.from_options(SliceOptions, options, sigma=sigma)
         counts = _find(reader, scan, settings, output, lines, png, options["overwrite"])
     if not counts["lines"]:
         talk(f"{strip}: has no scan line with a number in --lines")

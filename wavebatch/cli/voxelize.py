@@ -11,20 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, counting, print_summary
-from wavebatch.cli.options import (
-    calibration_option,
-    common_options,
-    from_options,
-    output_option,
-    read_calibration,
-    read_sensor,
-    read_system,
-    sensor_options,
-    strip_argument,
-    strip_options,
-    system_option,
-)
 
 if TYPE_CHECKING:
     from wavebatch.tools.voxels import VoxelSummary
@@ -33,8 +21,8 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 
 
 @click.command()
-@strip_argument
-@output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each.")
+@shared.strip_argument
+@shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each.")
 @click.option("--size", required=True, type=float, metavar="M",
               help="Edge of a voxel [m]; the faces of voxels lie at multiples of it.")
 @click.option("--method", type=click.Choice(["richardson_lucy", "gold", "wiener"]), default="richardson_lucy",
@@ -49,11 +37,11 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
               help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
               "from the highest return near it]")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
-@system_option
-@calibration_option
-@sensor_options
-@strip_options
-@common_options("overwrite", "json", "quiet")
+@shared.system_option
+@shared.calibration_option
+@shared.sensor_options
+@shared.strip_options
+@shared.common_options("overwrite", "json", "quiet")
 def voxelize(strip: Path, output: Path, **options: Any) -> None:
     """Deconvolve the waveforms of STRIP and sum them in the voxels of a 3D grid.
 
@@ -79,8 +67,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.tools.voxels import Deconvolution, VoxelOptions, voxelize_strip
 
     _check_options(options)
-    sensor = read_sensor(options)
-    settings = from_options(VoxelOptions, options, deconvolution=from_options(Deconvolution, options))
+    sensor = shared.read_sensor(options)
+    settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
     with counting("waveforms", options["quiet"]) as bar:
 
         def show(done: int, total: int) -> None:
@@ -91,8 +79,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
             strip,
             output,
             settings,
-            system=read_system(options),
-            calibration=read_calibration(options),
+            system=shared.read_system(options),
+            calibration=shared.read_calibration(options),
             sensor=sensor,
             progress=show,
             **{name: options[name] for name in ("direction", "headerless", "overwrite")},

@@ -39,11 +39,9 @@ class Breakdown:
         self._count("intensity", _octave(rows["intensity"]), alone)
         if others is not None:
             self._count("pulse", (others > 0).astype(np.int64), alone)
-        for place, flag in enumerate(EchoFlag):
-            has = (rows["flags"] & np.uint16(flag)) != 0
+        flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
+        for place, has in enumerate(flags):
             self._count("flag", np.full(int(has.sum()), place), alone[has])
-        none = rows["flags"] == 0
-        self._count("flag", np.full(int(none.sum()), len(EchoFlag)), alone[none])
 
     def _count(self, kind: str, code: np.ndarray, alone: np.ndarray) -> None:
         tally = self._tallies[kind]

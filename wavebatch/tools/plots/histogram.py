@@ -19,7 +19,6 @@ from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
 
-MOST_BINS = 10_000
 FEWEST, MOST_CHOSEN = 20, 120
 """Least and largest number of bins that are chosen if the user gives none."""
 
@@ -86,9 +85,8 @@ def count_values(
     bins: number of bins, by default from the rule of Freedman and Diaconis; a column with a fixed step gets at most as
     many, each a whole number of steps wide. limits: lowest and highest edge, by default all values but far outliers.
     each: one series per cloud instead of one for all.
-    Raises InputError without any value, ConfigError for wrong bins or limits.
+    Raises InputError without any value, ConfigError for a column of flags.
     """
-    _check(bins, limits)
     clouds = Clouds(paths, selection)
     if clouds.facts.is_flags:
         raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
@@ -112,13 +110,6 @@ def count_values(
     percentiles = [np.percentile(values, PERCENTILES) if len(values) else np.full(3, np.nan) for values in kept]
     names = tuple(path.name for path in paths) if each or len(paths) == 1 else (f"{len(paths)} clouds",)
     return Histogram(clouds.facts, names, edges, counts, below, above, tuple(tallies), np.stack(percentiles))
-
-
-def _check(bins: int | None, limits: tuple[float, float] | None) -> None:
-    if bins is not None and not 1 <= bins <= MOST_BINS:
-        raise ConfigError(f"bins must lie between 1 and {MOST_BINS}, got {bins}")
-    if limits is not None and not (math.isfinite(limits[1] - limits[0]) and limits[0] < limits[1]):
-        raise ConfigError(f"a range must go up from one finite number to another, got {limits[0]:g}:{limits[1]:g}")
 
 
 def _count(clouds: Clouds, edges: np.ndarray, number: int, each: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -57,8 +57,6 @@ class WaveformView:
     """The k echoes of this waveform."""
     returns: np.ndarray
     """Times of the returns of the input [ns], f8 (r,)."""
-    return_points: np.ndarray
-    """Indices of their points, i8 (r,)."""
 
     @property
     def spacing(self) -> float:
@@ -107,14 +105,11 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
             pulses = _place_pulses(shape, table, system, block.spacing)
             curves = pulses(fine)
             residual = _residual(samples - baseline, pulses(time).sum(axis=0), clipped, std, system.noise_gain)
-        returns = (np.empty(0), np.empty(0, np.int64))
-        if block.returns is not None:
-            near = np.flatnonzero(block.returns.waveform == row)
-            returns = (block.returns.time[near], block.returns.point[near])
+        returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
-                fine, curves, residual, table, *returns,
+                fine, curves, residual, table, returns,
             )  # fmt: skip
         )
     return views
