@@ -99,8 +99,8 @@ def test_resume_makes_anew_what_another_request_asked_for(strips, saved, tmp_pat
     assert other.read_text() != text
     for options in ([], ["--system", saved], ["--system", other], ["--profile", "accurate"], ["--tolerance", "1m"]):
         run = [strip, "-o", tmp_path / "out", "--resume", *options]
-        assert "is there already" not in _run(*run).stderr
-        assert "is there already" in _run(*run).stderr
+        assert "is up to date, skipped" not in _run(*run).stderr
+        assert "is up to date, skipped" in _run(*run).stderr
 
 
 @pytest.mark.parametrize(

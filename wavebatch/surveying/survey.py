@@ -12,7 +12,7 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.flat_ground import HALF_NORMAL
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
 from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
@@ -205,7 +205,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:
         return 0.0
     lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
-    excess = np.median(lack**2) / HALF_NORMAL - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
+    excess = np.median(lack**2) / SQUARED_NORMAL_MEDIAN - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
     return float(np.sqrt(max(excess, 0.0)))
 
 
