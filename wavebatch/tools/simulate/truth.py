@@ -1,4 +1,7 @@
-"""The truth of a strip as a .npz: columns spooled to disk while the strip is made, read back in pieces."""
+"""The truth file of a simulated strip: a .npz with one array per column, written and read in pieces.
+
+`strip.simulate_strip` writes it, `wavebatch compare` and the tests read it. Columns and their types are declared here.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ ECHO_COLUMNS: dict[str, str] = {
 }
 """Per true echo, in file order: packet number, byte offset of its packet, GPS time of its pulse [s], time after
 sample 0 [ns], amplitude [count], sigma [ns], position [m], angle to the ground's normal [deg], sensor to echo [m],
-EchoFlag bits, whether the closed bounds hold for it, whether a neighbour overlaps it."""
+EchoFlag bits, whether it is isolated, whether a neighbour overlaps it."""
 
 PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time": "<f8"}
 """Per packet, in file order, those without an echo too."""
@@ -43,19 +46,19 @@ _PIECE = 1 << 18
 class TruthWriter(NpzWriter):
     """Takes columns block by block and writes them as one .npz on `publish`; memory does not grow with their length.
 
-    Each `add` gives every column of a kind the same length. Raises InputError where it cannot write.
+    Raises InputError where it cannot write.
     """
 
     def __init__(self, target: Path, *, overwrite: bool = False) -> None:
         super().__init__(target, {**ECHO_COLUMNS, **PACKET_COLUMNS}, overwrite=overwrite)
 
     def publish(self, meta: Mapping[str, Any]) -> None:
-        """Writes the .npz and gives it its name; meta: plain values, kept as JSON in the array `meta`."""
+        """Writes and publishes the .npz; meta: plain values, stored as JSON in the array `meta`."""
         super().publish({_META: json.dumps(meta, sort_keys=True)})
 
 
 class TruthReader:
-    """The truth file of a simulated strip; columns are read in pieces. Raises InputError when it is none."""
+    """Reads a truth file; raises InputError when `path` is none."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
