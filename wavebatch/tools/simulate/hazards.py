@@ -1,6 +1,6 @@
 """Hazards: ways to draw echoes that break careless decomposers (docs/algorithms.md 3).
 
-Scene `stiff` mixes them, scene `stiff.<name>` holds one. tools.bench.hazards uses some of them at stated values.
+Scene `stiff` mixes them, scene `stiff.<name>` holds one. tools.bench.cases uses some of them at stated values.
 """
 
 from __future__ import annotations

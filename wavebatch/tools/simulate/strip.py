@@ -17,7 +17,8 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.cloud.return_io import FORMATS, ReturnWriter
+from wavebatch.files.cloud.return_io import ReturnWriter
+from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
 from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
@@ -163,7 +164,7 @@ def simulate_returns(
     summary = ReturnSummary()
     with ReturnWriter(
         target,
-        point_format=FORMATS[options.point_format],
+        point_format=WITHOUT_WAVES[options.point_format],
         scales=(options.scale,) * 3,
         offsets=(EAST, NORTH, 0.0),
         wkt=WKT,
