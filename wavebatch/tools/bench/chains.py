@@ -1,6 +1,6 @@
 """The chains of a benchmark: the shipped ones, those of the user, one per method, and `auto`.
 
-`auto` is the chain that a survey chooses, so the set of chains is made anew for every surveyed strip. `command` and
+`auto` is the chain that a survey chooses, so the set of chains is built for every surveyed strip. `command` and
 `stability` call this.
 """
 

@@ -134,7 +134,7 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
 
 
 def _pick_strongest(echoes: EchoTable) -> np.ndarray:
-    """Row of the strongest echo of every run of echoes that a discrete receiver cannot tell apart."""
+    """Row of the strongest echo of every run of echoes that a discrete receiver cannot separate."""
     if not len(echoes):
         return np.empty(0, np.int64)
     width = FWHM_PER_SIGMA * echoes.sigma
