@@ -42,10 +42,12 @@ class Table:
         if verdict == "FAIL":
             self.failures.append(name)
 
-    def near(self, name: str, ours: float, expected: float, *, within: float = 0.0, share: float = 0.0, **of) -> None:
-        """Adds a figure that may deviate from the expected one by `within` or by a relative `share`, the larger counts."""
+    def near(
+        self, name: str, ours: float, expected: float, *, within: float = 0.0, share: float = 0.0, **known
+    ) -> None:
+        """Adds a figure that may deviate from the expected one by `within`, or by `share` of it if that is more."""
         room = max(within, share * abs(expected))
-        self.add(name, ours, expected - room, expected + room, **(of or {"spec": expected}))
+        self.add(name, ours, expected - room, expected + room, **(known or {"spec": expected}))
 
     def _format(self, value: float | None) -> str:
         if value is None:

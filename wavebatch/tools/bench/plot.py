@@ -120,5 +120,5 @@ def _move(note: Any, place: tuple[float, float]) -> None:
 
 def _overlap(a: Any, b: Any) -> float:
     """Area that two boxes share [pixels]."""
-    width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
-    return width * height if width > 0 and height > 0 else 0.0
+    both = a.intersection(a, b)
+    return both.width * both.height if both else 0.0

@@ -22,15 +22,8 @@ from wavebatch.tools.bench.truth import smoothed_power
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.tools.simulate.draws import Drawn
 
-BENCH_SCENES: dict[str, str] = {
-    "mixed": "mixed",
-    "open": "urban",
-    "forest": "forest",
-    "empty": "empty",
-    "flat": "flat",
-    "stiff": "stiff",
-}
-"""Scene of tools.simulate by its name in the benchmark; any other scene can be named too."""
+OTHER_NAMES = {"open": "urban"}
+"""Scenes of tools.simulate with another name in the benchmark."""
 
 LEAST_WAVEFORMS = 200
 """Least waveforms of a strip whose echoes can be resampled."""
@@ -44,7 +37,7 @@ STRONG = 20.0
 
 def find_bench_scene(name: str) -> Scene:
     """The scene of that name; raises ConfigError with the nearest name when there is none."""
-    return replace(find_scene(BENCH_SCENES.get(name, name)), name=name)
+    return replace(find_scene(OTHER_NAMES.get(name, name)), name=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

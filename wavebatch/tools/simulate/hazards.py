@@ -104,16 +104,11 @@ def draw_constant(rng: np.random.Generator, n: int, recording: Recording) -> Dra
 
 
 HAZARDS: dict[str, Draw] = {
-    "near": draw_near,
-    "saturated": draw_saturated,
-    "huge": draw_huge,
-    "ringing": draw_ringing,
-    "edge": draw_edge,
-    "tiny": draw_tiny,
-    "contrast": draw_contrast,
-    "broad": draw_broad,
-    "crowd": draw_crowd,
-    "constant": draw_constant,
+    draw.__name__.removeprefix("draw_"): draw
+    for draw in (
+        *(draw_near, draw_saturated, draw_huge, draw_ringing, draw_edge),
+        *(draw_tiny, draw_contrast, draw_broad, draw_crowd, draw_constant),
+    )
 }
 """Every hazard by name; scene `stiff` mixes them evenly, scene `stiff.<name>` holds one of them."""
 

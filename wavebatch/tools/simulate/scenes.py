@@ -96,11 +96,7 @@ def _light_surfaces(light: float, rays: Rays) -> np.ndarray:
     return light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
 
 
-def _scenes(*scenes: Scene) -> dict[str, Scene]:
-    return {scene.name: scene for scene in scenes}
-
-
-SCENES: dict[str, Scene] = _scenes(
+_SCENES = (
     Scene(
         "flat",
         "bare, level ground: one echo of the system's width in every waveform",
@@ -172,6 +168,8 @@ SCENES: dict[str, Scene] = _scenes(
         recording=Recording(n_samples=96),
     ),
 )
+
+SCENES: dict[str, Scene] = {scene.name: scene for scene in _SCENES}
 """Every scene by name."""
 
 
