@@ -10,9 +10,16 @@ from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.tools.bench.figures import SURVEY_SCATTER, Figure, median_range, root_mean_square, share
+from wavebatch.tools.bench.figures import (
+    SURVEY_SCATTER,
+    Figure,
+    choose_cheapest,
+    find_front,
+    median_range,
+    root_mean_square,
+    share,
+)
 from wavebatch.tools.bench.promises import format_promises, judge
-from wavebatch.tools.bench.rank_chains import choose_cheapest, find_front
 from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.tools.simulate.render import paint_echoes
