@@ -9,10 +9,10 @@ from enum import StrEnum
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
 from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
