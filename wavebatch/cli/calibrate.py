@@ -56,9 +56,19 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
     found = calibrate_strip(strip, loaded, sensor=sensor, system=saved.survey.system if saved else None, **figures)
     write_text(output, format_calibration(found), overwrite=overwrite)
     for target in found.targets:
+        result = "too few, left out"
+        if target.constant is not None:
+            numbers = f"constant {target.constant:.4g}, spread {100 * target.spread:.1f} %"
+            result = f"{numbers}, incidence {target.incidence_deg:.1f} deg"
+        talk(f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, {result}")
+    constants = [target.constant for target in found.targets if target.constant is not None]
     ratio = max(constants) / min(constants)
     # Channels may have different constants, so that their targets may differ too.
     if ratio > 1 + 6 * max(options["reflectance_error"], LEAST_DOUBT) and not found.channels:
         talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
     for channel in found.channels:
+        error, spread = 100 * channel.relative_error, 100 * channel.spread
+        numbers = f"constant {channel.constant:.4g} +- {error:.1f} %, spread {spread:.1f} %"
+        where = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
+        talk(f"{where}: {count(channel.echoes, 'echo')}, {numbers}")
     talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")

@@ -9,9 +9,8 @@ from enum import StrEnum
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
-from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
+from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
 from wavebatch.surveying.measure import (
@@ -259,10 +258,14 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
             f"variance grows by {system.noise_gain * strongest:.2f} DN2 up to {strongest:.0f} DN, "
             f"against {system.noise_std**2:.2f} DN2 without signal",
         ),
-        Decision(Part.WIDTH, width >= LEAST_WIDTH, f"the system pulse is {width:.2f} samples wide ({LEAST_WIDTH})"),
+        Decision(
+            Part.WIDTH,
+            width >= LEAST_PULSE_WIDTH,
+            f"the system pulse is {width:.2f} samples wide ({LEAST_PULSE_WIDTH})",
+        ),
         Decision(
             Part.ANGLE,
-            width >= LEAST_WIDTH and figures["system_width_share"] < 0.95,
+            width >= LEAST_PULSE_WIDTH and figures["system_width_share"] < 0.95,
             f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse",
         ),
     )
