@@ -1,7 +1,7 @@
 """What the documentation takes from the program itself when the site is built: commands, stages, the Python API.
 
 mkdocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A line `<!-- commands -->`, `<!-- stages -->`,
-`<!-- api -->` or `<!-- modules -->` of a page is replaced by what the function of that name returns.
+`<!-- api -->` or `<!-- modules ROOM -->` of a page is replaced by what the function of that name returns.
 """
 
 from __future__ import annotations
@@ -21,14 +21,11 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain import KINDS, STAGES
 from wavebatch.stages.chain_file import format_step
 
-ROOMS = ("core", "kernels", "stages", "surveying", "batch")
-"""Rooms whose public functions and classes the page of modules lists."""
-
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """The page with the generated parts in their places."""
     makers = {"commands": commands, "stages": stages, "api": api, "modules": modules}
-    return re.sub(r"(?m)^<!-- (\w+) -->$", lambda found: makers[found[1]](), markdown)
+    return re.sub(r"(?m)^<!-- (\w+)((?: \w+)*) -->$", lambda found: makers[found[1]](*found[2].split()), markdown)
 
 
 def commands() -> str:
@@ -49,7 +46,7 @@ def _command(command: click.Command, parent: click.Context, name: str, level: in
     yield _paragraphs(inspect.cleandoc(command.help or ""))
     rows = [record for option in command.params if (record := option.get_help_record(context))]
     lines = ["| option | what it does |", "|---|---|"]
-    lines += [f"| `{_cell(names)}` | {_cell(text)} |" for names, text in rows if "--help" not in names]
+    lines += [f"| `{_cell(names)}` | {_cell(_plain(text))} |" for names, text in rows if text and "--help" not in names]
     if len(lines) > 2:
         yield "\n".join(lines)
     if isinstance(command, click.Group):
@@ -109,16 +106,18 @@ def _prose(stage) -> list[str]:
     known = dict(zip(sections[1::2], sections[2::2], strict=True))
     names = "|".join(map(re.escape, stage.parameters)) or "(?!)"
     front = re.split(rf"(?m)^(?:{names}): ", sections[0])[0]
-    parts = [front, known.get("Notes", ""), known.get("References", "")]
+    sources = known.get("References", "").strip()
+    parts = [front, known.get("Notes", ""), f"Source: {sources}" if sources else ""]
     return [part.strip() for text in parts for part in re.split(r"\n\s*\n", text) if part.strip()]
 
 
 def _plain(text: str) -> str:
     """Text of a docstring as Markdown: characters that would be markup are kept as they are."""
     pieces = re.split(r"(`[^`]*`)", re.sub(r"\s+", " ", text.replace("``", "`")).strip())
-    return "".join(
+    plain = "".join(
         piece if piece.startswith("`") else re.sub(r"([*_\[\]<>#])", r"\\\1", piece) for piece in pieces
     )
+    return re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[docs/\1](\1)", plain)
 
 
 def api() -> str:
@@ -132,16 +131,12 @@ def api() -> str:
     return "\n\n".join(parts)
 
 
-def modules() -> str:
-    """Public functions and classes of the lower rooms, module by module."""
-    parts = []
-    for room in ROOMS:
-        package = import_module(f"wavebatch.{room}")
-        parts.append(f"## {room}")
-        for module in sorted(_modules(package)):
-            options = "    options: {show_root_full_path: true, show_root_toc_entry: true, heading_level: 3}"
-            parts.append(f"::: {module}\n{options}")
-    return "\n\n".join(parts)
+def modules(room: str) -> str:
+    """Public functions and classes of a room, module by module."""
+    # Links to public names lead to the page of the API: names that have two places would be a warning.
+    options = "    options: {show_root_full_path: true, heading_level: 2, skip_local_inventory: true}"
+    found = sorted(_modules(import_module(f"wavebatch.{room}")))
+    return "\n\n".join(f"::: {module}\n{options}" for module in found)
 
 
 def _modules(package) -> Iterator[str]:
