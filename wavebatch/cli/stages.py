@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, print_json, report_errors
+from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
 from wavebatch.cli.options import json_option
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
@@ -24,7 +23,10 @@ if TYPE_CHECKING:
 def stages(name: str | None, as_json: bool, debug: bool) -> None:
     """The algorithms that a chain is made of: all of them, or one with its parameters, source and a TOML example."""
     from wavebatch.stages.chain import KINDS, STAGES
+    from wavebatch.stages.plugins import load_plugins
 
+    for line in load_plugins() if name not in STAGES else ():
+        talk(f"warning: {line}")
     if name is not None and name not in STAGES:
         told = nearest(name, STAGES)
         raise ConfigError(f"no stage {name!r}; {told if '?' in told else '`wavebatch stages` lists them'}")
@@ -54,7 +56,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
     return {
         "name": stage.name,
         "kind": stage.kind,
-        "text": _prose(stage),
+        "text": stage.text,
         "makes": list(stage.makes),
         "needs": list(stage.needs),
         "parameters": {
@@ -68,14 +70,6 @@ def _describe(stage: Stage) -> dict[str, Any]:
         },
         "example": format_step(stage.name, defaults),
     }
-
-
-def _prose(stage: Stage) -> str:
-    """The docstring without the parameters."""
-    lines = (inspect.getdoc(stage.function) or "").splitlines()
-    heads = tuple(f"{name}:" for name in stage.parameters)
-    end = next((i for i, line in enumerate(lines) if heads and line.startswith(heads)), len(lines))
-    return "\n".join(lines[:end]).strip()
 
 
 def _explain(stage: Stage) -> str:

@@ -12,7 +12,8 @@ from typing import Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.stages.chain import STAGES, Chain, Parameter, Stage, Step
+from wavebatch.stages.chain import Chain, Parameter, Stage, Step
+from wavebatch.stages.plugins import find_stage
 
 _TYPE_WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", type(None): "nothing"}
 
@@ -84,11 +85,10 @@ def _read_step(table: Mapping[str, Any], where: str) -> Step:
     name = table["stage"]
     if not isinstance(name, str):
         raise ConfigError(f"{where}: stage must be a string, it is {name!r}")
-    if name not in STAGES:
-        raise ConfigError(f"{where}: unknown stage {name!r}; {nearest(name, STAGES)}")
+    found = find_stage(name, where)
     where = f"{where} ({name})"
     values = {key: value for key, value in table.items() if key != "stage"}
-    return Step(STAGES[name], {key: _read_value(STAGES[name], key, value, where) for key, value in values.items()})
+    return Step(found, {key: _read_value(found, key, value, where) for key, value in values.items()})
 
 
 def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:

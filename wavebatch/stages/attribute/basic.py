@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 
@@ -51,7 +52,11 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     """Deviation of each echo from the fitted pulse: sqrt(h3^2 + h4^2) of its residual, per unit of A/std sqrt(s/T).
 
     The Gauss-Hermite moments h3 (skew) and h4 (peakedness) of a right fit are standard normal, so that noise leaves
-    about 1.25 std/A sqrt(T/s) here; merged echoes and sloping targets leave more. Source: ALGORITHMS 4.2.
+    about 1.25 std/A sqrt(T/s) here; merged echoes and sloping targets leave more.
+
+    References
+    ----------
+    ALGORITHMS 4.2.
     """
     s, spacing = block.samples.shape[1], block.spacing
     time, sigma = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
@@ -104,15 +109,27 @@ def _read_several(
 
 @stage("attribute", makes=("x", "y", "z", "point", "range_err"))
 def position(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *, tolerance: float = 2.5
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    *,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 2.5,
 ) -> EchoTable:
     """Coordinates of each echo along its ray [m], relative to the returns of its packet; the return it is matched with.
 
     Return locations are offset from the fit by an amount that the returns of a packet share (the outgoing pulse's
     phase, a leading-edge detector): the offset is measured on the matched returns and taken off. Packets in which no
-    return is matched keep the raw location and are flagged. Source: LAS-WAVEFORMS 8.
+    return is matched keep the raw location and are flagged.
 
-    tolerance: largest distance in time between an echo and the return it is matched with [ns], beyond half a sample.
+    Parameters
+    ----------
+    tolerance : float
+        Largest distance in time between an echo and the return it is matched with [ns], beyond half a sample.
+
+    References
+    ----------
+    LAS-WAVEFORMS 8.
     """
     waveform = echoes.waveform
     offset = np.zeros(len(block))

@@ -66,7 +66,10 @@ def reflectance(
 
     gamma / (4 cos(alpha)): only a target that fills the beam has a reflectance.
 
-    surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
+    Parameters
+    ----------
+    surface : {"level", "echo", "facing"}
+        Where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
         none), or every surface taken as facing the sensor.
     """
     return _reflectance(block, echoes, "reflectance", _measure_light(block, system, echoes, 2), surface)
@@ -106,7 +109,10 @@ def relative_reflectance(
 
     R^2 A sigma / (4 cos(alpha) eta(R)): the reflectance without the constant C', for strips without calibration.
 
-    surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
+    Parameters
+    ----------
+    surface : {"level", "echo", "facing"}
+        Where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
         none), or every surface taken as facing the sensor.
     """
     light = _measure_light(block, _relative(system), echoes, 2)

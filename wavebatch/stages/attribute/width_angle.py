@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from wavebatch.kernels.physics.incidence import (
     spread_variance,
 )
 from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 LEAST_WIDTH = 0.85
@@ -48,9 +48,9 @@ def incidence_angle(
     echoes: EchoTable,
     *,
     mode: Literal["system", "pulse", "paper"] = "system",
-    divergence: float = 0.0,
-    max_error: float = 10.0,
-    reference_error: float = 0.003,
+    divergence: Annotated[float, Range(0.0, 100.0)] = 0.0,
+    max_error: Annotated[float, Range(1e-3, 180.0)] = 10.0,
+    reference_error: Annotated[float, Range(0.0, 1.0)] = 0.003,
     alone: bool = True,
 ) -> EchoTable:
     """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
@@ -59,19 +59,25 @@ def incidence_angle(
     samples, where sensor or divergence are not known, and where the angle is more uncertain than max_error: with a
     narrow beam and a long pulse that is everywhere. Rough ground and plants widen echoes too, and read as slopes.
     Echoes narrower than the system pulse have angle 0, and the flag NARROW where that is more than noise: three errors.
-    Source: Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
 
-    mode: system takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
+    Parameters
+    ----------
+    mode : {"system", "pulse", "paper"}
+        System takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
         file's sampling; paper the printed formulas, which read angles too high.
+    divergence : float
+        Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
+    max_error : float
+        Largest standard deviation of an angle that is written [deg]; an echo that is not wider than the system pulse by
+        four errors must meet it even if its surface faces the sensor, where angles are least certain.
+    reference_error : float
+        Standard deviation of the system pulse's width, relative.
+    alone : bool
+        Only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
 
-    divergence: full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
-
-    max_error: largest standard deviation of an angle that is written [deg]; an echo that is not wider than the system
-        pulse by four errors must meet it even if its surface faces the sensor, where angles are least certain.
-
-    reference_error: standard deviation of the system pulse's width, relative.
-
-    alone: only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
+    References
+    ----------
+    Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
     """
     beam = divergence or system.divergence
     short = system.sigma_ref < LEAST_WIDTH * block.spacing

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import WidthPrior
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
 from wavebatch.kernels.signal.signal import smooth_121, transpose_samples
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
@@ -56,18 +57,27 @@ def closed_form(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    fraction: float = 0.2,
-    steps: int = 2,
-    significance: float = 5.0,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.2,
+    steps: Annotated[int, Range(0, 100)] = 2,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A Gaussian for every candidate on its own: a closed form and a few Gauss-Newton steps.
 
     At the Cramer-Rao bound for isolated echoes; overlapping echoes are cut apart half-way between them and therefore
-    biased. Source: Guo (2011); ALGORITHMS 4.1.
+    biased.
 
-    fraction: samples of at least this share of the peak enter the closed form.
-    steps: Gauss-Newton steps after it.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    fraction : float
+        Samples of at least this share of the peak enter the closed form.
+    steps : int
+        Gauss-Newton steps after it.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Guo (2011); ALGORITHMS 4.1.
     """
     start = _start_closed_form(block, noise, system, echoes, fraction)
     settings = make_settings(block, system, GAUSSIAN, tolerance=0.1, max_iterations=steps + 1, grow=False)
@@ -81,19 +91,27 @@ def gaussian(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
     Batched Levenberg-Marquardt; widths within 0.7 and 4 system widths, times within the window; no echo is added.
-    Source: Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
-        standard deviation of the minimum.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a standard
+        deviation of the minimum.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
     """
     settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
@@ -106,31 +124,45 @@ def adaptive(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    acceptance: float = 0.0,
-    max_echoes: int = 6,
-    gate_residual: float = 4.2,
-    gate_hermite: float = 8.5,
-    width_prior: float = 0.1,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
+    acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
+    max_echoes: Annotated[int, Range(1, 1000)] = 6,
+    gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
+    gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
+    width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
 
     Each cluster of candidates is fitted with the strip's pulse. Where the smoothed residual or its Gauss-Hermite
     moments leave the range of noise, a score test places one more echo, and the fit with it is kept if chi2 falls
-    enough and the echoes can be told apart. Source: ALGORITHMS 2.3, 4.2, H1, H3.
+    enough and the echoes can be told apart.
 
-    acceptance: least fall of chi2 for which an echo is added; 0 takes the strip's own from the survey.
-    max_echoes: echoes per cluster up to which a fit grows.
-    gate_residual: largest smoothed residual of a complete fit, in standard deviations.
-    gate_hermite: largest h3^2 + h4^2 of a complete fit.
-    width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths;
-        0 for no prior.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
-        standard deviation of the minimum.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    acceptance : float
+        Least fall of chi2 for which an echo is added; 0 takes the strip's own from the survey.
+    max_echoes : int
+        Echoes per cluster up to which a fit grows.
+    gate_residual : float
+        Largest smoothed residual of a complete fit, in standard deviations.
+    gate_hermite : float
+        Largest h3^2 + h4^2 of a complete fit.
+    width_prior : float
+        How far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths; 0 for no
+        prior.
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a standard
+        deviation of the minimum.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    ALGORITHMS 2.3, 4.2, H1, H3.
     """
     shape = pulse_shape(system, block.spacing)
     ref = shape_limits(system, block.spacing).ref

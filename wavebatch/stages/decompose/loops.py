@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from wavebatch.kernels.fit.cluster import estimate_starts, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.signal import smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.detect.correlation import asdf
@@ -28,20 +28,29 @@ def residual_loop(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    t_diff: float = 4.0,
-    max_echoes: int = 6,
-    max_iterations: int = 40,
-    significance: float = 5.0,
+    t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    max_echoes: Annotated[int, Range(1, 1000)] = 6,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """Gaussians, one more at the largest residual of the waveform as long as that exceeds a threshold.
 
-    Nothing proves the added echoes but their residual: on pulses that are not Gaussian they are many. Source: Wang,
-    Wang and Tseng; ALGORITHMS 1.2.
+    Nothing proves the added echoes but their residual: on pulses that are not Gaussian they are many.
 
-    t_diff: largest residual that is left alone, in standard deviations of the noise.
-    max_echoes: echoes per waveform up to which they are added.
-    max_iterations: of each fit, after which an echo is flagged as not converged.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    t_diff : float
+        Largest residual that is left alone, in standard deviations of the noise.
+    max_echoes : int
+        Echoes per waveform up to which they are added.
+    max_iterations : int
+        Of each fit, after which an echo is flagged as not converged.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Wang, Wang and Tseng; ALGORITHMS 1.2.
     """
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
@@ -106,18 +115,26 @@ def asdf_only(
     echoes: EchoTable,
     *,
     mode: Literal["shortcut", "mixed"] = "shortcut",
-    tolerance: float = 0.5,
-    threshold: float = 4.0,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
 ) -> EchoTable:
     """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where it is needed.
 
     Mixed: waveforms in which the chain's detector and the ASDF disagree in the number or the times of the echoes are
     fitted with Gaussians, from the detector's candidates. Errors without a fit are those expected of isolated echoes.
-    Source: Wagner et al. (2007); ALGORITHMS 1.1.
 
-    mode: `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
-    tolerance: largest distance in time of echoes that agree, in widths of the system pulse.
-    threshold: of the ASDF, in standard deviations of the filtered noise.
+    Parameters
+    ----------
+    mode : {"shortcut", "mixed"}
+        `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
+    tolerance : float
+        Largest distance in time of echoes that agree, in widths of the system pulse.
+    threshold : float
+        Of the ASDF, in standard deviations of the filtered noise.
+
+    References
+    ----------
+    Wagner et al. (2007); ALGORITHMS 1.1.
     """
     quick = _describe(block, noise, system, asdf(block, noise, system, threshold=threshold))
     if mode == "shortcut":

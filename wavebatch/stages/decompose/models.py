@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model, gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.fit import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
@@ -38,19 +38,29 @@ def skewed(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    kappa: float = 0.0,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
+    kappa: Annotated[float, Range(-1.0, 1.0)] = 0.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
 
-    The time is that of the peak. Source: Wang, Wang and Tseng eq. 2; ALGORITHMS 0, 1.2.
+    The time is that of the peak.
 
-    kappa: skew; 0 takes the strip's own from the survey.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    kappa : float
+        Skew; 0 takes the strip's own from the survey.
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Wang, Wang and Tseng eq. 2; ALGORITHMS 0, 1.2.
     """
     settings = _model_settings(block, system, skewed_shape(system, kappa), max_iterations, tolerance)
     return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
@@ -71,21 +81,31 @@ def reference(
     *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
     pulse: str = "",
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
-    Time and amplitude are those of the pulse's peak, the width its full width at half maximum over 2.354820. Source:
-    ALGORITHMS R1; Mallet and Bretar (2009).
+    Time and amplitude are those of the pulse's peak, the width its full width at half maximum over 2.354820.
 
-    model: `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in
-        time, `given` for the pulse below, stretched.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    model : {"broadened", "stretched", "given"}
+        `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in time,
+        `given` for the pulse below, stretched.
+    pulse : str
+        Samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    ALGORITHMS R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
     settings = _model_settings(block, system, shape, max_iterations, tolerance)
@@ -124,18 +144,27 @@ def generalized_gaussian(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A sum of generalized Gaussians exp(-|z|^p / 2) whose exponent each cluster of echoes chooses for itself.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
-    width at half maximum over 2.354820. Source: Chauve et al. (2007), eq. 4.
+    width at half maximum over 2.354820.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Chauve et al. (2007), eq. 4.
     """
     plain = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
     candidates, clusters = find_clusters(block, noise, system, echoes, plain, MOST_JOINED)
@@ -172,17 +201,26 @@ def gauss_newton(
     system: SystemPulse,
     echoes: EchoTable,
     *,
-    max_iterations: int = 20,
-    tolerance: float = 0.01,
-    significance: float = 5.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 20,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
     """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts further off than one sigma are lost.
 
-    A fit that is lost gives its start back, flagged as not converged. Source: Jutzi and Stilla (2005); ALGORITHMS 1.3.
+    A fit that is lost gives its start back, flagged as not converged.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    max_iterations : int
+        After which an echo is flagged as not converged.
+    tolerance : float
+        Fall of chi2 that the last step, which is taken, may promise.
+    significance : float
+        Least energy of an echo, in standard deviations of the noise's.
+
+    References
+    ----------
+    Jutzi and Stilla (2005); ALGORITHMS 1.3.
     """
     settings = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, MOST_JOINED)
@@ -201,12 +239,7 @@ def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
 
 
 def _solve_undamped(
-    block: WaveformBlock,
-    noise: Noise,
-    candidates: Candidates,
-    clusters: Clusters,
-    rows: np.ndarray,
-    settings: Settings,
+    block: WaveformBlock, noise: Noise, candidates: Candidates, clusters: Clusters, rows: np.ndarray, settings: Settings
 ) -> Solution:
     low, high = clusters.low[rows], clusters.high[rows]
     length = min(-(-int((high - low).max()) // 8) * 8, block.samples.shape[1])

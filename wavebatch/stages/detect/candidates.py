@@ -46,9 +46,5 @@ def candidate_table(
     ref = system.sigma_ref / block.spacing
     last = block.samples.shape[1] - 1
     return make_table(
-        block,
-        waveform,
-        np.clip(time, 0.0, last),
-        np.maximum(amplitude, 0.0),
-        np.clip(width, 0.7 * ref, 4.0 * ref),
+        block, waveform, np.clip(time, 0.0, last), np.maximum(amplitude, 0.0), np.clip(width, 0.7 * ref, 4.0 * ref)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from wavebatch.kernels.signal.filters import (
 )
 from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 
 
@@ -31,15 +31,28 @@ def _smoothed_width(ref: float) -> float:
 
 @stage("detect")
 def threshold(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 4.0, correct_walk: bool = True
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    *,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+    correct_walk: bool = True,
 ) -> EchoTable:
     """One echo per run of smoothed signal above a level, timed at its leading edge.
 
-    The leading edge comes earlier the stronger the echo is. Source: Wagner et al. (2007), section 3.
+    The leading edge comes earlier the stronger the echo is.
 
-    level: of the trigger, in standard deviations of the smoothed noise.
-    correct_walk: add the time that an echo of this amplitude and the system's width takes from the level to its peak;
-        without it, times are those of the edge itself.
+    Parameters
+    ----------
+    level : float
+        Of the trigger, in standard deviations of the smoothed noise.
+    correct_walk : bool
+        Add the time that an echo of this amplitude and the system's width takes from the level to its peak; without it,
+        times are those of the edge itself.
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     smoothed = smooth_121(signal_above(block, noise))
     s, n = smoothed.shape
@@ -63,15 +76,27 @@ def threshold(
 
 @stage("detect")
 def sustained_threshold(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 3.0, duration: float = 1.0
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    *,
+    level: Annotated[float, Range(0.1, 1e6)] = 3.0,
+    duration: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> EchoTable:
     """One echo per run of samples above a level that lasts as long as the system pulse, at its highest sample.
 
     Finds half of the echoes of 5.5 standard deviations and all of 10; no false echo in 20,000 waveforms of noise.
-    Source: Jutzi and Stilla (2005); ALGORITHMS 1.3.
 
-    level: that every sample of the run exceeds, in standard deviations of the noise.
-    duration: least length of the run, in full widths at half maximum of the system pulse.
+    Parameters
+    ----------
+    level : float
+        That every sample of the run exceeds, in standard deviations of the noise.
+    duration : float
+        Least length of the run, in full widths at half maximum of the system pulse.
+
+    References
+    ----------
+    Jutzi and Stilla (2005); ALGORITHMS 1.3.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -87,13 +112,22 @@ def sustained_threshold(
 
 
 @stage("detect")
-def center_of_gravity(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 4.0) -> EchoTable:
+def center_of_gravity(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: Annotated[float, Range(0.1, 1e6)] = 4.0
+) -> EchoTable:
     """One echo per run of smoothed signal above a level, at the centre of gravity of its samples.
 
     Insensitive to noise and to the shape of the pulse; overlapping echoes become one between them. The width is the
-    standard deviation of the samples in time. Source: Wagner et al. (2007), section 3.
+    standard deviation of the samples in time.
 
-    level: that the run exceeds, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    level : float
+        That the run exceeds, in standard deviations of the smoothed noise.
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -107,15 +141,28 @@ def center_of_gravity(block: WaveformBlock, noise: Noise, system: SystemPulse, *
 
 @stage("detect")
 def constant_fraction(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, fraction: float = 0.5, level: float = 4.0
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    *,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.5,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
 ) -> EchoTable:
     """An echo per local maximum, timed where its leading edge reaches a fraction of its height.
 
     The time does not depend on the amplitude; the lead of the edge of a system pulse is added, so that times are those
-    of the peak. Source: Wagner et al. (2007), section 3.
+    of the peak.
 
-    fraction: of the height, above 0 and below 1.
-    level: least height above the baseline, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    fraction : float
+        Of the height, above 0 and below 1.
+    level : float
+        Least height above the baseline, in standard deviations of the smoothed noise.
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     if not 0 < fraction < 1:
         raise ConfigError(f"fraction must lie between 0 and 1, got {fraction}")
@@ -139,17 +186,26 @@ def zero_crossing(
     system: SystemPulse,
     *,
     derivative: Literal["first", "second"] = "first",
-    level: float = 4.0,
-    scale: float = 0.5,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.5,
 ) -> EchoTable:
     """Echoes where the first derivative falls through zero, or between two zeros of the second.
 
     The zeros of the second derivative are the inflection points: an echo lies half-way between the two, and its width
-    is half of their distance. Source: Wagner et al. (2007), section 3; Hofton et al. (2000).
+    is half of their distance.
 
-    derivative: of the waveform, `first` or `second`.
-    level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
-    scale: width of the Gaussian that the derivative is taken of, in widths of the system pulse.
+    Parameters
+    ----------
+    derivative : {"first", "second"}
+        Of the waveform, `first` or `second`.
+    level : float
+        Least height of the smoothed signal above the baseline, in standard deviations of its noise.
+    scale : float
+        Width of the Gaussian that the derivative is taken of, in widths of the system pulse.
+
+    References
+    ----------
+    Wagner et al. (2007), section 3; Hofton et al. (2000).
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from wavebatch.kernels.signal.square_differences import (
     slide_taps,
     square_differences,
 )
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse
 
@@ -47,21 +47,31 @@ def correlation(
     system: SystemPulse,
     *,
     reference: Literal["gaussian", "system", "given"] = "system",
-    threshold: float = 4.27,
-    similarity: float = 0.5,
-    reach: float = 3.0,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
+    similarity: Annotated[float, Range(0.0, 1.0)] = 0.5,
+    reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
 ) -> EchoTable:
     """Echoes at the maxima of the correlation with a reference pulse, where the waveform resembles it.
 
-    Sub-sample times by a parabola through the logarithms of three correlations. Source: Hofton and Blair (2002); Jutzi
-    and Stilla (2005); ALGORITHMS 1.3.
+    Sub-sample times by a parabola through the logarithms of three correlations.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    threshold: least correlation, in standard deviations of the filtered noise.
-    similarity: least correlation coefficient of waveform and reference, up to 1.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    threshold : float
+        Least correlation, in standard deviations of the filtered noise.
+    similarity : float
+        Least correlation coefficient of waveform and reference, up to 1.
+    reach : float
+        Half of the reference's length, in widths of the system pulse.
+    pulse : str
+        Samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+
+    References
+    ----------
+    Hofton and Blair (2002); Jutzi and Stilla (2005); ALGORITHMS 1.3.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     energy = float(np.sum(given.taps**2))
@@ -91,27 +101,39 @@ def asdf(
     *,
     reference: Literal["gaussian", "system", "given"] = "gaussian",
     rule: Literal["absolute", "paper"] = "absolute",
-    fraction: float = 0.3,
-    threshold: float = 4.0,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.3,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
     interpolation: Literal["log", "parabola"] = "log",
-    reach: float = 5.0,
+    reach: Annotated[float, Range(0.5, 20.0)] = 5.0,
     pulse: str = "",
 ) -> EchoTable:
     """Echoes at the minima of the average square difference to a reference pulse as high as the waveform.
 
     With the paper's rule, echoes below 30 % of the strongest are lost and noise alone has at least one echo; the
-    absolute rule asks for a minimum as deep as noise seldom makes it, at a maximum of the correlation. Source:
-    Wagner et al. (2007) eq. 6, 7; ALGORITHMS 1.1.
+    absolute rule asks for a minimum as deep as noise seldom makes it, at a maximum of the correlation.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    rule: `absolute` for a threshold in noise, `paper` for one relative to the waveform's largest and least difference.
-    fraction: of the range of differences that separates minima by the paper's rule.
-    threshold: of the absolute rule: least depth of a minimum and least correlation at it, in standard deviations of
-        the filtered noise.
-    interpolation: `log` for a parabola through the logarithms of the correlation, which has no bias for Gaussians;
-        `parabola` for the paper's, through the differences.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    rule : {"absolute", "paper"}
+        `absolute` for a threshold in noise, `paper` for one relative to the waveform's largest and least difference.
+    fraction : float
+        Of the range of differences that separates minima by the paper's rule.
+    threshold : float
+        Of the absolute rule: least depth of a minimum and least correlation at it, in standard deviations of the
+        filtered noise.
+    interpolation : {"log", "parabola"}
+        `log` for a parabola through the logarithms of the correlation, which has no bias for Gaussians; `parabola` for
+        the paper's, through the differences.
+    reach : float
+        Half of the reference's length, in widths of the system pulse.
+    pulse : str
+        Samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+
+    References
+    ----------
+    Wagner et al. (2007) eq. 6, 7; ALGORITHMS 1.1.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     gain = np.float32(threshold * np.sqrt(np.sum(given.taps**2)))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
@@ -15,7 +17,7 @@ from wavebatch.kernels.signal.filters import (
     refine_peaks,
 )
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import make_table, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
@@ -26,15 +28,23 @@ BROAD = 4.0
 
 
 @stage("detect")
-def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.0) -> EchoTable:
+def maximum(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.0
+) -> EchoTable:
     """Echoes at the local maxima of the [1 4 6 4 1]/16-smoothed waveform.
 
     Of pulses wider than 4 samples, on whose tops noise has maxima of its own, a Gaussian takes the place of these taps,
     which grows by half of what they are wider. Time, amplitude and width come from a log-parabola through five samples
-    around the maximum. Never splits a broad echo. Source: Wagner et al. (2007), max-detection; smoothing as in
-    ALGORITHMS 1.1.
+    around the maximum. Never splits a broad echo.
 
-    threshold: least height above the baseline, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    threshold : float
+        Least height above the baseline, in standard deviations of the smoothed noise.
+
+    References
+    ----------
+    Wagner et al. (2007), max-detection; smoothing as in ALGORITHMS 1.1.
     """
     signal = signal_above(block, noise)
     ref = system.sigma_ref / block.spacing
@@ -70,14 +80,23 @@ def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
 
 
 @stage("detect")
-def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.27) -> EchoTable:
+def matched_filter(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.27
+) -> EchoTable:
     """Echoes at the maxima of the correlation with the system pulse: the most sensitive detector of weak echoes.
 
-    Sub-sample times by a parabola through the logarithms of three correlations (1.00-1.04 of the Cramer-Rao bound
-    for an isolated echo of the system's width). Source: ALGORITHMS 1.1 (4), 1.3, 4.1.
+    Sub-sample times by a parabola through the logarithms of three correlations (1.00-1.04 of the Cramer-Rao bound for
+    an isolated echo of the system's width).
 
-    threshold: least correlation, in standard deviations of the filtered noise; 4.27 lets noise through in 0.1 % of 200
-    samples.
+    Parameters
+    ----------
+    threshold : float
+        Least correlation, in standard deviations of the filtered noise; 4.27 lets noise through in 0.1 % of 200
+        samples.
+
+    References
+    ----------
+    ALGORITHMS 1.1 (4), 1.3, 4.1.
     """
     ref = system.sigma_ref / block.spacing
     taps = gaussian_taps(ref)
@@ -96,18 +115,27 @@ def second_derivative(
     noise: Noise,
     system: SystemPulse,
     *,
-    threshold: float = 2.0,
-    scale: float = 0.85,
-    level: float = 4.0,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 2.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.85,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
 ) -> EchoTable:
     """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
 
-    The derivative is taken of the waveform smoothed by a Gaussian. Equal echoes are told apart from
-    1.48 sqrt(s^2 + a^2) on, a the smoothing. Source: Hofton et al. (2000), inflection points; ALGORITHMS 1.2, 2.2.
+    The derivative is taken of the waveform smoothed by a Gaussian. Equal echoes are told apart from 1.48 sqrt(s^2 +
+    a^2) on, a the smoothing.
 
-    threshold: least curvature, in standard deviations of the filtered noise.
-    scale: width of the smoothing, in widths of the system pulse.
-    level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
+    Parameters
+    ----------
+    threshold : float
+        Least curvature, in standard deviations of the filtered noise.
+    scale : float
+        Width of the smoothing, in widths of the system pulse.
+    level : float
+        Least height of the smoothed signal above the baseline, in standard deviations of its noise.
+
+    References
+    ----------
+    Hofton et al. (2000), inflection points; ALGORITHMS 1.2, 2.2.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filt
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse
 
@@ -35,17 +35,26 @@ def wavelet(
     system: SystemPulse,
     *,
     wavelet: Literal["b3", "mexican_hat"] = "b3",
-    threshold: float = 4.0,
-    scale: float = 0.0,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.0,
 ) -> EchoTable:
     """Echoes at the maxima of one scale of a wavelet transform.
 
     The B3-spline transform with holes tells echoes apart from about one full width at half maximum on; its level
-    follows the width of the system pulse. Source: Wang, Wang and Tseng; ALGORITHMS 1.2.
+    follows the width of the system pulse.
 
-    wavelet: `b3` for the B3-spline transform, `mexican_hat` for the second derivative of a Gaussian.
-    threshold: least value at a maximum, in standard deviations of the transformed noise; the paper's is 3.
-    scale: level of the B3 transform (1, 2, ...), or width of the Mexican hat in ns; 0 takes what suits the system.
+    Parameters
+    ----------
+    wavelet : {"b3", "mexican_hat"}
+        `b3` for the B3-spline transform, `mexican_hat` for the second derivative of a Gaussian.
+    threshold : float
+        Least value at a maximum, in standard deviations of the transformed noise; the paper's is 3.
+    scale : float
+        Level of the B3 transform (1, 2, ...), or width of the Mexican hat in ns; 0 takes what suits the system.
+
+    References
+    ----------
+    Wang, Wang and Tseng; ALGORITHMS 1.2.
     """
     ref = system.sigma_ref / block.spacing
     signal = signal_above(block, noise)
@@ -70,21 +79,32 @@ def richardson_lucy(
     system: SystemPulse,
     *,
     reference: Literal["gaussian", "system", "given"] = "system",
-    iterations: int = 16,
-    threshold: float = 4.27,
-    reach: float = 3.0,
+    iterations: Annotated[int, Range(1, 10_000)] = 16,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
+    reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
 ) -> EchoTable:
     """Echoes at the peaks of the waveform deconvolved by Richardson and Lucy's iteration with the pulse.
 
     Each iteration is extrapolated from those before it. Separates echoes of the system's width that are 2 widths apart
-    (1.5 with 40 iterations), but draws close ones together. Source: Richardson (1972), Lucy (1974); ALGORITHMS 2.5.
+    (1.5 with 40 iterations), but draws close ones together.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    iterations: more of them separate closer echoes, and split more broad ones.
-    threshold: least amplitude of an echo, in standard deviations that it would have if it were alone.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    iterations : int
+        More of them separate closer echoes, and split more broad ones.
+    threshold : float
+        Least amplitude of an echo, in standard deviations that it would have if it were alone.
+    reach : float
+        Half of the reference's length, in widths of the system pulse.
+    pulse : str
+        Samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+
+    References
+    ----------
+    Richardson (1972), Lucy (1974); ALGORITHMS 2.5.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     signal = signal_above(block, noise)

@@ -183,10 +183,7 @@ def plan_run(
 
 
 def find_request(
-    chain: ChainLike,
-    *,
-    tolerance: float | None = None,
-    system: Survey | Path | str | None = None,
+    chain: ChainLike, *, tolerance: float | None = None, system: Survey | Path | str | None = None
 ) -> tuple[Chain, Request]:
     """Find the chain to run with, or the widest one that a survey may choose, and the request that goes with it.
 
