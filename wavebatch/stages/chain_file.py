@@ -1,4 +1,7 @@
-"""Chain files: TOML text -> checked Chain, and back to text that names every parameter."""
+"""Chain files: TOML text to a checked Chain, and a Chain to text that names every parameter.
+
+A chain file holds only what changes the result: no paths, no number of processes. Shipped chains are in `profiles/`.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +22,51 @@ _TYPE_WORDS = {int: "an integer", float: "a number", bool: "true or false", str:
 
 
 def list_profiles() -> list[str]:
-    """Names of the shipped chains."""
+    """Return the names of the shipped chains, sorted."""
     return sorted(file.name.removesuffix(".toml") for file in _shipped().iterdir() if file.name.endswith(".toml"))
 
 
 def load_profile(name: str) -> Chain:
-    """The shipped chain of that name; raises ConfigError where there is none."""
+    """Load a shipped chain.
+
+    Parameters
+    ----------
+    name : str
+        A name of `list_profiles`.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown name.
+    """
     if name not in list_profiles():
         raise ConfigError(f"profile {name!r} does not exist; {nearest(name, list_profiles())}")
     return parse_chain((_shipped() / f"{name}.toml").read_text("utf-8"), f"profile {name}")
 
 
 def load_chain(path: Path | str) -> Chain:
-    """The chain of a TOML file; raises ConfigError that names file, table, key and the nearest known word."""
+    """Load the chain of a TOML file.
+
+    Parameters
+    ----------
+    path : path or str
+        The file.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        Where the file or the chain is wrong; names file, table, key and the nearest known word.
+    """
     try:
         text = Path(path).read_text("utf-8")
     except OSError as error:
@@ -42,7 +77,25 @@ def load_chain(path: Path | str) -> Chain:
 
 
 def parse_chain(text: str, name: str) -> Chain:
-    """The chain that TOML text describes; `name` stands in front of every error message."""
+    """Read a chain from TOML text.
+
+    Parameters
+    ----------
+    text : str
+        [[chain]] tables.
+    name : str
+        Name of the chain; every error message starts with it.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        Where the chain is wrong.
+    """
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -58,12 +111,36 @@ def parse_chain(text: str, name: str) -> Chain:
 
 
 def effective(chain: Chain) -> str:
-    """TOML text of the chain with every parameter as it will be used; `parse_chain` gives the same chain again."""
+    """Write a chain as TOML text with every parameter as it will be used; `parse_chain` reads it back.
+
+    Parameters
+    ----------
+    chain : Chain
+        Any chain.
+
+    Returns
+    -------
+    str
+        [[chain]] tables.
+    """
     return "\n".join(format_step(step.stage.name, step.effective()) for step in chain.steps)
 
 
 def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
-    """One [[chain]] table as TOML text; parameters that are None are left out."""
+    """Write one [[chain]] table as TOML text; parameters that are None are left out.
+
+    Parameters
+    ----------
+    stage : str
+        Name of the stage.
+    parameters : mapping
+        Values by name.
+
+    Returns
+    -------
+    str
+        The table.
+    """
     lines = ["[[chain]]", f'stage = "{stage}"']
     lines += [f"{name} = {_format_value(value)}" for name, value in parameters.items() if value is not None]
     return "\n".join(lines) + "\n"
@@ -106,7 +183,7 @@ def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
 
 
 def _check_type(parameter: Parameter, value: Any, where: str) -> Any:
-    """The value in the parameter's type: integers are taken for numbers, nothing else is converted."""
+    """Return the value in the parameter's type: integers become numbers, nothing else is converted."""
     if float in parameter.types and isinstance(value, int) and not isinstance(value, bool):
         value = value if int in parameter.types else float(value)
     elif type(value) not in parameter.types:
