@@ -20,10 +20,10 @@ RINGING_FACTOR = 1.2
 """Echoes up to this many times the strip's ringing may be ringing (docs/algorithms.md H7)."""
 
 LEAST_RATIO = 0.02
-"""Share of a stronger neighbour that an echo must exceed: a learned pulse is not known better (docs/algorithms.md R3)."""
+"""Share of a stronger neighbour that an echo must exceed: no learned pulse is better known (docs/algorithms.md R3)."""
 
 UNRELIABLE_BELOW = 0.15
-"""If less than this share of an echo lies below the digitizer's limit, its amplitude is a guess (docs/algorithms.md H6)."""
+"""Below this share of an echo under the digitizer's limit its amplitude is a guess (docs/algorithms.md H6)."""
 
 
 def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:

@@ -1,9 +1,13 @@
-"""Decomposers: what candidates become when a model of the waveform is fitted to it."""
+"""Decomposers that fit a pulse model to clusters of candidates, and the steps that all fitting decomposers share.
+
+Path of a block: candidates in ns, clusters in samples (`find_clusters`), fits (kernels), flagged table in ns
+(`describe_solutions`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -35,18 +39,18 @@ REACH = 3.0
 """Windows extend at least this many system widths beyond the outer candidates."""
 
 LEAST_PLATEAU = 2
-"""Clipped samples between two candidates from which they stand on one flat top ..."""
+"""Two candidates stand on one flat top if at least so many clipped samples lie between them ..."""
 
 PLATEAU_SLACK = 2
-"""... if no more samples than this between them are not clipped."""
+"""... and at most so many that are not clipped (docs/algorithms.md H6)."""
 
 MOST_JOINED = 6
-"""Candidates on one run of signal beyond which it is fitted in parts."""
+"""A run of signal with more candidates is fitted in parts."""
 
 
 @stage("decompose")
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """The detector's echoes as they are, without a fit and without errors."""
+    """Echoes of the detector as they are, without a fit and without errors."""
     return flag_echoes(block, noise, system, echoes)
 
 
@@ -61,10 +65,10 @@ def closed_form(
     steps: Annotated[int, Range(0, 100)] = 2,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A Gaussian for every candidate on its own: a closed form and a few Gauss-Newton steps.
+    """One Gaussian for every candidate alone: a closed form and a few Gauss-Newton steps.
 
-    At the Cramer-Rao bound for isolated echoes; overlapping echoes are cut apart half-way between them and therefore
-    biased.
+    Errors are at the Cramer-Rao bound for isolated echoes. Overlapping echoes are cut apart midway between them and are
+    therefore biased.
 
     Parameters
     ----------
@@ -73,15 +77,15 @@ def closed_form(
     steps : int
         Gauss-Newton steps after it.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    Guo (2011); ALGORITHMS 4.1.
+    Guo (2011); docs/algorithms.md 4.1.
     """
     start = _start_closed_form(block, noise, system, echoes, fraction)
     settings = make_settings(block, system, GAUSSIAN, tolerance=0.1, max_iterations=steps + 1, grow=False)
-    return fit_candidates(block, noise, system, start, settings, most=1, significance=significance)
+    return fit_candidates(block, noise, system, start, settings, significance=significance, most=1)
 
 
 @stage("decompose")
@@ -97,24 +101,24 @@ def gaussian(
 ) -> EchoTable:
     """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
-    Batched Levenberg-Marquardt; widths within 0.7 and 4 system widths, times within the window; no echo is added.
+    Batched Levenberg-Marquardt. Widths stay within 0.7 and 4 system widths, times within the window. No echo is added.
 
     Parameters
     ----------
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a standard
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
         deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
+    Wagner et al. (2007) eq. 3; docs/algorithms.md 2.3.
     """
     settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 @stage("decompose")
@@ -133,36 +137,36 @@ def adaptive(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
+    """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 
     Each cluster of candidates is fitted with the strip's pulse. Where the smoothed residual or its Gauss-Hermite
-    moments leave the range of noise, a score test places one more echo, and the fit with it is kept if chi2 falls
-    enough and the echoes can be told apart.
+    moments exceed what noise explains, a score test places one more echo. The larger fit is kept if chi2 falls enough
+    and the echoes are resolved.
 
     Parameters
     ----------
     acceptance : float
-        Least fall of chi2 for which an echo is added; 0 takes the strip's own from the survey.
+        Least fall of chi2 for which an echo is added; 0 takes the value of the survey.
     max_echoes : int
-        Echoes per cluster up to which a fit grows.
+        Most echoes per cluster to which a fit grows.
     gate_residual : float
-        Largest smoothed residual of a complete fit, in standard deviations.
+        Largest smoothed residual of a complete fit [standard deviations].
     gate_hermite : float
         Largest h3^2 + h4^2 of a complete fit.
     width_prior : float
-        How far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths; 0 for no
-        prior.
+        How far overlapping echoes may be narrower than the system pulse [one standard deviation, in system widths]; 0
+        for no prior.
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a standard
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
         deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    ALGORITHMS 2.3, 4.2, H1, H3.
+    docs/algorithms.md 2.3, 4.2, H1, H3.
     """
     shape = pulse_shape(system, block.spacing)
     ref = shape_limits(system, block.spacing).ref
@@ -180,11 +184,26 @@ def adaptive(
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
-def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
-    """What a decomposition with this pulse may do, with the strip's widths, digitizer and noise."""
+def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options: Any) -> Settings:
+    """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
+
+    Parameters
+    ----------
+    block, system
+        As for a stage.
+    shape : PulseShape
+        The pulse to fit.
+    **options
+        Further fields of Settings.
+
+    Returns
+    -------
+    Settings
+        For `fit_candidates`.
+    """
     limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
     return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
 
@@ -196,31 +215,69 @@ def fit_candidates(
     echoes: EchoTable,
     settings: Settings,
     *,
-    most: int,
     significance: float,
+    most: int = MOST_JOINED,
 ) -> EchoTable:
-    """Candidates in ns -> clusters -> fits -> flagged table in ns."""
+    """Run a decomposer: candidates in ns, clusters, fits, flagged table in ns.
+
+    Parameters
+    ----------
+    block, noise, system, echoes
+        As for a stage.
+    settings : Settings
+        Pulse, limits and options of the fit.
+    significance : float
+        Least energy of an echo [standard deviations].
+    most : int
+        Most candidates that are fitted together.
+
+    Returns
+    -------
+    EchoTable
+        Fitted echoes with errors and flags.
+    """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
     solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
     return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
 
 
 def find_clusters(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, settings: Settings, most: int
+    block: WaveformBlock,
+    noise: Noise,
+    system: SystemPulse,
+    echoes: EchoTable,
+    settings: Settings,
+    most: int = MOST_JOINED,
 ) -> tuple[Candidates, Clusters]:
-    """Candidates in samples, as parameters of the pulse, and which of them are fitted together."""
+    """Turn candidates into parameters of the pulse in samples, and group those that must be fitted together.
+
+    Parameters
+    ----------
+    block, noise, system, echoes
+        As for a stage.
+    settings : Settings
+        Pulse and limits of the fit.
+    most : int
+        Most candidates of a cluster.
+
+    Returns
+    -------
+    candidates : Candidates
+        Without those that a flat top or an after-pulse explains.
+    clusters : Clusters
+        Disjoint windows with their candidates.
+    """
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
-    start = np.stack(
-        [np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1
-    )
-    amplitude, time, width = model_parameters(settings.shape, limits, start.astype(np.float64)).T
+    columns = np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing
+    start = np.stack(columns, axis=1).astype(np.float64)
+    amplitude, time, width = model_parameters(settings.shape, limits, start).T
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
-    ref = system.sigma_ref / block.spacing
     candidates = _join_plateaus(block, candidates, settings.clip)
     candidates, tail = _explain_tails(candidates, noise, settings)
     present, row = np.unique(candidates.waveform, return_inverse=True)
     signal = transpose_samples(block.samples[present])
     signal -= noise.baseline[present]
+    ref = system.sigma_ref / block.spacing
     clusters = cluster_candidates(
         candidates._replace(waveform=row),
         smooth_121(signal),
@@ -234,7 +291,7 @@ def find_clusters(
 
 
 def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float | None) -> Candidates:
-    """Candidates of which no two stand on one flat top: clipped samples between them are no sign of two echoes (H6)."""
+    """Candidates of which no two stand on one flat top: clipped samples between two are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
     if clip is None or len(waveform) < 2:
         return candidates
@@ -258,9 +315,9 @@ def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float | N
 
 
 def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
-    """Candidates that the after-pulses of stronger echoes before them do not explain, and how far tails reach (H7).
+    """Candidates that after-pulses of stronger echoes do not explain, and how far tails reach (docs/algorithms.md H7).
 
-    A candidate that is dropped here comes back by growth if the fit of the stronger echo leaves something there.
+    Growth finds a dropped candidate again if the fit of the stronger echo leaves a residual there.
     """
     tail = pulse_tail(settings.shape, settings.width_ref)
     if tail is None:
@@ -287,7 +344,28 @@ def describe_solutions(
     settings: Settings,
     significance: float,
 ) -> EchoTable:
-    """Fits in samples as a flagged table in ns, without echoes that noise explains or that lie outside."""
+    """Turn fits in samples into a flagged table in ns.
+
+    Echoes that noise explains or that lie outside the waveform are dropped, unresolved ones are merged.
+
+    Parameters
+    ----------
+    block, noise, system
+        As for a stage.
+    clusters : Clusters
+        The fitted clusters.
+    solutions : list of Solution
+        Their fits.
+    settings : Settings
+        Pulse and limits of the fit.
+    significance : float
+        Least energy of an echo [standard deviations].
+
+    Returns
+    -------
+    EchoTable
+        Fitted echoes with errors and flags.
+    """
     if not solutions:
         return EchoTable.empty()
     flat = [_flatten(clusters, solution) for solution in solutions]
@@ -299,19 +377,13 @@ def describe_solutions(
     last = block.samples.shape[1] - 1
     keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
     keep &= np.isfinite(errors).all(axis=1)
-    waveform, time, amplitude, width = waveform[keep], time[keep], amplitude[keep], width[keep]
-    errors = errors[keep]
+    amplitude, time, width = parameters[keep].T
+    amplitude_err, time_err, width_err = errors[keep].T
+    spacing = block.spacing
     table = EchoTable.build(
-        waveform,
-        time * block.spacing,
-        amplitude,
-        width * block.spacing,
-        time_err=errors[:, 1] * block.spacing,
-        amplitude_err=errors[:, 0],
-        sigma_err=errors[:, 2] * block.spacing,
-        residual=misfit[keep],
-        flags=flags[keep],
-    )
+        waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
+        amplitude_err=amplitude_err, sigma_err=width_err * spacing, residual=misfit[keep], flags=flags[keep],
+    )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system)
@@ -337,7 +409,7 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
 def _start_closed_form(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, fraction: float
 ) -> EchoTable:
-    """The candidates with amplitude, time and width from the closed form where it holds."""
+    """Candidates with amplitude, time and width of the closed form, where it is valid."""
     ref = system.sigma_ref / block.spacing
     waveform = echoes.waveform.astype(np.int64)
     s = block.samples.shape[1]

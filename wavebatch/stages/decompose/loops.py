@@ -1,4 +1,4 @@
-"""Decomposers that decide what is fitted: Wang's residual loop, and ASDF with a fit only where it is needed."""
+"""Decomposers that decide what is fitted: Wang's residual loop, and the ASDF with a fit only where it is needed."""
 
 from __future__ import annotations
 
@@ -33,24 +33,24 @@ def residual_loop(
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """Gaussians, one more at the largest residual of the waveform as long as that exceeds a threshold.
+    """Gaussians, with one more at the largest residual of the waveform while that exceeds a threshold.
 
-    Nothing proves the added echoes but their residual: on pulses that are not Gaussian they are many.
+    Only their residual supports the added echoes: on pulses that are not Gaussian there are many.
 
     Parameters
     ----------
     t_diff : float
-        Largest residual that is left alone, in standard deviations of the noise.
+        Largest residual that adds no echo [standard deviations of the noise].
     max_echoes : int
-        Echoes per waveform up to which they are added.
+        Most echoes per waveform up to which echoes are added.
     max_iterations : int
-        Of each fit, after which an echo is flagged as not converged.
+        Of each fit; an echo that has not converged after so many is flagged.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    Wang, Wang and Tseng; ALGORITHMS 1.2.
+    Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
@@ -84,7 +84,7 @@ def _add_echoes(
     block: WaveformBlock,
     system: SystemPulse,
 ) -> EchoTable:
-    """The echoes found and one of the system's width at a sample of each of the given waveforms."""
+    """The found echoes and one more, of the system's width, at a sample of each of the given waveforms."""
     ref = np.full(len(waveform), system.sigma_ref)
     added = (waveform, sample * block.spacing, height, ref)
     known = (found.waveform, found.time, found.amplitude, found.sigma)
@@ -118,7 +118,7 @@ def asdf_only(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
 ) -> EchoTable:
-    """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where it is needed.
+    """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where needed.
 
     Mixed: waveforms in which the chain's detector and the ASDF disagree in the number or the times of the echoes are
     fitted with Gaussians, from the detector's candidates. Errors without a fit are those expected of isolated echoes.
@@ -128,13 +128,13 @@ def asdf_only(
     mode : {"shortcut", "mixed"}
         `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
     tolerance : float
-        Largest distance in time of echoes that agree, in widths of the system pulse.
+        Largest distance in time of echoes that agree [widths of the system pulse].
     threshold : float
-        Of the ASDF, in standard deviations of the filtered noise.
+        Of the ASDF [standard deviations of the filtered noise].
 
     References
     ----------
-    Wagner et al. (2007); ALGORITHMS 1.1.
+    Wagner et al. (2007); docs/algorithms.md 1.1.
     """
     quick = _describe(block, noise, system, asdf(block, noise, system, threshold=threshold))
     if mode == "shortcut":
@@ -151,7 +151,7 @@ def asdf_only(
 
 
 def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
-    """True (n,) for waveforms in which two tables have another number of echoes, or one at another time."""
+    """True (n,) for waveforms in which two tables have different numbers of echoes, or one at a different time."""
     differ = first.count(n) != second.count(n)
     a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
     differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
@@ -168,7 +168,7 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
     table = candidate_table(block, system, waveform, echoes.time / spacing, amplitude, width)
     std = noise.std[waveform]
     height, width = np.maximum(table.amplitude, std).astype(np.float64), table.sigma.astype(np.float64)
-    # A reference of another width than the echo's loses this much of the bound (Schwarz's inequality, of the slopes).
+    # A reference whose width is not the echo's loses this much of the bound (Schwarz's inequality of the slopes).
     loss = ((width * width + system.sigma_ref**2) / (2.0 * width * system.sigma_ref)) ** 1.5
     amplitude_err, width_err = start_errors(height, width / spacing, std)
     table = replace(

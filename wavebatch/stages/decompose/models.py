@@ -1,4 +1,4 @@
-"""Decomposers for comparison: other pulse models, and undamped Gauss-Newton steps."""
+"""Decomposers for comparison: other pulse models, and Gauss-Newton steps without damping."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model, gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.decompose.fit import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
+from wavebatch.stages.decompose.fit import describe_solutions, find_clusters, fit_candidates, make_settings
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
-"""Exponents of the generalized Gaussian that are tried for every cluster of echoes."""
+"""Exponents of the generalized Gaussian that are tried for every cluster."""
 
 
 def _model_settings(
@@ -50,24 +50,38 @@ def skewed(
     Parameters
     ----------
     kappa : float
-        Skew; 0 takes the strip's own from the survey.
+        Skew; 0 takes the value of the survey.
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise.
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
+        deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    Wang, Wang and Tseng eq. 2; ALGORITHMS 0, 1.2.
+    Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
     settings = _model_settings(block, system, skewed_shape(system, kappa), max_iterations, tolerance)
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
-    """The pulse that `skewed` fits."""
+    """Return the pulse that `skewed` fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    kappa : float
+        Skew; 0 takes the value of the survey.
+
+    Returns
+    -------
+    PulseShape
+        Skewed, or Gaussian where the skew is negligible.
+    """
     skew = kappa or system.kappa
     return PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
 
@@ -87,7 +101,7 @@ def reference(
 ) -> EchoTable:
     """A sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
-    Time and amplitude are those of the pulse's peak, the width its full width at half maximum over 2.354820.
+    Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
 
     Parameters
     ----------
@@ -95,27 +109,43 @@ def reference(
         `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in time,
         `given` for the pulse below, stretched.
     pulse : str
-        Samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise.
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
+        deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    ALGORITHMS R1; Mallet and Bretar (2009).
+    docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
     settings = _model_settings(block, system, shape, max_iterations, tolerance)
     if model != "broadened":
         system = replace(system, components=())
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str) -> PulseShape:
-    """The pulse that `reference` fits."""
+    """Return the pulse that `reference` fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    model, pulse : str
+        As for `reference`.
+
+    Returns
+    -------
+    PulseShape
+        Pulse for the kernels.
+    """
     shape = pulse_shape(system, spacing)
     if model == "stretched":
         return _tabulate_system(system, shape, spacing)
@@ -148,7 +178,7 @@ def generalized_gaussian(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of generalized Gaussians exp(-|z|^p / 2) whose exponent each cluster of echoes chooses for itself.
+    """A sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
     width at half maximum over 2.354820.
@@ -156,18 +186,19 @@ def generalized_gaussian(
     Parameters
     ----------
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise.
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
+        deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
     Chauve et al. (2007), eq. 4.
     """
     plain = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
-    candidates, clusters = find_clusters(block, noise, system, echoes, plain, MOST_JOINED)
+    candidates, clusters = find_clusters(block, noise, system, echoes, plain)
     best = np.full(len(clusters.number), np.inf)
     chosen = np.zeros(len(best), np.int64)
     found: list[list[Solution]] = []
@@ -190,7 +221,18 @@ def generalized_gaussian(
 
 
 def half_width_factor(power: float) -> float:
-    """Full width at half maximum of exp(-|z|^p / 2) over 2.354820."""
+    """Return the full width at half maximum of exp(-|z|^p / 2) over 2.354820.
+
+    Parameters
+    ----------
+    power : float
+        Exponent p.
+
+    Returns
+    -------
+    float
+        1 for a Gaussian.
+    """
     return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
@@ -205,31 +247,32 @@ def gauss_newton(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts further off than one sigma are lost.
+    """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
-    A fit that is lost gives its start back, flagged as not converged.
+    A fit that is lost returns its start, flagged as not converged.
 
     Parameters
     ----------
     max_iterations : int
-        After which an echo is flagged as not converged.
+        An echo that has not converged after so many is flagged.
     tolerance : float
-        Fall of chi2 that the last step, which is taken, may promise.
+        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
+        deviation of the minimum.
     significance : float
-        Least energy of an echo, in standard deviations of the noise's.
+        Least energy of an echo [standard deviations of the noise's energy].
 
     References
     ----------
-    Jutzi and Stilla (2005); ALGORITHMS 1.3.
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
     settings = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings, MOST_JOINED)
+    candidates, clusters = find_clusters(block, noise, system, echoes, settings)
     found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in _alike(clusters, block)]
     return describe_solutions(block, noise, system, clusters, found, settings, significance)
 
 
 def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
-    """Clusters with the same number of echoes and windows of about the same length, a batch at a time."""
+    """Batches of clusters with the same number of echoes and windows of about the same length."""
     length = np.minimum(-(-(clusters.high - clusters.low) // 8) * 8, block.samples.shape[1])
     kind = clusters.number * (1 << 32) + length
     order = np.argsort(kind, kind="stable")

@@ -25,7 +25,7 @@ from wavebatch.stages.detect.candidates import candidate_table, signal_above
 
 
 def _smoothed_width(ref: float) -> float:
-    """Width of the system pulse behind the [1 2 1]/4 filter [samples]."""
+    """Width of the system pulse after the [1 2 1]/4 filter [samples]."""
     return float(np.sqrt(ref * ref + 0.5))
 
 
@@ -40,15 +40,15 @@ def threshold(
 ) -> EchoTable:
     """One echo per run of smoothed signal above a level, timed at its leading edge.
 
-    The leading edge comes earlier the stronger the echo is.
+    The stronger the echo, the earlier its leading edge.
 
     Parameters
     ----------
     level : float
-        Of the trigger, in standard deviations of the smoothed noise.
+        Level of the trigger [standard deviations of the smoothed noise].
     correct_walk : bool
-        Add the time that an echo of this amplitude and the system's width takes from the level to its peak; without it,
-        times are those of the edge itself.
+        Add the time from the level to the peak of an echo of this amplitude and the system's width; without it, times
+        are those of the edge.
 
     References
     ----------
@@ -85,18 +85,19 @@ def sustained_threshold(
 ) -> EchoTable:
     """One echo per run of samples above a level that lasts as long as the system pulse, at its highest sample.
 
-    Finds half of the echoes of 5.5 standard deviations and all of 10; no false echo in 20,000 waveforms of noise.
+    Finds half of the echoes of 5.5 noise standard deviations and all of 10. It made no false echo in 20,000 waveforms
+    of noise.
 
     Parameters
     ----------
     level : float
-        That every sample of the run exceeds, in standard deviations of the noise.
+        Every sample of the run exceeds it [standard deviations of the noise].
     duration : float
-        Least length of the run, in full widths at half maximum of the system pulse.
+        Least length of the run [full widths at half maximum of the system pulse].
 
     References
     ----------
-    Jutzi and Stilla (2005); ALGORITHMS 1.3.
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -117,13 +118,13 @@ def center_of_gravity(
 ) -> EchoTable:
     """One echo per run of smoothed signal above a level, at the centre of gravity of its samples.
 
-    Insensitive to noise and to the shape of the pulse; overlapping echoes become one between them. The width is the
-    standard deviation of the samples in time.
+    Insensitive to noise and to the shape of the pulse; overlapping echoes become one echo between them. The width is
+    the standard deviation of the samples in time.
 
     Parameters
     ----------
     level : float
-        That the run exceeds, in standard deviations of the smoothed noise.
+        Every sample of the run exceeds it [standard deviations of the smoothed noise].
 
     References
     ----------
@@ -148,17 +149,17 @@ def constant_fraction(
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.5,
     level: Annotated[float, Range(0.1, 1e6)] = 4.0,
 ) -> EchoTable:
-    """An echo per local maximum, timed where its leading edge reaches a fraction of its height.
+    """One echo per local maximum, timed where its leading edge reaches a fraction of its height.
 
-    The time does not depend on the amplitude; the lead of the edge of a system pulse is added, so that times are those
-    of the peak.
+    The time does not depend on the amplitude. The time from the edge to the peak of a system pulse is added, so times
+    are those of the peak.
 
     Parameters
     ----------
     fraction : float
         Of the height, above 0 and below 1.
     level : float
-        Least height above the baseline, in standard deviations of the smoothed noise.
+        Least height above the baseline [standard deviations of the smoothed noise].
 
     References
     ----------
@@ -189,19 +190,19 @@ def zero_crossing(
     level: Annotated[float, Range(0.1, 1e6)] = 4.0,
     scale: Annotated[float, Range(0.0, 100.0)] = 0.5,
 ) -> EchoTable:
-    """Echoes where the first derivative falls through zero, or between two zeros of the second.
+    """Echoes where the first derivative falls through zero, or midway between two zeros of the second.
 
-    The zeros of the second derivative are the inflection points: an echo lies half-way between the two, and its width
+    The zeros of the second derivative are the inflection points: an echo lies midway between two of them, and its width
     is half of their distance.
 
     Parameters
     ----------
     derivative : {"first", "second"}
-        Of the waveform, `first` or `second`.
+        Which derivative of the waveform.
     level : float
-        Least height of the smoothed signal above the baseline, in standard deviations of its noise.
+        Least height of the smoothed signal above the baseline [standard deviations of its noise].
     scale : float
-        Width of the Gaussian that the derivative is taken of, in widths of the system pulse.
+        Width of the Gaussian that smooths before the derivative [widths of the system pulse].
 
     References
     ----------
@@ -225,7 +226,7 @@ def zero_crossing(
 
 
 def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Waveform and time (m,) of the places where slope (s, n) goes from positive to not positive."""
+    """Waveform and time (m,) of the places where slope (s, n) goes from positive to zero or below."""
     n = slope.shape[1]
     falling = slope[:-1] > 0
     falling &= slope[1:] <= 0
@@ -238,7 +239,7 @@ def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _between_inflections(
     curvature: np.ndarray, taps: np.ndarray, noise: Noise, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Waveform, time and width (m,) of the stretches of positive curvature; those that noise makes are left out."""
+    """Waveform, time and width (m,) of the stretches of positive curvature that exceed the noise."""
     waveform, sample = find_peaks(curvature, np.float32(2.0 * np.sqrt(filter_energy(taps))) * noise.std)
     zero = np.zeros(len(sample))
     left = walk_down(curvature, waveform, sample, zero, -1)

@@ -1,4 +1,4 @@
-"""Detectors: where a waveform holds echoes. Times in ns; widths are first guesses."""
+"""The standard detectors: local maxima of a filtered waveform. Times in ns; widths are first guesses for the fit."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ def maximum(
 ) -> EchoTable:
     """Echoes at the local maxima of the [1 4 6 4 1]/16-smoothed waveform.
 
-    Of pulses wider than 4 samples, on whose tops noise has maxima of its own, a Gaussian takes the place of these taps,
-    which grows by half of what they are wider. Time, amplitude and width come from a log-parabola through five samples
-    around the maximum. Never splits a broad echo.
+    System pulses wider than 4 samples have several noise maxima on their tops. They are smoothed by a Gaussian instead,
+    which grows by half of the additional width. Time, amplitude and width come from a log-parabola through five samples
+    around the maximum. A broad echo is never split.
 
     Parameters
     ----------
     threshold : float
-        Least height above the baseline, in standard deviations of the smoothed noise.
+        Least height above the baseline [standard deviations of the smoothed noise].
 
     References
     ----------
-    Wagner et al. (2007), max-detection; smoothing as in ALGORITHMS 1.1.
+    Wagner et al. (2007), max-detection; smoothing as in docs/algorithms.md 1.1.
     """
     signal = signal_above(block, noise)
     ref = system.sigma_ref / block.spacing
@@ -72,7 +72,7 @@ def maximum(
 def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
     """Samples to the nearest other maximum of the waveform (m,), infinite without one.
 
-    Echoes closer than two widths have one maximum (ALGORITHMS 2.2), so half of the gap bounds the width.
+    Echoes closer than two widths have one maximum (docs/algorithms.md 2.2), so half of the gap bounds the width.
     """
     gap = np.full(len(sample) + 1, np.inf)
     gap[1:-1] = np.where(np.diff(waveform) == 0, np.diff(sample), np.inf)
@@ -85,18 +85,18 @@ def matched_filter(
 ) -> EchoTable:
     """Echoes at the maxima of the correlation with the system pulse: the most sensitive detector of weak echoes.
 
-    Sub-sample times by a parabola through the logarithms of three correlations (1.00-1.04 of the Cramer-Rao bound for
-    an isolated echo of the system's width).
+    Times come from a parabola through the logarithms of three correlations. For an isolated echo of the system's width
+    their error is 1.00 to 1.04 of the Cramer-Rao bound.
 
     Parameters
     ----------
     threshold : float
-        Least correlation, in standard deviations of the filtered noise; 4.27 lets noise through in 0.1 % of 200
+        Least correlation [standard deviations of the filtered noise]; noise exceeds 4.27 in 0.1 % of waveforms of 200
         samples.
 
     References
     ----------
-    ALGORITHMS 1.1 (4), 1.3, 4.1.
+    docs/algorithms.md 1.1 (4), 1.3, 4.1.
     """
     ref = system.sigma_ref / block.spacing
     taps = gaussian_taps(ref)
@@ -121,21 +121,21 @@ def second_derivative(
 ) -> EchoTable:
     """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
 
-    The derivative is taken of the waveform smoothed by a Gaussian. Equal echoes are told apart from 1.48 sqrt(s^2 +
-    a^2) on, a the smoothing.
+    The derivative is taken of the waveform smoothed by a Gaussian of width a. Equal echoes of width s are separated
+    from a distance of 1.48 sqrt(s^2 + a^2) on.
 
     Parameters
     ----------
     threshold : float
-        Least curvature, in standard deviations of the filtered noise.
+        Least curvature [standard deviations of the filtered noise].
     scale : float
-        Width of the smoothing, in widths of the system pulse.
+        Width of the smoothing [widths of the system pulse].
     level : float
-        Least height of the smoothed signal above the baseline, in standard deviations of its noise.
+        Least height of the smoothed signal above the baseline [standard deviations of its noise].
 
     References
     ----------
-    Hofton et al. (2000), inflection points; ALGORITHMS 1.2, 2.2.
+    Hofton et al. (2000), inflection points; docs/algorithms.md 1.2, 2.2.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
