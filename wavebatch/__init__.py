@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
     from wavebatch.core.errors import ConfigError, InputError, StageError
     from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
-    from wavebatch.stages.chain import Chain, Step, stage
+    from wavebatch.stages.chain import Chain, Range, Step, stage
     from wavebatch.surveying.sensor import SensorRequest
     from wavebatch.surveying.survey import Decision, Survey
     from wavebatch.tools.api.chain import auto_chain, load_chain
@@ -40,7 +40,7 @@ _MODULES = {
     "core.echoes": ("COLUMNS", "Column", "EchoFlag", "EchoTable"),
     "core.errors": ("ConfigError", "InputError", "StageError"),
     "core.waveforms": ("Digitizer", "Noise", "ReturnTable", "SystemPulse", "WaveformBlock"),
-    "stages.chain": ("Chain", "Step", "stage"),
+    "stages.chain": ("Chain", "Range", "Step", "stage"),
     "surveying.sensor": ("SensorRequest",),
     "surveying.survey": ("Decision", "Survey"),
     "tools.api.chain": ("auto_chain", "load_chain"),
@@ -63,6 +63,7 @@ __all__ = [
     "InputError",
     "Noise",
     "Outcome",
+    "Range",
     "ReturnTable",
     "SensorRequest",
     "StageError",

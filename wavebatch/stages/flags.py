@@ -99,7 +99,7 @@ def clear_lone(table: EchoTable) -> EchoTable:
 
 
 def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: float, *, before: bool) -> np.ndarray:
-    """True (m,) for echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
+    """Find echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
 
     before: also of an echo that follows within this distance.
     """

@@ -1,4 +1,4 @@
-"""Angle between ray and surface from the points around an echo: what angles from widths are to be compared with."""
+"""Incidence angles from the points around an echo: the check for angles from echo widths."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ def incidence_angle_normals(
 ) -> EchoTable:
     """Angle between the packet's ray and the normal of the plane of the points around each echo [deg]; its error.
 
-    `run` fills it in a second pass, when all points of the strip are there; the echoes of a block alone have no-data.
-    The plane is fitted to all points within the radius that are not outliers. No-data where there are fewer than
-    min_points, where they are no plane (plants, ridges: less than 60 % of them in it, thicker than a fifth of its
-    width, or the echo not in it), where the angle is beyond 80 degrees (plants struck by one sweep of the scanner make
-    a plane that its rays lie in), and where it is more uncertain than max_error. It needs neither sensor nor
-    divergence.
+    `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
+    is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
+
+    No-data where there are fewer than min_points; where the points are no plane (plants, ridges: less than 60 % of them
+    in it, thicker than a fifth of its width, or the echo not in it); where the angle exceeds 80 degrees (one sweep of
+    the scanner over plants makes a plane that contains its rays); and where its error exceeds max_error.
 
     Parameters
     ----------
     radius : float
-        Of the neighbourhood [m], in all directions; three times the distance between points is a good start.
+        Radius of the neighbourhood [m]; three times the distance between points is a good start.
     min_points : int
         Least number of points in the neighbourhood, and in the plane.
     max_error : float
@@ -49,7 +49,7 @@ def incidence_angle_normals(
 
     References
     ----------
-    the comparison of Rhomberg-Kauert et al. 2024, Fig. 6; ALGORITHMS 1.4.
+    Rhomberg-Kauert et al. (2024), comparison of Fig. 6; docs/algorithms.md 1.4.
     """
     if not 1e-3 <= radius <= 1e3 or min_points < 4 or not max_error > 0:
         raise ConfigError("radius must lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")

@@ -99,7 +99,7 @@ def gaussian(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
+    """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
     Batched Levenberg-Marquardt. Widths stay within 0.7 and 4 system widths, times within the window. No echo is added.
 

@@ -84,7 +84,7 @@ def _add_echoes(
     block: WaveformBlock,
     system: SystemPulse,
 ) -> EchoTable:
-    """The found echoes and one more, of the system's width, at a sample of each of the given waveforms."""
+    """Add one echo to those found, of the system's width, at a sample of each of the given waveforms."""
     ref = np.full(len(waveform), system.sigma_ref)
     added = (waveform, sample * block.spacing, height, ref)
     known = (found.waveform, found.time, found.amplitude, found.sigma)
@@ -151,7 +151,7 @@ def asdf_only(
 
 
 def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
-    """True (n,) for waveforms in which two tables have different numbers of echoes, or one at a different time."""
+    """Find waveforms in which two tables have different numbers of echoes, or one at a different time."""
     differ = first.count(n) != second.count(n)
     a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
     differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
@@ -159,7 +159,7 @@ def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> 
 
 
 def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Detected echoes with amplitude and width by a log-parabola through five samples, expected errors and misfit."""
+    """Describe echoes by a log-parabola through five samples, with the expected errors and the misfit."""
     spacing, last = block.spacing, block.samples.shape[1] - 1
     sample = np.clip(np.rint(echoes.time / spacing), 0, last).astype(np.int64)
     waveform = echoes.waveform.astype(np.int64)
@@ -186,8 +186,8 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
 def _misfit(residual: np.ndarray, waveform: np.ndarray, sample: np.ndarray, reach: float) -> np.ndarray:
     """Root mean square of residuals (n, s) within `reach` of samples, float32 (m,)."""
     total, number = np.zeros(len(sample)), np.zeros(len(sample))
-    reach = min(int(np.ceil(reach)), residual.shape[1])
-    for lag in range(-reach, reach + 1):
+    most = min(int(np.ceil(reach)), residual.shape[1])
+    for lag in range(-most, most + 1):
         at = sample + lag
         inside = (at >= 0) & (at < residual.shape[1])
         total += np.where(inside, residual[waveform, np.clip(at, 0, residual.shape[1] - 1)], 0.0) ** 2

@@ -43,7 +43,7 @@ def skewed(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
+    """Sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
 
     The time is that of the peak.
 
@@ -99,7 +99,7 @@ def reference(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
+    """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
     Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
 
@@ -156,7 +156,7 @@ def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str)
 
 
 def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:
-    """The survey's pulse as a table."""
+    """Tabulate the survey's pulse."""
     ref = shape_limits(system, spacing).ref
     ends = [-6 * ref, 6 * ref]
     for _, delay, extra in shape.components:
@@ -178,7 +178,7 @@ def generalized_gaussian(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
+    """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
     width at half maximum over 2.354820.
@@ -247,7 +247,7 @@ def gauss_newton(
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
 ) -> EchoTable:
-    """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
+    """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
     A fit that is lost returns its start, flagged as not converged.
 
@@ -307,6 +307,6 @@ def _solve_undamped(
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:
-    """The solution with widths multiplied by the factor."""
+    """Multiply the widths of a solution by the factor."""
     scale = np.array([1.0, 1.0, factor])[:, None]
     return solution._replace(parameters=solution.parameters * scale, errors=solution.errors * scale)

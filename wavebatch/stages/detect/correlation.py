@@ -156,7 +156,7 @@ def asdf(
 
 
 def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Samples from minima of values (n, rows) to the peak, and whether the correlation (rows, n) peaks there too."""
+    """Distance from minima of values (n, rows) to the peak [samples]; whether the correlation (rows, n) peaks there."""
     waveform, row = minima.waveform, minima.row
     shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))
     near = [correlations[row + d, waveform] for d in (-1, 0, 1)]

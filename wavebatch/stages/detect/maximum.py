@@ -70,7 +70,7 @@ def maximum(
 
 
 def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Samples to the nearest other maximum of the waveform (m,), infinite without one.
+    """Distance in samples to the nearest other maximum of the waveform (m,), infinite without one.
 
     Echoes closer than two widths have one maximum (docs/algorithms.md 2.2), so half of the gap bounds the width.
     """
