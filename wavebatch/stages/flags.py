@@ -116,7 +116,7 @@ def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: floa
 
 def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: EchoTable) -> EchoTable:
     """Flag echoes with clipped samples within 1.5 widths of their centre, and amplitudes that are guesses."""
-    rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
+    rows = np.flatnonzero(np.any(block.samples >= level, axis=1)[table.waveform])
     if not len(rows):
         return table
     sample = np.arange(block.samples.shape[1]) * block.spacing

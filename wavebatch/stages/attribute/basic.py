@@ -74,7 +74,7 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     return echoes.with_attributes(pulse_deviation=(np.hypot(h3, h4) / np.maximum(unit, 1e-6)).astype(np.float32))
 
 
-_Read = Callable[[np.ndarray, np.ndarray], np.ndarray]
+_Read = Callable[[np.ndarray | slice, np.ndarray], np.ndarray]
 
 
 def _read_single(
@@ -85,7 +85,7 @@ def _read_single(
     first = waveform.astype(np.int64)[:, None] * s
     amplitude, time, width = model.astype(np.float32).T[..., None]
 
-    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         values = samples[first[part] + at].astype(np.float32)
         values -= noise.baseline[waveform[part], None]
         values -= amplitude[part] * evaluate_pulse(shape, at.astype(np.float32), time[part], width[part])[0]
@@ -102,7 +102,7 @@ def _read_several(
     residual = block.samples[rows] - noise.baseline[rows, None]
     residual -= render_echoes(shape, len(rows), block.samples.shape[1], place, model[:, 1], model[:, 0], model[:, 2])
 
-    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         return residual[place[part][:, None], at].astype(np.float32)
 
     return read
@@ -110,13 +110,9 @@ def _read_several(
 
 @stage("attribute", makes=("x", "y", "z", "point", "range_err"))
 def position(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 2.5,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Coordinates of each echo along its ray [m], relative to the returns of its packet, and the return it matches.
 
     Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a

@@ -20,15 +20,11 @@ from wavebatch.stages.chain import Range, stage
     second_pass=measure_normals,
 )
 def incidence_angle_normals(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     radius: Annotated[float, Range(1e-3, 1000.0)] = 1.5,
     min_points: Annotated[int, Range(4, 10_000)] = 8,
     max_error: Annotated[float, Range(1e-3, 180.0)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Angle between the packet's ray and the normal of the plane of the points around each echo [deg]; its error.
 
     `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane

@@ -63,13 +63,9 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
 
 @stage("attribute", makes=("reflectance", "reflectance_err"), needs=_POSITION)
 def reflectance(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["level", "echo", "facing"] = "level",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Diffuse reflectance of each echo that is alone in its waveform, and its error; no-data for all others.
 
     gamma / (4 cos(alpha)): only a target that fills the beam has a reflectance.
@@ -110,13 +106,9 @@ def relative_cross_section(block: WaveformBlock, noise: Noise, system: SystemPul
 
 @stage("attribute", makes=("relative_reflectance", "relative_reflectance_err"), needs=_POSITION)
 def relative_reflectance(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["level", "echo", "facing"] = "level",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Reflectance of each echo that is alone in its waveform, in units of its strip [DN ns m2], and its error.
 
     R^2 A sigma / (4 cos(alpha) eta(R)): the reflectance without the constant C', for strips without calibration.

@@ -42,17 +42,13 @@ _REASON = f"incidence_angle{SUFFIX}"
 
 @stage("attribute", makes=("incidence_angle", "incidence_angle_err"), needs=("x", "y", "z"))
 def incidence_angle(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["system", "pulse", "paper"] = "system",
     divergence: Annotated[float, Range(0.0, 100.0)] = 0.0,
     max_error: Annotated[float, Range(1e-3, 180.0)] = 10.0,
     reference_error: Annotated[float, Range(0.0, 1.0)] = 0.003,
     alone: bool = True,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
 
     A plane spreads the pulse by R divergence tan(alpha) / (2 c). Rough ground and plants widen echoes too and look like

@@ -56,15 +56,11 @@ def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTa
 
 @stage("decompose")
 def closed_form(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.2,
     steps: Annotated[int, Range(0, 100)] = 2,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """One Gaussian for every candidate alone: a closed form and a few Gauss-Newton steps.
 
     Errors are at the Cramer-Rao bound for isolated echoes. Overlapping echoes are cut apart midway between them and are
@@ -90,15 +86,11 @@ def closed_form(
 
 @stage("decompose")
 def gaussian(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
     Batched Levenberg-Marquardt. Widths stay within 0.7 and 4 system widths, times within the window. No echo is added.
@@ -108,8 +100,8 @@ def gaussian(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
+        standard deviation of the minimum.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -123,11 +115,7 @@ def gaussian(
 
 @stage("decompose")
 def adaptive(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
     gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
@@ -136,7 +124,7 @@ def adaptive(
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 
     Each cluster of candidates is fitted with the strip's pulse. Where the smoothed residual or its Gauss-Hermite
@@ -159,8 +147,8 @@ def adaptive(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
+        standard deviation of the minimum.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -272,7 +260,7 @@ def find_clusters(
     start = np.stack(columns, axis=1).astype(np.float64)
     amplitude, time, width = model_parameters(settings.shape, limits, start).T
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
-    candidates = _join_plateaus(block, candidates, settings.clip)
+    candidates = _join_plateaus(block, candidates, clip_level(block, system))
     candidates, tail = _explain_tails(candidates, noise, settings)
     present, row = np.unique(candidates.waveform, return_inverse=True)
     signal = transpose_samples(block.samples[present])
@@ -290,10 +278,10 @@ def find_clusters(
     return candidates, clusters._replace(waveform=present[clusters.waveform])
 
 
-def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float | None) -> Candidates:
+def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) -> Candidates:
     """Candidates of which no two stand on one flat top: clipped samples between two are no sign of two echoes."""
     waveform, time, amplitude, _ = candidates
-    if clip is None or len(waveform) < 2:
+    if len(waveform) < 2:
         return candidates
     pair = np.flatnonzero(waveform[1:] == waveform[:-1])
     clipped = block.samples[waveform[pair]] >= clip

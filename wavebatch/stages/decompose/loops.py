@@ -16,6 +16,7 @@ from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.signal import smooth_121
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.detect.correlation import asdf
 from wavebatch.stages.flags import flag_echoes
@@ -23,16 +24,12 @@ from wavebatch.stages.flags import flag_echoes
 
 @stage("decompose")
 def residual_loop(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Gaussians, with one more at the largest residual of the waveform while that exceeds a threshold.
 
     Only their residual supports the added echoes: on pulses that are not Gaussian there are many.
@@ -55,40 +52,29 @@ def residual_loop(
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
     varies = find_varying(block.samples)
-    parts: list[tuple[EchoTable, int]] = []
+    parts: list[EchoTable] = []
     while len(rows):
         found = gaussian(
             block, noise, system, echoes, max_iterations=max_iterations, tolerance=0.1, significance=significance
         )
-        sample, height = _largest_residuals(block, noise, found)
+        residual = _residual(block, noise, found)
+        height = residual.max(axis=1)
         number = found.count(len(rows))
         grows = (height > t_diff * noise.std) & (number < max_echoes) & (number > before) & varies
-        final = found.take(np.flatnonzero(~grows[found.waveform]))
-        parts.append((replace(final, waveform=rows[final.waveform].astype(np.int32)), 0))
-        at = np.flatnonzero(grows)
-        echoes = _add_echoes(
-            found.take(np.flatnonzero(grows[found.waveform])), at, sample[at], height[at], block, system
-        )
-        echoes = replace(echoes, waveform=np.searchsorted(at, echoes.waveform).astype(np.int32))
+        at, goes_on = np.flatnonzero(grows), grows[found.waveform]
+        final, kept = found.take(np.flatnonzero(~goes_on)), found.take(np.flatnonzero(goes_on))
+        parts.append(_renumber(final, rows[final.waveform]))
+        new = residual[at].argmax(axis=1) * block.spacing
+        added = EchoTable.build(at, new, height[at], np.full(len(at), system.sigma_ref))
+        echoes = join_tables(kept, added)
+        echoes = _renumber(echoes, np.searchsorted(at, echoes.waveform))
         rows, before, varies, block = rows[at], number[at], varies[at], block.rows(at)
         noise = Noise(noise.baseline[at], noise.std[at])
-    table = EchoTable.concatenate(parts)
-    return table.take(np.lexsort((table.time, table.waveform)))
+    return join_tables(*parts)
 
 
-def _add_echoes(
-    found: EchoTable,
-    waveform: np.ndarray,
-    sample: np.ndarray,
-    height: np.ndarray,
-    block: WaveformBlock,
-    system: SystemPulse,
-) -> EchoTable:
-    """Add one echo to those found, of the system's width, at a sample of each of the given waveforms."""
-    ref = np.full(len(waveform), system.sigma_ref)
-    added = (waveform, sample * block.spacing, height, ref)
-    known = (found.waveform, found.time, found.amplitude, found.sigma)
-    return EchoTable.build(*(np.concatenate(pair) for pair in zip(known, added, strict=True)))
+def _renumber(table: EchoTable, waveform: np.ndarray) -> EchoTable:
+    return replace(table, waveform=waveform.astype(np.int32))
 
 
 def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarray:
@@ -100,24 +86,13 @@ def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarra
     return residual.astype(np.float32)
 
 
-def _largest_residuals(block: WaveformBlock, noise: Noise, table: EchoTable) -> tuple[np.ndarray, np.ndarray]:
-    """Sample and height of the largest residual of every waveform (n,)."""
-    residual = _residual(block, noise, table)
-    sample = np.argmax(residual, axis=1)
-    return sample, residual[np.arange(len(block)), sample]
-
-
 @stage("decompose")
 def asdf_only(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["shortcut", "mixed"] = "shortcut",
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where needed.
 
     Mixed: waveforms in which the chain's detector and the ASDF disagree in the number or the times of the echoes are
@@ -142,12 +117,10 @@ def asdf_only(
     differ = _disagree(len(block), echoes, quick, tolerance * system.sigma_ref)
     rows = np.flatnonzero(differ)
     chosen = echoes.take(np.flatnonzero(differ[echoes.waveform]))
-    chosen = replace(chosen, waveform=np.searchsorted(rows, chosen.waveform).astype(np.int32))
+    chosen = _renumber(chosen, np.searchsorted(rows, chosen.waveform))
     fitted = gaussian(block.rows(rows), Noise(noise.baseline[rows], noise.std[rows]), system, chosen)
-    fitted = replace(fitted, waveform=rows[fitted.waveform].astype(np.int32))
     agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
-    table = EchoTable.concatenate([(agreed, 0), (fitted, 0)])
-    return table.take(np.lexsort((table.time, table.waveform)))
+    return join_tables(agreed, _renumber(fitted, rows[fitted.waveform]))
 
 
 def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:

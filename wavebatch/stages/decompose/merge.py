@@ -107,5 +107,21 @@ def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
     keep = np.ones(len(table), bool)
     keep[first] = keep[first + 1] = False
     rest = table.take(np.flatnonzero(keep))
-    joined = EchoTable.concatenate([(rest, 0), (merged, 0)])
+    return join_tables(rest, merged)
+
+
+def join_tables(*tables: EchoTable) -> EchoTable:
+    """Join echoes of the same block into one table, sorted by waveform, then time.
+
+    Parameters
+    ----------
+    *tables : EchoTable
+        With the same columns.
+
+    Returns
+    -------
+    EchoTable
+        All echoes.
+    """
+    joined = EchoTable.concatenate((table, 0) for table in tables)
     return joined.take(np.lexsort((joined.time, joined.waveform)))

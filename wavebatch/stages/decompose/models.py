@@ -15,7 +15,7 @@ from wavebatch.kernels.fit.cluster import Candidates, Clusters, cut_windows
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model, gram_matrix, parameter_errors
-from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.fit import describe_solutions, find_clusters, fit_candidates, make_settings
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
@@ -25,24 +25,14 @@ POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
 """Exponents of the generalized Gaussian that are tried for every cluster."""
 
 
-def _model_settings(
-    block: WaveformBlock, system: SystemPulse, shape: PulseShape, max_iterations: int, tolerance: float
-) -> Settings:
-    return make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
-
-
 @stage("decompose")
 def skewed(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     kappa: Annotated[float, Range(-1.0, 1.0)] = 0.0,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
 
     The time is that of the peak.
@@ -54,8 +44,7 @@ def skewed(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -63,7 +52,8 @@ def skewed(
     ----------
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
-    settings = _model_settings(block, system, skewed_shape(system, kappa), max_iterations, tolerance)
+    shape = skewed_shape(system, kappa)
+    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
@@ -82,23 +72,18 @@ def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
     PulseShape
         Skewed, or Gaussian where the skew is negligible.
     """
-    skew = kappa or system.kappa
-    return PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
+    return pulse_shape(replace(system, components=(), kappa=kappa or system.kappa), 1.0)
 
 
 @stage("decompose")
 def reference(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
     pulse: str = "",
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
     Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
@@ -113,8 +98,7 @@ def reference(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -123,7 +107,7 @@ def reference(
     docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
-    settings = _model_settings(block, system, shape, max_iterations, tolerance)
+    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     if model != "broadened":
         system = replace(system, components=())
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
@@ -169,15 +153,11 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
 
 @stage("decompose")
 def generalized_gaussian(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
@@ -188,8 +168,7 @@ def generalized_gaussian(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -197,7 +176,7 @@ def generalized_gaussian(
     ----------
     Chauve et al. (2007), eq. 4.
     """
-    plain = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
+    plain = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     candidates, clusters = find_clusters(block, noise, system, echoes, plain)
     best = np.full(len(clusters.number), np.inf)
     chosen = np.zeros(len(best), np.int64)
@@ -238,15 +217,11 @@ def half_width_factor(power: float) -> float:
 
 @stage("decompose")
 def gauss_newton(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 20,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
     A fit that is lost returns its start, flagged as not converged.
@@ -256,8 +231,7 @@ def gauss_newton(
     max_iterations : int
         An echo that has not converged after so many is flagged.
     tolerance : float
-        A fit ends when its last step promised a smaller fall of chi2: it is then within a few hundredths of a standard
-        deviation of the minimum.
+        A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
 
@@ -265,7 +239,7 @@ def gauss_newton(
     ----------
     Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
-    settings = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
+    settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     candidates, clusters = find_clusters(block, noise, system, echoes, settings)
     found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in _alike(clusters, block)]
     return describe_solutions(block, noise, system, clusters, found, settings, significance)

@@ -42,16 +42,13 @@ def _in_parts(signal: np.ndarray, std: np.ndarray, detect: Callable[..., Candida
 
 @stage("detect")
 def correlation(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
     threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
     similarity: Annotated[float, Range(0.0, 1.0)] = 0.5,
     reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of the correlation with a reference pulse, where the waveform resembles it.
 
     Times come from a parabola through the logarithms of three correlations.
@@ -77,12 +74,11 @@ def correlation(
     energy = float(np.sum(given.taps**2))
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Candidates:
-        s, n = signal.shape
         padded = pad_samples(signal, given.middle)
         correlations = slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
-        squares = slide_energy(padded, len(given.taps)).reshape(-1)[sample * n + waveform]
-        value = correlations.reshape(-1)[sample * n + waveform]
+        squares = slide_energy(padded, len(given.taps))[sample, waveform]
+        value = correlations[sample, waveform]
         alike = value >= similarity * np.sqrt(np.maximum(squares, 0) * np.float32(energy))
         waveform, sample = waveform[alike], sample[alike]
         time, height = refine_peaks(correlations, waveform, sample)
@@ -93,10 +89,7 @@ def correlation(
 
 @stage("detect")
 def asdf(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "gaussian",
     rule: Literal["absolute", "paper"] = "absolute",
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.3,
@@ -104,7 +97,7 @@ def asdf(
     interpolation: Literal["log", "parabola"] = "log",
     reach: Annotated[float, Range(0.5, 20.0)] = 5.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the minima of the average square difference to a reference pulse as high as the waveform.
 
     The paper's rule loses echoes below 30 % of the strongest and finds at least one echo in noise alone. The absolute

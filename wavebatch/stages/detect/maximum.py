@@ -111,14 +111,11 @@ def matched_filter(
 
 @stage("detect")
 def second_derivative(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     threshold: Annotated[float, Range(0.0, 1e6)] = 2.0,
     scale: Annotated[float, Range(0.0, 100.0)] = 0.85,
     level: Annotated[float, Range(0.1, 1e6)] = 4.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
 
     The derivative is taken of the waveform smoothed by a Gaussian of width a. Equal echoes of width s are separated
@@ -143,8 +140,7 @@ def second_derivative(
     taps = curvature_taps(max(scale * ref, 0.7))
     curvature = filter_symmetric(signal, taps)
     waveform, sample = find_peaks(curvature, np.float32(threshold * np.sqrt(filter_energy(taps))) * noise.std)
-    s, n = smoothed.shape
-    high = smoothed.reshape(-1)[sample * n + waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
+    high = smoothed[sample, waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
     waveform, sample = waveform[high], sample[high]
     time, _ = refine_peaks(curvature, waveform, sample)
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)

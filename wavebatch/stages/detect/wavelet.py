@@ -30,14 +30,11 @@ AT_A_TIME = 1024
 
 @stage("detect")
 def wavelet(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     wavelet: Literal["b3", "mexican_hat"] = "b3",
     threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
     scale: Annotated[float, Range(0.0, 100.0)] = 0.0,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of one scale of a wavelet transform.
 
     The B3-spline transform with holes separates echoes from a distance of about one full width at half maximum on; its
@@ -74,16 +71,13 @@ def wavelet(
 
 @stage("detect")
 def richardson_lucy(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
     iterations: Annotated[int, Range(1, 10_000)] = 16,
     threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
     reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the peaks of the waveform deconvolved by Richardson and Lucy's iteration with the pulse.
 
     Each iteration starts from an extrapolation of the earlier ones. Separates echoes of the system's width that are 2
