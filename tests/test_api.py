@@ -127,6 +127,18 @@ def test_from_strip_to_echoes(strips):
                 np.testing.assert_array_equal(whole, parts)
 
 
+def test_echoes_become_a_structured_array(strips):
+    with wb.open_strip(strips[0]) as strip:
+        survey = wb.survey(strip)
+        echoes = wb.load_chain("accurate").run(next(strip.blocks()), survey.system)
+    rows = echoes.to_numpy()
+    assert len(rows) == len(echoes) > 1000
+    for name in ("waveform", "time", "amplitude", "sigma", "time_err", "flags"):
+        np.testing.assert_array_equal(rows[name], getattr(echoes, name))
+    assert {"echo_width", "x", "y", "z"} <= set(rows.dtype.names)
+    np.testing.assert_array_equal(rows["echo_width"], echoes.attributes["echo_width"])
+
+
 def test_survey_takes_a_path_and_says_what_the_command_says(strips):
     survey = wb.survey(strips[0], waveforms=500)
     assert survey.waveforms == 500

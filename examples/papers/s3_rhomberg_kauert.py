@@ -14,7 +14,6 @@ from table import Table, main
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import (
-    FWHM_PER_TAU,
     angles_of_variance,
     direct_width,
     paper_table,
@@ -29,6 +28,8 @@ from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_sy
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""
+FWHM_PER_TAU = 3.3946780749849567
+"""Full width at half maximum of t^2 exp(-t), in tau (docs/algorithms.md 1.4); of the printed t exp(-t) it is 3.5."""
 OWN = LENGTH / FWHM_PER_SIGMA
 DEGREES = (5, 10, 20, 30, 45, 60, 75)
 WIDTHS = {

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
-from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Decision, Survey
 from wavebatch.surveying.auto_chain import ANGLE
@@ -58,8 +58,9 @@ def predict_angles(
     """
     width = system.sigma_ref / spacing
     own = float(np.sqrt(max(system.sigma_ref**2 + system.level_variance, 1e-12)))
-    if width < LEAST_WIDTH:
-        reason = f"the system pulse is {width:.2f} samples wide, {LEAST_WIDTH} are needed for widths to mean a slope"
+    if width < LEAST_PULSE_WIDTH:
+        needed = f"{LEAST_PULSE_WIDTH} are needed for widths to mean a slope"
+        reason = f"the system pulse is {width:.2f} samples wide, {needed}"
         return AngleOutlook(np.inf, max_error, reason)
     added = float(spread_of_angle(np.radians(SLOPE), distance, 1e-3 * divergence))
     sigma = float(np.hypot(own, added))

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.attribute.radiometry import is_alone, level_angle
@@ -21,9 +22,6 @@ from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_samp
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
-
-HALF_NORMAL = 0.455
-"""Median of the square of a standard normal number."""
 
 
 def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing: float) -> SystemPulse:
@@ -45,7 +43,7 @@ def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing:
     # The survey's pulse may hold slopes, but no echo is narrower than the true one.
     level = min(_find_level(variance, error), 0.0)
     below = variance < level
-    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / HALF_NORMAL if below.any() else 1.0
+    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
     excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
     return replace(system, level_variance=level, width_scatter=scatter)

@@ -80,4 +80,5 @@ def rebuild_waveforms(
         return None
     described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
     amplitude, time, width = model_parameters(shape, shape_limits(system, spacing), described.astype(np.float64)).T
-    return render_echoes(shape, *block.samples.shape, echoes.waveform, time, amplitude, width)
+    n, s = block.samples.shape
+    return render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
