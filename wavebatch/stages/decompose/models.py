@@ -18,7 +18,8 @@ from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model
 from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.decompose.fit import describe_solutions, find_clusters, fit_candidates, make_settings
+from wavebatch.stages.decompose.fit import describe_solutions, fit_candidates, make_settings
+from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
