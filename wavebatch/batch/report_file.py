@@ -16,9 +16,10 @@ from wavebatch.batch.explain import explain_absence
 from wavebatch.batch.unit import Prepared, StripJob
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
-from wavebatch.surveying.system_file import format_survey, write_text
+from wavebatch.surveying.system_file import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 BATCH_SCHEMA = "wavebatch.batch-report/1"

@@ -52,8 +52,9 @@ def calibrate(
     its targets give no constant, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
+    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.calibration import format_calibration
-    from wavebatch.surveying.system_file import load_survey, write_text
+    from wavebatch.surveying.system_file import load_survey
     from wavebatch.surveying.targets import calibrate_strip, load_targets
 
     sensor = read_sensor(options)

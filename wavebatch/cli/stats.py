@@ -19,7 +19,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
-from wavebatch.surveying.system_file import write_text
+from wavebatch.files.text_file import write_text
 from wavebatch.tools.return_stats.areas import AreaStats, Grid, PolygonSet
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 

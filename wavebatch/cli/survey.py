@@ -42,8 +42,9 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     or a file not be written.
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
+    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
-    from wavebatch.surveying.system_file import write_survey, write_text
+    from wavebatch.surveying.system_file import write_survey
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):

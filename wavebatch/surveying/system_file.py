@@ -14,7 +14,7 @@ from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
+from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
@@ -152,25 +152,6 @@ def _format_fingerprint(fingerprint: Mapping[str, Any]) -> list[str]:
 def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
     """The survey as a file that appears whole or not at all; InputError where it exists or cannot be written."""
     write_text(path, format_survey(saved), overwrite=overwrite)
-
-
-def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """A text file that appears whole or not at all; InputError where it exists or cannot be written.
-
-    With overwrite a device or a pipe (/dev/null, /dev/stdout) gets the text as it is.
-    """
-    data = text.encode(errors="replace")  # a strip's name can be any bytes
-    if overwrite and is_stream(path):
-        with reporting(path), open_stream(path) as stream:
-            stream.write(data)
-        return
-    draft = Draft(path, overwrite=overwrite)
-    try:
-        with reporting(path):
-            draft.file.write(data)
-        draft.publish()
-    finally:
-        draft.discard()
 
 
 def load_survey(path: Path | str) -> SavedSurvey:
