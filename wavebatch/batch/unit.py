@@ -156,10 +156,10 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
     """How the points of the strip's output look; raises InputError or ConfigError where that cannot be had."""
     options = job.options
     return plan_output(
-        facts,
+        facts.checked,
         options.columns,
         point_format=options.point_format,
-        keep_packets=options.keep_packets,
+        packets=facts if options.keep_packets else None,
         names=options.names,
         points=options.points,
     )
@@ -218,7 +218,7 @@ def process_unit(prepared: Prepared, number: int, block_size: int | None = None)
     start = time.perf_counter()
     stages: dict[str, float] = {}
     echoes_mode = prepared.job.options.points == "echoes"
-    with prepared.job.open() as reader:
+    with StripReader.reopen(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         opened = time.perf_counter()
         size = block_size or _block_size(unit)

@@ -11,12 +11,11 @@ import numpy as np
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.raw_bytes import take_records, widen
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.strip.facts import StripFacts, collect_facts
+from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_vectors import check_option, read_toward
-from wavebatch.files.strip.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
+from wavebatch.files.strip.packets import PacketFile, PacketPlace, block_rows
 from wavebatch.files.strip.scan_result import StripScan, raise_problem
 from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
@@ -29,7 +28,6 @@ UNIT_POINTS = 50_000
 UNIT_BYTES = 1 << 26
 """Points with very long records make smaller units."""
 _SAMPLED_UNITS = 16
-_FIRST_POINTS = 10_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,17 +87,22 @@ class StripReader:
 
     def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
         check_option(direction)
-        checked = read_checked_header(Path(path))
-        found = read_descriptors(checked.header)
-        place = locate_packets(checked, found.compression, headerless)
-        self._points = open_points(checked)
+        self._open(find_facts(Path(path), direction, headerless))
+
+    @classmethod
+    def reopen(cls, facts: StripFacts) -> StripReader:
+        """Return a reader of a strip whose facts are known, so that its headers need not be read and checked again."""
+        reader = cls.__new__(cls)
+        reader._open(facts)
+        return reader
+
+    def _open(self, facts: StripFacts) -> None:
+        self.facts = facts
+        self._points = open_points(facts.checked)
         try:
-            if place.base < 0:
-                some = self._points.read(0, min(checked.header.point_count, _FIRST_POINTS))
-                place = settle_headerless(place, some)
-            self.facts = collect_facts(checked, found, place, direction)
-            self._judge = Judge(self.facts)
-            self._packets = PacketFile(place)
+            self._judge = Judge(facts)
+            place = (facts.packet_file, facts.internal, facts.packet_base, facts.packet_start, facts.packet_end)
+            self._packets = PacketFile(PacketPlace(*place))
         except BaseException:
             self._points.close()
             raise

@@ -10,7 +10,8 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
-from wavebatch.files.cloud.return_io import FORMATS, ReturnWriter
+from wavebatch.files.cloud.return_io import ReturnWriter
+from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
 from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight
 from wavebatch.tools.simulate.returns import Returns
@@ -112,7 +113,7 @@ def simulate_returns(
     points = empty = 0
     with ReturnWriter(
         target,
-        point_format=FORMATS[options.point_format],
+        point_format=WITHOUT_WAVES[options.point_format],
         scales=(options.scale,) * 3,
         offsets=(EAST, NORTH, 0.0),
         wkt=WKT,
