@@ -198,7 +198,7 @@ def test_cut_laz_files(tmp_path, cut, point_format):
     begin = struct.unpack_from("<I", data, 96)[0]
     table = struct.unpack_from("<q", data, begin)[0]
     path.write_bytes(data[: int(begin + (table + 8 - begin) * cut)])
-    refused(path, "LAZ chunks|record of its packets")
+    refused(path, "LAZ chunks|waveform record at byte")
 
 
 def test_a_chunk_that_does_not_fit_memory_is_refused(tmp_path, monkeypatch):

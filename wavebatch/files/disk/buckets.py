@@ -16,7 +16,7 @@ BUCKET_ROWS = 400_000
 """Rows in memory at a time, unless MOST_BUCKETS are too few."""
 
 MOST_BUCKETS = 72
-"""More buckets make the pieces of a bucket on disk so small that reading them takes most of the time."""
+"""With BUCKET_ROWS these hold 29 million rows; more rows make larger buckets, so that reads from disk stay long."""
 
 MOST_RETURNS = 16
 """Most points per GPS time on average; with more, times are not those of pulses (LAS allows 15 returns)."""
