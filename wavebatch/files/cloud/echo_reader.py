@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Self
 
 import laspy
 import numpy as np
@@ -16,6 +15,7 @@ from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_names import STYLES
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.read_points import open_points
@@ -44,7 +44,7 @@ _LARGEST = 1e30
 """Larger values are damage and become no data: their squares would overflow in single precision."""
 
 
-class CloudReader:
+class CloudReader(Closing):
     """Reads a LAS or LAZ file in pieces of CLOUD_DTYPE; subclasses read other records. A context manager.
 
     Raises InputError if the file is damaged, or compressed in a way that no installed library can read.
@@ -63,10 +63,8 @@ class CloudReader:
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
         self._points = open_points(checked)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._points.close()
 
     def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:

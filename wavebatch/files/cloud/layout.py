@@ -1,7 +1,7 @@
 """Layout of the points of one output cloud, and the rows that are made for it from input records and columns.
 
 The batch plans the layout once per strip, workers make the rows of each unit, and `writer.CloudWriter` writes them.
-Rows depend only on their own input, never on the block or unit they are made in.
+A row depends only on its input point and echo, never on the block or unit that it is made in.
 """
 
 from __future__ import annotations
@@ -135,10 +135,7 @@ class OutputLayout:
                     f"integers at scale {self.scales[axis]:g} and offset {self.offsets[axis]:g}; rescale the strip "
                     "(las2las -rescale ... -reoffset ...) and run again"
                 )
-            if new.all():
-                rows[name] = counts.astype(np.int32)
-            else:
-                rows[name][new] = counts[new].astype(np.int32)
+            rows[name] = np.where(new, counts, rows[name])
 
     def _set_returns(self, rows: np.ndarray, number: np.ndarray | None, count: np.ndarray | None) -> None:
         bits = 4 if self.point_format >= 6 else 3

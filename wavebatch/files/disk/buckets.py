@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 
 BUCKET_ROWS = 400_000
@@ -28,7 +29,7 @@ Sorter = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From rows to (row numbers, bucket numbers); a row may go into several buckets, or into none."""
 
 
-class Buckets:
+class Buckets(Closing):
     """Rows of one dtype in `number` buckets: `add` all of them, then `read` bucket by bucket. A context manager.
 
     Raises InputError if there is no room for the temporary file.
@@ -36,12 +37,6 @@ class Buckets:
 
     def __init__(self, dtype: np.dtype, number: int) -> None:
         self._spool = Spool(number, dtype)
-
-    def __enter__(self) -> Buckets:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def add(self, rows: np.ndarray, sorter: Sorter) -> None:
         """Put rows (n,) into the buckets that `sorter` gives; a single bucket takes all rows."""

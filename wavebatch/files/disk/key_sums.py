@@ -13,6 +13,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.temp_folders import reporting_scratch, scratch_place
 
 HELD = 1 << 18
@@ -22,7 +23,7 @@ STRIDE = 256
 """One key of so many rows on disk stays in memory, to find ranges of keys without reading."""
 
 
-class KeyedSums:
+class KeyedSums(Closing):
     """Sums of `columns` integers per key: `add` any number of times, then `pieces`, then `close`.
 
     held: rows in memory; more rows go to a temporary file. A context manager.
@@ -36,12 +37,6 @@ class KeyedSums:
         self._number = 0
         self._file: IO[bytes] | None = None
         self._runs: list[_Run] = []
-
-    def __enter__(self) -> KeyedSums:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Remove the temporary file."""

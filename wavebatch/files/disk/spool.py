@@ -1,7 +1,7 @@
 """Entries sorted into numbered buckets: few of them stay in memory, many go to a temporary file.
 
-The strip scan, the second pass and `Buckets` use it. A sealed spool is pickled and read by other processes, while its
-own process removes the file at the end.
+The strip scan, the second pass and `Buckets` use it. A sealed spool is pickled and read by other processes; only the
+process that made it removes the file.
 """
 
 from __future__ import annotations

@@ -25,13 +25,13 @@ def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool)
 
     keep: the output keeps the waveform fields. Raises ConfigError if the wanted format would lose anything else.
     """
-    own = header.point_format
+    given = header.point_format
     if wanted is None:
-        return own if keep else WITHOUT_WAVES.get(own, own)
-    legal = [number for number in STANDARD_DTYPES if _can_hold(own, number) and (number in WITHOUT_WAVES) == keep]
+        return given if keep else WITHOUT_WAVES.get(given, given)
+    legal = [number for number in STANDARD_DTYPES if _can_hold(given, number) and (number in WITHOUT_WAVES) == keep]
     if wanted not in legal:
         raise ConfigError(
-            f"{path}: point format {own} cannot be written as {wanted}{' with its packets' if keep else ''} without "
+            f"{path}: point format {given} cannot be written as {wanted}{' with its packets' if keep else ''} without "
             f"loss; possible are {', '.join(map(str, legal))}"
         )
     return wanted

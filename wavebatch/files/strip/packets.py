@@ -96,21 +96,21 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & WAVES_INTERNAL:
         return _locate_internal(checked)
-    beside = _find_beside(path)
+    packet_file = _find_packet_file(path)
     if header.global_encoding & WAVES_EXTERNAL:
-        if beside is None:
-            if _find_beside(path, "wdz") is not None:
+        if packet_file is None:
+            if _find_packet_file(path, "wdz") is not None:
                 raise refuse_compressed(path, 1)
             raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
-        return _locate_external(checked, beside, headerless)
+        return _locate_external(checked, packet_file, headerless)
     warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
     if header.waveform_start:
         place = _locate_internal(checked)
         return replace(place, warnings=(*place.warnings, f"{warning}; they are read from the record in the file"))
-    if beside is not None:
-        place = _locate_external(checked, beside, headerless)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {beside.name}"))
-    if _find_beside(path, "wdz") is not None:
+    if packet_file is not None:
+        place = _locate_external(checked, packet_file, headerless)
+        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {packet_file.name}"))
+    if _find_packet_file(path, "wdz") is not None:
         raise refuse_compressed(path, 1)
     return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
 
@@ -123,7 +123,7 @@ def refuse_compressed(path: Path, kind: int) -> InputError:
     )
 
 
-def _find_beside(path: Path, suffix: str = "wdp") -> Path | None:
+def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
     for candidate in (path.with_suffix(f".{suffix}"), path.with_suffix(f".{suffix.upper()}")):
         if candidate.is_file():
             return candidate
@@ -156,22 +156,22 @@ def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     return PacketPlace(path, True, at, at + EVLR_HEADER_SIZE, end, tuple(warnings))
 
 
-def _locate_external(checked: CheckedHeader, beside: Path, headerless: bool) -> PacketPlace:
-    size = beside.stat().st_size
-    with open(beside, "rb") as file:
+def _locate_external(checked: CheckedHeader, packet_file: Path, headerless: bool) -> PacketPlace:
+    size = packet_file.stat().st_size
+    with open(packet_file, "rb") as file:
         head = file.read(EVLR_HEADER_SIZE)
     warnings = []
     if len(head) < EVLR_HEADER_SIZE or not head[2:].startswith(b"LAS") or head[18:20] != b"\xff\xff":
         if not headerless:
             raise InputError(
-                f"{checked.path}: {beside.name} does not begin with the 60-byte header of a waveform record; if it has "
-                "no header, run again with --headerless, else get it again"
+                f"{checked.path}: {packet_file.name} does not begin with the 60-byte header of a waveform record; "
+                "if it has no header, run again with --headerless, else get it again"
             )
-        return PacketPlace(beside, False, -EVLR_HEADER_SIZE, 0, size, (f"{beside.name} has no header",))
+        return PacketPlace(packet_file, False, -EVLR_HEADER_SIZE, 0, size, (f"{packet_file.name} has no header",))
     (length,) = struct.unpack_from("<Q", head, 20)
     if length not in (0, size - EVLR_HEADER_SIZE):
-        warnings.append(f"{beside.name} claims {length} bytes of packets, {size - EVLR_HEADER_SIZE} are there")
-    return PacketPlace(beside, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
+        warnings.append(f"{packet_file.name} claims {length} bytes of packets, {size - EVLR_HEADER_SIZE} are there")
+    return PacketPlace(packet_file, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
 
 
 def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:

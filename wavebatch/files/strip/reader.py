@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_records, widen
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
@@ -80,7 +81,7 @@ class Unit:
     vector_form: str
 
 
-class StripReader:
+class StripReader(Closing):
     """Reads one strip; opening reads only the headers. A context manager.
 
     Parameters
@@ -121,12 +122,6 @@ class StripReader:
         except BaseException:
             self._points.close()
             raise
-
-    def __enter__(self) -> StripReader:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the files; scans stay valid."""

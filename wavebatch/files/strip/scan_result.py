@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StripScan:
+class StripScan(Closing):
     """Result of one pass over the points; picklable. `close` it (or use `with`) to remove its temporary file."""
 
     points: int
@@ -66,18 +67,12 @@ class StripScan:
         """Remove the temporary file."""
         self.context.close()
 
-    def __enter__(self) -> StripScan:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
 
 def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
     """Return the message about a strip without any usable packet."""
     if facts.packet_file is None:
-        beside = facts.path.with_suffix(".wdp").name
-        return f"points refer to packets that are neither in the file nor next to it: put {beside} next to the strip"
+        name = facts.path.with_suffix(".wdp").name
+        return f"points refer to packets that are neither in the file nor next to it: put {name} next to the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
     remedy = f"{facts.packet_file.name} is cut, damaged or belongs to another strip: get it again"
