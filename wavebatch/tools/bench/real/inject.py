@@ -1,0 +1,295 @@
+"""Echoes of known time, amplitude and width, added to the waveforms of a strip."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.stages.score import match_echoes
+from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, find_fill
+from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
+
+QUIET = 4.0
+"""An injected echo this far from every echo of its waveform lies in a quiet stretch [FWHM of the system pulse]."""
+
+NEAREST, FARTHEST = 0.5, 4.0
+"""Separations from the strongest echo that are tried, before and after it [FWHM]."""
+
+EDGE = 1.5
+"""Least distance of an injected echo from the ends of its waveform [FWHM]."""
+
+LEAST = 2.5
+"""Least amplitude that is injected [noise standard deviations]."""
+
+TRIES = 24
+"""Places that are tried for an echo in a waveform before another waveform is taken."""
+
+TOLERANCE = 0.6
+"""A found echo this near is the injected one [FWHM]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Injected:
+    """k injected echoes and what a chain made of them, one array per field."""
+
+    near: np.ndarray
+    """Near the waveform's strongest echo, else in a quiet stretch, bool."""
+    separation: np.ndarray
+    """From the strongest echo, negative before it [FWHM]; NaN in quiet stretches."""
+    host: np.ndarray
+    """Amplitude of that echo [DN]; NaN in quiet stretches."""
+    amplitude: np.ndarray
+    """[DN]."""
+    clipped: np.ndarray
+    """Samples of it are at the digitizer's limit, bool."""
+    found: np.ndarray
+    """Found, and the strongest echo still found too where it is near, bool."""
+    extra: np.ndarray
+    """Echoes found that neither were there before nor were injected."""
+    errors: np.ndarray
+    """Found minus injected time [ns], amplitude [DN] and sigma [ns], (k, 3); NaN where not found."""
+    reported: np.ndarray
+    """Standard deviations of these that the chain reports, (k, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.near)
+
+    def take(self, rows: np.ndarray) -> Injected:
+        """The echoes at `rows`."""
+        return Injected(*(getattr(self, name)[rows] for name in self.__slots__))
+
+    @classmethod
+    def join(cls, parts: Sequence[Injected]) -> Injected:
+        """All echoes of several tables."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Places:
+    """Where echoes are injected into a block."""
+
+    row: np.ndarray
+    time: np.ndarray
+    strongest: np.ndarray
+    """Row in the table of echoes of the strongest echo of the waveform; -1 for quiet stretches."""
+
+
+def inject_echoes(
+    pool: Pool,
+    solver: Solver,
+    echoes: Sequence[EchoTable],
+    templates: Sequence[Template],
+    noise: float,
+    number: int,
+    rng: np.random.Generator,
+) -> Injected:
+    """Injects about `number` echoes, half in quiet stretches and half near strong echoes, and runs the chain again.
+
+    echoes: of the pool's blocks. noise: standard deviation of a quiet sample [DN]. Only one echo is added to a copy of
+    a waveform. Blocks without a template of their digitizer get none.
+    """
+    parts = []
+    for block, table in zip(pool.blocks, echoes, strict=True):
+        usable = [template for template in templates if template.kind == digitizer_kind(block)]
+        share = round(number * len(block) / max(len(pool), 1))
+        if not usable or not share:
+            continue
+        for near in (False, True):
+            for begin in range(0, max(share // 2, 1), ROWS):
+                wanted = min(ROWS, max(share // 2, 1) - begin)
+                places = _find_places(block, table, solver, noise, wanted, near, rng)
+                if len(places.row):
+                    parts.append(_inject(block, table, solver, usable, noise, places, rng))
+    return Injected.join(parts) if parts else _nothing()
+
+
+def _nothing() -> Injected:
+    none = np.empty(0)
+    return Injected(none > 0, none, none, none, none > 0, none > 0, none, np.empty((0, 3)), np.empty((0, 3)))
+
+
+def _find_places(
+    block: WaveformBlock,
+    table: EchoTable,
+    solver: Solver,
+    noise: float,
+    wanted: int,
+    near: bool,
+    rng: np.random.Generator,
+) -> _Places:
+    """Random places that meet the rules; fewer than wanted where the strip has no room."""
+    fwhm, end = solver.fwhm, (block.samples.shape[1] - 1) * block.spacing
+    strongest = _strongest(table, len(block))
+    hosts = np.arange(len(block))
+    if near:
+        strong = np.where(strongest >= 0, table.amplitude[strongest] if len(table) else 0.0, 0.0)
+        hosts = np.flatnonzero(strong > 10 * noise)
+    if not len(hosts) or end <= 2 * EDGE * fwhm:
+        return _Places(*(np.empty(0, np.int64),) * 3)
+    row = np.repeat(rng.choice(hosts, wanted), TRIES)
+    if near:
+        # As many at each ratio of separations: the narrow ones matter most.
+        apart = np.exp(rng.uniform(np.log(NEAREST), np.log(FARTHEST), len(row))) * rng.choice((-1, 1), len(row))
+        time = table.time[strongest[row]] + apart * fwhm
+    else:
+        time = rng.uniform(EDGE * fwhm, end - EDGE * fwhm, len(row))
+    good = (time >= EDGE * fwhm) & (time <= end - EDGE * fwhm)
+    good &= _is_clear(table, row, time, fwhm, strongest if near else None)
+    good &= ~_touches_fill(block, row, time, fwhm)
+    tries = good.reshape(wanted, TRIES)
+    done = np.flatnonzero(tries.any(axis=1))
+    chosen = done * TRIES + tries[done].argmax(axis=1)
+    owner = strongest[row[chosen]] if near else np.full(len(chosen), -1)
+    return _Places(row[chosen], time[chosen], owner)
+
+
+def _strongest(table: EchoTable, n: int) -> np.ndarray:
+    """Row of the strongest echo of each waveform, -1 without any."""
+    strongest = np.full(n, -1)
+    order = np.lexsort((table.amplitude, table.waveform))
+    strongest[table.waveform[order]] = order
+    return strongest
+
+
+def _is_clear(
+    table: EchoTable, row: np.ndarray, time: np.ndarray, fwhm: float, strongest: np.ndarray | None
+) -> np.ndarray:
+    """Whether no echo of the waveform is near; the strongest may be, and others of it further off then."""
+    clear = np.ones(len(row), bool)
+    count = np.bincount(table.waveform, minlength=int(row.max(initial=0)) + 1)
+    first = np.cumsum(count) - count
+    for order in range(int(count.max(initial=0))):
+        have = np.flatnonzero(count[row] > order)
+        echo = first[row[have]] + order
+        apart = np.abs(time[have] - table.time[echo]) / fwhm
+        limit = QUIET if strongest is None else np.where(strongest[row[have]] == echo, 0.0, 0.5 * QUIET)
+        clear[have] &= apart >= limit
+    return clear
+
+
+def _touches_fill(block: WaveformBlock, row: np.ndarray, time: np.ndarray, fwhm: float) -> np.ndarray:
+    """Whether a gap between two recordings lies under the echo or next to it."""
+    fill = find_fill(block.samples)
+    if not fill.any():
+        return np.zeros(len(row), bool)
+    before = np.concatenate([np.zeros((len(fill), 1), np.int64), np.cumsum(fill, axis=1)], axis=1)
+    s = fill.shape[1]
+    low = np.clip(np.floor((time - EDGE * fwhm) / block.spacing), 0, s).astype(int)
+    high = np.clip(np.ceil((time + EDGE * fwhm) / block.spacing) + 1, 0, s).astype(int)
+    return before[row, high] > before[row, low]
+
+
+def _inject(
+    block: WaveformBlock,
+    table: EchoTable,
+    solver: Solver,
+    templates: Sequence[Template],
+    noise: float,
+    places: _Places,
+    rng: np.random.Generator,
+) -> Injected:
+    k = len(places.row)
+    system = solver.system.of(block)
+    limit = clip_level(block, system)
+    height, which = _draw_pulses(templates, noise, k, rng)
+    lag = np.arange(block.samples.shape[1]) * block.spacing - places.time[:, None]
+    pulse = np.empty(lag.shape)
+    for number in np.unique(which):
+        pulse[which == number] = templates[number].evaluate(lag[which == number])
+    samples = block.samples[places.row]
+    added = add_signal(samples, height[:, None] * pulse, limit, find_fill(samples), rng)
+    core = np.abs(lag) < solver.fwhm
+    clipped = ((added >= limit) & core).any(axis=1)
+    found = solver.run(bare_block(block, added))
+    gain, delay, sigma = np.array([(t.gain, t.delay, t.sigma) for t in templates])[which].T
+    amplitude, time = gain * height, places.time + delay
+    truth, is_new, is_host = _truth(table, places, amplitude, time, sigma)
+    match = match_echoes(found, truth, TOLERANCE * solver.fwhm)
+    place = np.full(len(truth), -1)
+    place[match.truth] = match.found
+    mine = place[is_new]
+    kept = np.ones(k, bool)
+    kept[truth.waveform[is_host]] = place[is_host] >= 0
+    near = places.strongest >= 0
+    hit = (mine >= 0) & kept
+    errors, reported = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
+    true = np.stack([time, amplitude, sigma], axis=1)
+    for column, name in enumerate(("time", "amplitude", "sigma")):
+        errors[hit, column] = getattr(found, name)[mine[hit]] - true[hit, column]
+        reported[hit, column] = getattr(found, f"{name}_err")[mine[hit]]
+    paired = np.bincount(found.waveform[match.found], minlength=k)
+    hosts = np.where(near, places.strongest, 0)
+    many = len(table) > 0
+    apart = (places.time - table.time[hosts]) / solver.fwhm if many else np.zeros(k)
+    return Injected(
+        near=near,
+        separation=np.where(near, apart, np.nan),
+        host=np.where(near, table.amplitude[hosts] if many else 0.0, np.nan),
+        amplitude=amplitude,
+        clipped=clipped,
+        found=hit,
+        extra=found.count(k) - paired,
+        errors=errors,
+        reported=reported,
+    )
+
+
+def _draw_pulses(
+    templates: Sequence[Template], noise: float, k: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights [DN], as many at each ratio, and the number of the template of each: one of echoes at least as strong."""
+    tiers = np.array([template.tier for template in templates])
+    tops = [max(t.amplitude for t in templates if t.tier == tier) for tier in np.unique(tiers)]
+    most = max(tops[-1], 2 * LEAST * noise)
+    height = np.exp(rng.uniform(np.log(LEAST * noise), np.log(most), k))
+    tier = np.unique(tiers)[np.minimum(np.searchsorted(np.maximum.accumulate(tops), height), len(tops) - 1)]
+    choice = rng.random(k)
+    which = np.empty(k, np.int64)
+    for number in np.unique(tier):
+        members, rows = np.flatnonzero(tiers == number), tier == number
+        which[rows] = members[(choice[rows] * len(members)).astype(int)]
+    return height, which
+
+
+def add_signal(
+    samples: np.ndarray, signal: np.ndarray, limit: float, fill: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Raw counts with a signal added as if the digitizer had seen both.
+
+    A recorded count stands for any value half a count around it: one of these is drawn, so that rounding the sum does
+    not add noise (rounding twice would), and samples without signal stay what they are. Counts at the digitizer's
+    limit stay there, and samples in `fill` stay as they are.
+    """
+    exact = samples + rng.uniform(-0.5, 0.5, samples.shape) + signal
+    top = min(limit, float(np.iinfo(samples.dtype).max))
+    added = np.clip(np.rint(exact), 0, top)
+    keep = fill | (samples >= limit) | (signal == 0)
+    return np.where(keep, samples, added).astype(samples.dtype)
+
+
+def _truth(
+    table: EchoTable, places: _Places, amplitude: np.ndarray, time: np.ndarray, sigma: np.ndarray
+) -> tuple[EchoTable, np.ndarray, np.ndarray]:
+    """The echoes that the copies hold; rows of the injected ones in order of the copies, and of the hosts."""
+    k = len(places.row)
+    count = np.bincount(table.waveform, minlength=int(places.row.max(initial=0)) + 1)
+    first = np.cumsum(count) - count
+    number = count[places.row]
+    copy = np.repeat(np.arange(k), number)
+    old = np.repeat(first[places.row] - (np.cumsum(number) - number), number) + np.arange(len(copy))
+    waveform = np.r_[copy, np.arange(k)]
+    is_new = np.repeat((False, True), (len(copy), k))
+    is_host = np.r_[places.strongest[copy] == old, np.zeros(k, bool)]
+    truth = EchoTable.build(
+        waveform,
+        np.r_[table.time[old], time],
+        np.r_[table.amplitude[old], amplitude],
+        np.r_[table.sigma[old], sigma],
+        attributes={"new": is_new, "host": is_host},
+    )
+    return truth, np.flatnonzero(truth.attributes["new"]), np.flatnonzero(truth.attributes["host"])

@@ -1,0 +1,93 @@
+"""Noise of a strip's quiet samples, measured apart from the survey: standard deviation and correlation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+
+LAGS = 8
+"""Lags at which the covariance is measured [samples]; beyond them it counts as none."""
+
+QUIET_BEFORE, QUIET_AFTER = 6.0, 25.0
+"""Samples this far from every echo are quiet [sigma of the system pulse]: pulses rise fast and have long tails."""
+
+LEAST_QUIET = 6
+"""Quiet samples of a waveform that is looked at."""
+
+OUTLIER = 4.5
+"""Samples further off are echoes too weak to be found, or spikes [standard deviations]."""
+
+
+@dataclass(frozen=True, slots=True)
+class QuietNoise:
+    """Noise of samples far from any echo."""
+
+    std: float
+    """[DN]."""
+    correlation: tuple[float, ...]
+    """With the next sample, the one after it, ..."""
+    samples: int
+
+
+def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> QuietNoise:
+    """Noise about the mean of each waveform's quiet samples.
+
+    The mean of a few correlated samples follows their noise; what it takes away is added again, from the covariance
+    itself, until both agree. echoes: of the pool's blocks.
+    """
+    products, pairs = np.zeros(LAGS + 1), np.zeros(LAGS + 1)
+    lengths = []
+    for block, table in zip(pool.blocks, echoes, strict=True):
+        quiet = _find_quiet(block, table, solver.system.sigma_ref)
+        quiet &= (quiet.sum(axis=1) >= LEAST_QUIET)[:, None]
+        number = quiet.sum(axis=1)
+        mean = np.sum(block.samples * quiet, axis=1) / np.maximum(number, 1)
+        deviation = block.samples - mean[:, None]
+        if not quiet.any():
+            continue
+        # 0.455 is the median of a squared standard normal number.
+        usual = np.sqrt(np.median(deviation[quiet] ** 2) / 0.455)
+        kept = quiet & (np.abs(deviation) < OUTLIER * max(float(usual), QUANTISATION_STD))
+        for lag in range(min(LAGS + 1, kept.shape[1])):
+            end = kept.shape[1] - lag
+            both = kept[:, lag:] & kept[:, :end]
+            products[lag] += (deviation[:, lag:] * deviation[:, :end])[both].sum()
+            pairs[lag] += both.sum()
+        lengths.append(np.repeat(number, number))
+    if not lengths or pairs[0] < 100:
+        return QuietNoise(solver.system.noise_std, (), int(pairs[0]))
+    covariance = _add_mean(products / np.maximum(pairs, 1), np.concatenate(lengths))
+    std = float(np.sqrt(max(covariance[0], QUANTISATION_STD**2)))
+    return QuietNoise(std, tuple(map(float, covariance[1:5] / std**2)), int(pairs[0]))
+
+
+def _find_quiet(block: WaveformBlock, table: EchoTable, sigma: float) -> np.ndarray:
+    """Recorded samples far from every echo, bool (n, s)."""
+    quiet = ~find_fill(block.samples)
+    time = np.arange(block.samples.shape[1]) * block.spacing
+    count = table.count(len(block))
+    first = np.cumsum(count) - count
+    for order in range(int(count.max(initial=0))):
+        rows = np.flatnonzero(count > order)
+        lag = (time - table.time[first[rows] + order][:, None]) / sigma
+        quiet[rows] &= (lag < -QUIET_BEFORE) | (lag > QUIET_AFTER)
+    return quiet
+
+
+def _add_mean(covariance: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Covariance (LAGS + 1,) about the true mean, from that about means of `lengths` samples, one per sample."""
+    kinds, weights = np.unique(lengths, return_counts=True)
+    lag = np.arange(1, LAGS + 1)
+    share = np.maximum(1 - lag / kinds[:, None], 0.0)
+    true = covariance
+    for _ in range(20):
+        of_mean = (true[0] + 2 * (share * true[1:]).sum(axis=1)) / kinds
+        true = covariance + np.clip(np.average(of_mean, weights=weights), 0.0, 2 * covariance[0])
+    return true
