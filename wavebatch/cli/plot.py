@@ -75,6 +75,9 @@ def plot() -> None:
               help="The first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True,
               help="Waveforms, where their number is not said.")
+@click.option("--random", type=click.IntRange(1, 100), metavar="N", help="N packets at random in place of these.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random packets.")
+@click.option("--sheet", is_flag=True, help="A contact sheet: up to 100 small pictures, cut to their echoes.")
 @click.option("--times", "shown", callback=_read_range, metavar="LOW:HIGH",
               help="The part of the waveforms to show [ns].  [default: all]")
 @click.option("-c", "--chain", "chain_file", type=click.Path(path_type=Path), metavar="FILE", help="Chain file (TOML).")
@@ -101,16 +104,19 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
     if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
         raise ConfigError("--flags-with looks for waveforms itself; leave --packet, --point and --gps-time out")
+    if options["random"] and (options["packets"] or options["points"] or options["times"] or options["flags_with"]):
+        raise ConfigError("--random draws packets itself; leave --packet, --point, --gps-time and --flags-with out")
     check_picture(output, overwrite=options["overwrite"])
     wanted = Wanted(
-        options["packets"], options["points"], options["times"], read_flags(options["flags_with"]), options["most"]
-    )
+        options["packets"], options["points"], options["times"], read_flags(options["flags_with"]), options["most"],
+        options["random"] or 0, options["seed"], options["sheet"],
+    )  # fmt: skip
     views, chain = _view(strip, wanted, options)
+    from wavebatch.tools.plots.draw_sheet import draw_sheet
     from wavebatch.tools.plots.draw_waveform import draw_waveforms
 
-    draw_waveforms(
-        views, output, strip=strip.name, chain=chain, times=options["shown"], overwrite=options["overwrite"]
-    )
+    draw = draw_sheet if options["sheet"] else draw_waveforms
+    draw(views, output, strip=strip.name, chain=chain, times=options["shown"], overwrite=options["overwrite"])
     if not options["quiet"]:
         talk(f"{output}: {len(views)} waveforms, {sum(len(view.echoes) for view in views)} echoes")
 

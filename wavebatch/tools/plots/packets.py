@@ -18,6 +18,9 @@ FARTHEST = 1e-3
 MOST = 24
 """Waveforms of a picture."""
 
+MOST_ON_SHEET = 100
+"""Waveforms of a contact sheet."""
+
 _BLOCK = 4096
 
 
@@ -35,6 +38,17 @@ class Wanted:
     """EchoFlag bits: the first waveforms with an echo that has one of them."""
     most: int = 6
     """Of those with flags, and of those spread evenly."""
+    random: int = 0
+    """Packets drawn at random in place of those spread evenly."""
+    seed: int = 0
+    """Of the random ones."""
+    sheet: bool = False
+    """For a contact sheet, which has room for more."""
+
+    @property
+    def limit(self) -> int:
+        """Waveforms that the picture has room for."""
+        return MOST_ON_SHEET if self.sheet else MOST
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +78,8 @@ def find_places(
     searches = [_Number(number) for number in _list_numbers(scan, wanted, str(path))]
     searches += [_Point(point) for point in wanted.points]
     searches += [_Time(time) for time in wanted.times]
-    if len(searches) > MOST:
-        raise ConfigError(f"{path}: {len(searches)} waveforms are too many for a picture; {MOST} fit")
+    if len(searches) > wanted.limit:
+        raise ConfigError(f"{path}: {len(searches)} waveforms are too many for a picture; {wanted.limit} fit")
     for point in wanted.points:
         if not 0 <= point < scan.points:
             raise ConfigError(f"{path}: there is no point {point}; points are 0 to {scan.points - 1}")
@@ -80,14 +94,17 @@ def find_places(
 
 def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
     """Numbers of the packets that are asked for; without any request those spread evenly."""
+    if wanted.random:
+        number = min(wanted.random, scan.packets)
+        return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
     if not (wanted.packets or wanted.points or wanted.times):
-        return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, MOST)).round().astype(int)).tolist()
+        return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, wanted.limit)).round().astype(int)).tolist()
     numbers: list[int] = []
     for first, behind in wanted.packets:
         if not 0 <= first < behind <= scan.packets:
             asked = str(first) if behind == first + 1 else f"{first}:{behind}"
             raise ConfigError(f"{path}: there is no packet {asked}; packets are 0 to {scan.packets - 1}")
-        numbers += range(first, min(behind, first + MOST + 1))
+        numbers += range(first, min(behind, first + wanted.limit + 1))
     return numbers
 
 
@@ -184,7 +201,7 @@ def _find_flagged(
 ) -> list[Place]:
     """The first waveforms, in the order of the file, with an echo that has one of the flags."""
     found: list[Place] = []
-    most = min(wanted.most, MOST)
+    most = min(wanted.most, wanted.limit)
     for unit, base in _read_units(reader, scan):
         rows = np.flatnonzero(unit.packets.owned)
         for begin in range(0, len(rows), _BLOCK):

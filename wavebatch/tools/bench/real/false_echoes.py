@@ -9,10 +9,10 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.inject import TOLERANCE
+from wavebatch.tools.bench.real.noise import QuietNoise, unround
 from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
 from wavebatch.tools.bench.real.templates import bare_block
 
@@ -53,9 +53,14 @@ class FalseEchoes:
     before: Stretch
     after: Stretch
 
+    @property
+    def correctness(self) -> float:
+        """Share of the echoes that noise did not make; NaN without any."""
+        return 1 - (self.mirrored_near + self.mirrored_far) / self.echoes if self.echoes else float("nan")
+
 
 def count_false(
-    pool: Pool, solver: Solver, echoes: Sequence[EchoTable], noise: float, rng: np.random.Generator
+    pool: Pool, solver: Solver, echoes: Sequence[EchoTable], noise: QuietNoise, rng: np.random.Generator
 ) -> FalseEchoes:
     """Counts false echoes in all waveforms of the pool.
 
@@ -66,8 +71,8 @@ def count_false(
     length, found, near, far = 0.0, 0, 0, 0
     stretches = np.zeros((2, 3))
     for block, table in zip(pool.blocks, echoes, strict=True):
-        new = _mirror(block, table, solver, rng)
-        first, last = _signal_span(block, table, noise)
+        new = _mirror(block, table, solver, noise, rng)
+        first, last = _signal_span(block, table, noise.std)
         alone = _apart(new, table, len(block)) > NEAR * solver.fwhm
         length += block.samples.size * block.spacing
         found += len(table)
@@ -77,17 +82,13 @@ def count_false(
     return FalseEchoes(length, found, near, far, before, after)
 
 
-def _mirror(block: WaveformBlock, table: EchoTable, solver: Solver, rng: np.random.Generator) -> EchoTable:
+def _mirror(
+    block: WaveformBlock, table: EchoTable, solver: Solver, noise: QuietNoise, rng: np.random.Generator
+) -> EchoTable:
     """Echoes that appear when residuals change their sign."""
-    system = solver.system.of(block)
-    first = solver.chain.steps[0]
-    noise = first.stage.function(block, system, **first.parameters)
-    model = rebuild_waveforms(block, system, solver.chain.steps[2], table)
-    if model is None:
-        return EchoTable.empty()
-    limit = clip_level(block, system)
-    exact = block.samples + rng.uniform(-0.5, 0.5, block.samples.shape)
-    turned = np.rint(2.0 * (noise.baseline[:, None] + model) - exact)
+    limit = clip_level(block, solver.system.of(block))
+    expected = solver.expect(block, table)
+    turned = np.rint(2.0 * expected - unround(block.samples, expected, noise, rng))
     turned = np.clip(turned, 0, min(limit, np.iinfo(block.samples.dtype).max))
     keep = find_fill(block.samples) | (block.samples >= limit)
     samples = np.where(keep, block.samples, turned).astype(block.samples.dtype)

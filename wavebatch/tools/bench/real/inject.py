@@ -11,6 +11,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
+from wavebatch.tools.bench.real.noise import QuietNoise, unround
 from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, find_fill
 from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
 
@@ -84,13 +85,13 @@ def inject_echoes(
     solver: Solver,
     echoes: Sequence[EchoTable],
     templates: Sequence[Template],
-    noise: float,
+    noise: QuietNoise,
     number: int,
     rng: np.random.Generator,
 ) -> Injected:
     """Injects about `number` echoes, half in quiet stretches and half near strong echoes, and runs the chain again.
 
-    echoes: of the pool's blocks. noise: standard deviation of a quiet sample [DN]. Only one echo is added to a copy of
+    echoes: of the pool's blocks. Only one echo is added to a copy of
     a waveform. Blocks without a template of their digitizer get none.
     """
     parts = []
@@ -102,7 +103,7 @@ def inject_echoes(
         for near in (False, True):
             for begin in range(0, max(share // 2, 1), ROWS):
                 wanted = min(ROWS, max(share // 2, 1) - begin)
-                places = _find_places(block, table, solver, noise, wanted, near, rng)
+                places = _find_places(block, table, solver, noise.std, wanted, near, rng)
                 if len(places.row):
                     parts.append(_inject(block, table, solver, usable, noise, places, rng))
     return Injected.join(parts) if parts else _nothing()
@@ -189,20 +190,21 @@ def _inject(
     table: EchoTable,
     solver: Solver,
     templates: Sequence[Template],
-    noise: float,
+    noise: QuietNoise,
     places: _Places,
     rng: np.random.Generator,
 ) -> Injected:
     k = len(places.row)
     system = solver.system.of(block)
     limit = clip_level(block, system)
-    height, which = _draw_pulses(templates, noise, k, rng)
+    height, which = _draw_pulses(templates, noise.std, k, rng)
     lag = np.arange(block.samples.shape[1]) * block.spacing - places.time[:, None]
     pulse = np.empty(lag.shape)
     for number in np.unique(which):
         pulse[which == number] = templates[number].evaluate(lag[which == number])
     samples = block.samples[places.row]
-    added = add_signal(samples, height[:, None] * pulse, limit, find_fill(samples), rng)
+    exact = unround(samples, solver.expect(block, table)[places.row], noise, rng)
+    added = add_signal(samples, exact, height[:, None] * pulse, limit)
     core = np.abs(lag) < solver.fwhm
     clipped = ((added >= limit) & core).any(axis=1)
     found = solver.run(bare_block(block, added))
@@ -256,19 +258,15 @@ def _draw_pulses(
     return height, which
 
 
-def add_signal(
-    samples: np.ndarray, signal: np.ndarray, limit: float, fill: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
+def add_signal(samples: np.ndarray, exact: np.ndarray, signal: np.ndarray, limit: float) -> np.ndarray:
     """Raw counts with a signal added as if the digitizer had seen both.
 
-    A recorded count stands for any value half a count around it: one of these is drawn, so that rounding the sum does
-    not add noise (rounding twice would), and samples without signal stay what they are. Counts at the digitizer's
-    limit stay there, and samples in `fill` stay as they are.
+    exact: the samples before they were rounded, so that they are rounded only once. Samples at the digitizer's limit,
+    those that only fill a packet and those without signal stay what they are.
     """
-    exact = samples + rng.uniform(-0.5, 0.5, samples.shape) + signal
     top = min(limit, float(np.iinfo(samples.dtype).max))
-    added = np.clip(np.rint(exact), 0, top)
-    keep = fill | (samples >= limit) | (signal == 0)
+    added = np.clip(np.rint(exact + signal), 0, top)
+    keep = find_fill(samples) | (samples >= limit) | (signal == 0)
     return np.where(keep, samples, added).astype(samples.dtype)
 
 

@@ -103,11 +103,9 @@ def measure_real(
     echoes = [solver.run(block) for block in pool.blocks]
     noise = measure_noise(pool, solver, echoes)
     templates = learn_templates(pool, solver, echoes, noise.std, np.random.default_rng((seed, 0)))
-    injected = inject_echoes(
-        pool, solver, echoes, templates, noise.std, injections, np.random.default_rng((seed, 1))
-    )
+    injected = inject_echoes(pool, solver, echoes, templates, noise, injections, np.random.default_rng((seed, 1)))
     clock.note("inject", f"{pool.path.name}: {len(injected)} echoes injected")
-    false = count_false(pool, solver, echoes, noise.std, np.random.default_rng((seed, 2)))
+    false = count_false(pool, solver, echoes, noise, np.random.default_rng((seed, 2)))
     clock.note("false", f"{pool.path.name}: residuals mirrored")
     agreement = compare_parts(pool, solver, survey_of, np.random.default_rng((seed, 3))) if stability else []
     clock.note("stability", f"{pool.path.name}: parts surveyed")

@@ -14,6 +14,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import Chain
+from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import sample_size
@@ -53,6 +54,13 @@ class Solver:
         starts = range(0, len(block), ROWS)
         parts = [(self.chain.run(block.rows(slice(at, at + ROWS)), self.system), at) for at in starts]
         return EchoTable.concatenate(parts)
+
+    def expect(self, block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+        """Samples without their noise, f4 (n, s): baseline and fitted echoes; the baseline where nothing is fitted."""
+        system, (first, _, decomposer) = self.system.of(block), self.chain.steps
+        baseline = first.stage.function(block, system, **first.parameters).baseline[:, None]
+        model = rebuild_waveforms(block, system, decomposer, echoes)
+        return np.broadcast_to(baseline, block.samples.shape) if model is None else baseline + model
 
 
 @dataclass(frozen=True, eq=False)

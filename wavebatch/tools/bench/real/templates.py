@@ -200,9 +200,7 @@ def _make_templates(kind: tuple, donors: _Donors, spacing: float, solver: Solver
     return templates
 
 
-def _make_template(
-    kind: tuple, donors: _Donors, rows: np.ndarray, spacing: float, tier: int, width: float
-) -> Template:
+def _make_template(kind: tuple, donors: _Donors, rows: np.ndarray, spacing: float, tier: int, width: float) -> Template:
     """A cubic spline through the samples of some echoes, scaled to a peak of 1. width: of the system pulse [ns]."""
     lag = np.concatenate([donors.lag[row] for row in rows])
     value = np.concatenate([donors.value[row] for row in rows])
