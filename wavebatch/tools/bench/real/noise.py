@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 from scipy.special import ndtr, ndtri
 
 from wavebatch.core.echoes import EchoTable
@@ -14,8 +15,11 @@ from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
 
-LAGS = 8
+LAGS = 4
 """Lags at which the covariance is measured [samples]; beyond them it counts as none."""
+
+LONG = 64
+"""Quiet samples from which on their mean is that of the noise."""
 
 QUIET_BEFORE, QUIET_AFTER = 6.0, 25.0
 """Samples this far from every echo are quiet [sigma of the system pulse]: pulses rise fast and have long tails."""
@@ -28,7 +32,11 @@ OUTLIER = 4.5
 
 
 SWEEPS = 3
-"""Times that all samples are drawn before they no longer follow their start."""
+"""Times that all samples are drawn; more change nothing in the covariance of the result."""
+
+
+MISSED = 3.5
+"""Means over the width of an echo that are higher are echoes that were not found [their standard deviations]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +68,8 @@ class QuietNoise:
 def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> QuietNoise:
     """Noise about the mean of each waveform's quiet samples.
 
-    The mean of a few correlated samples follows their noise; what it takes away is added again, from the covariance
-    itself, until both agree. echoes: of the pool's blocks.
+    The mean of a few correlated samples follows their noise; what it takes away is added again. echoes: of the pool's
+    blocks.
     """
     products, pairs = np.zeros(LAGS + 1), np.zeros(LAGS + 1)
     lengths = []
@@ -73,9 +81,8 @@ def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> Qu
         deviation = block.samples - mean[:, None]
         if not quiet.any():
             continue
-        # 0.455 is the median of a squared standard normal number.
-        usual = np.sqrt(np.median(deviation[quiet] ** 2) / 0.455)
-        kept = quiet & (np.abs(deviation) < OUTLIER * max(float(usual), QUANTISATION_STD))
+        kept = quiet & (np.abs(deviation) < OUTLIER * max(_usual(deviation[quiet]), QUANTISATION_STD))
+        kept &= ~_find_missed(deviation, quiet, solver.fwhm / block.spacing)
         for lag in range(min(LAGS + 1, kept.shape[1])):
             end = kept.shape[1] - lag
             both = kept[:, lag:] & kept[:, :end]
@@ -86,7 +93,7 @@ def measure_noise(pool: Pool, solver: Solver, echoes: Sequence[EchoTable]) -> Qu
         return QuietNoise(solver.system.noise_std, (), int(pairs[0]))
     covariance = _add_mean(products / np.maximum(pairs, 1), np.concatenate(lengths))
     std = float(np.sqrt(max(covariance[0], QUANTISATION_STD**2)))
-    return QuietNoise(std, tuple(map(float, covariance[1:5] / std**2)), int(pairs[0]))
+    return QuietNoise(std, tuple(map(float, covariance[1:] / std**2)), int(pairs[0]))
 
 
 def _find_quiet(block: WaveformBlock, table: EchoTable, sigma: float) -> np.ndarray:
@@ -102,16 +109,38 @@ def _find_quiet(block: WaveformBlock, table: EchoTable, sigma: float) -> np.ndar
     return quiet
 
 
+def _find_missed(deviation: np.ndarray, quiet: np.ndarray, width: float) -> np.ndarray:
+    """Samples of echoes that a chain with too high a threshold left in quiet stretches, bool (n, s).
+
+    width: of an echo [samples].
+    """
+    size = max(round(width), 1)
+    smoothed = uniform_filter1d(np.where(quiet, deviation, 0.0), size, axis=1, mode="constant")
+    high = quiet & (smoothed > MISSED * _usual(smoothed[quiet]))
+    return maximum_filter1d(high, 4 * size + 1, axis=1, mode="constant")
+
+
+def _usual(values: np.ndarray) -> float:
+    """Standard deviation from the median of squares, of which 0.455 is that of standard normal numbers."""
+    return float(np.sqrt(np.median(values**2) / 0.455))
+
+
 def _add_mean(covariance: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Covariance (LAGS + 1,) about the true mean, from that about means of `lengths` samples, one per sample."""
-    kinds, weights = np.unique(lengths, return_counts=True)
-    lag = np.arange(1, LAGS + 1)
-    share = np.maximum(1 - lag / kinds[:, None], 0.0)
-    true = covariance
-    for _ in range(20):
-        of_mean = (true[0] + 2 * (share * true[1:]).sum(axis=1)) / kinds
-        true = covariance + np.clip(np.average(of_mean, weights=weights), 0.0, 2 * covariance[0])
-    return true
+    """Covariance (LAGS + 1,) about the true mean, from that about means of `lengths` samples, one per sample.
+
+    What is expected about such means is linear in the true covariance, which counts as 0 beyond the last lag.
+    """
+    kinds, weights = np.unique(np.minimum(lengths, LONG), return_counts=True)
+    expected = sum(weight * _expect_covariance(int(n)) for n, weight in zip(kinds, weights, strict=True))
+    return np.linalg.lstsq(expected / weights.sum(), covariance, rcond=1e-3)[0]
+
+
+def _expect_covariance(n: int) -> np.ndarray:
+    """Covariance at each lag about the mean of n samples, per true covariance at each lag, (LAGS + 1, LAGS + 1)."""
+    lag = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    centre = np.eye(n) - 1 / n
+    found = [centre @ (lag == true) @ centre for true in range(LAGS + 1)]
+    return np.array([[np.diagonal(part, at).mean() if at < n else 0.0 for part in found] for at in range(LAGS + 1)])
 
 
 def unround(samples: np.ndarray, expected: np.ndarray, noise: QuietNoise, rng: np.random.Generator) -> np.ndarray:
