@@ -165,6 +165,15 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     assert 0 < len(made) <= 150 and not made.near.any()
 
 
+def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp_path):
+    assert report.clipped is None
+    path = tmp_path / "shore.las"
+    simulate_strip("shore", path, pulses=2000, seed=3)
+    found = measure_real(path, injections=3000, stability=False)
+    assert found.clipped.injected > 50 and found.clipped.recall > 0.98
+    assert found.clipped.extra < 0.05 * found.clipped.injected
+
+
 def test_agreement_sees_a_survey_that_is_off(strip):
     pool = read_pool(strip, 500)
     one = Solver.of_blocks(pool.blocks)

@@ -12,23 +12,18 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
+from wavebatch.tools.bench.real.places import Places, find_places
 from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, find_fill
 from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
-
-QUIET = 4.0
-"""An injected echo this far from every echo of its waveform lies in a quiet stretch [FWHM of the system pulse]."""
-
-NEAREST, FARTHEST = 0.5, 4.0
-"""Separations from the strongest echo that are tried, before and after it [FWHM]."""
-
-EDGE = 1.5
-"""Least distance of an injected echo from the ends of its waveform [FWHM]."""
 
 LEAST = 2.5
 """Least amplitude that is injected [noise standard deviations]."""
 
-TRIES = 24
-"""Places that are tried for an echo in a waveform before another waveform is taken."""
+CLIPPED = 0.001
+"""Share of waveforms with clipped samples from which clipped echoes are injected too ..."""
+
+CLIPPED_INJECTED, MOST_CLIPPED = 0.1, 1.5
+"""... this share of all, up to this many times as high as the digitizer's range."""
 
 TOLERANCE = 0.6
 """A found echo this near is the injected one [FWHM]."""
@@ -70,16 +65,6 @@ class Injected:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Places:
-    """Where echoes are injected into a block."""
-
-    row: np.ndarray
-    time: np.ndarray
-    strongest: np.ndarray
-    """Row in the table of echoes of the strongest echo of the waveform; -1 for quiet stretches."""
-
-
 def inject_echoes(
     pool: Pool,
     solver: Solver,
@@ -103,7 +88,7 @@ def inject_echoes(
         for near in (False, True):
             for begin in range(0, max(share // 2, 1), ROWS):
                 wanted = min(ROWS, max(share // 2, 1) - begin)
-                places = _find_places(block, table, solver, noise.std, wanted, near, rng)
+                places = find_places(block, table, solver, noise.std, wanted, near, rng)
                 if len(places.row):
                     parts.append(_inject(block, table, solver, usable, noise, places, rng))
     return Injected.join(parts) if parts else _nothing()
@@ -114,131 +99,56 @@ def _nothing() -> Injected:
     return Injected(none > 0, none, none, none, none > 0, none > 0, none, np.empty((0, 3)), np.empty((0, 3)))
 
 
-def _find_places(
-    block: WaveformBlock,
-    table: EchoTable,
-    solver: Solver,
-    noise: float,
-    wanted: int,
-    near: bool,
-    rng: np.random.Generator,
-) -> _Places:
-    """Random places that meet the rules; fewer than wanted where the strip has no room."""
-    fwhm, end = solver.fwhm, (block.samples.shape[1] - 1) * block.spacing
-    strongest = _strongest(table, len(block))
-    hosts = np.arange(len(block))
-    if near:
-        strong = np.where(strongest >= 0, table.amplitude[strongest] if len(table) else 0.0, 0.0)
-        hosts = np.flatnonzero(strong > 10 * noise)
-    if not len(hosts) or end <= 2 * EDGE * fwhm:
-        return _Places(*(np.empty(0, np.int64),) * 3)
-    row = np.repeat(rng.choice(hosts, wanted), TRIES)
-    if near:
-        # As many at each ratio of separations: the narrow ones matter most.
-        apart = np.exp(rng.uniform(np.log(NEAREST), np.log(FARTHEST), len(row))) * rng.choice((-1, 1), len(row))
-        time = table.time[strongest[row]] + apart * fwhm
-    else:
-        time = rng.uniform(EDGE * fwhm, end - EDGE * fwhm, len(row))
-    good = (time >= EDGE * fwhm) & (time <= end - EDGE * fwhm)
-    good &= _is_clear(table, row, time, fwhm, strongest if near else None)
-    good &= ~_touches_fill(block, row, time, fwhm)
-    tries = good.reshape(wanted, TRIES)
-    done = np.flatnonzero(tries.any(axis=1))
-    chosen = done * TRIES + tries[done].argmax(axis=1)
-    owner = strongest[row[chosen]] if near else np.full(len(chosen), -1)
-    return _Places(row[chosen], time[chosen], owner)
-
-
-def _strongest(table: EchoTable, n: int) -> np.ndarray:
-    """Row of the strongest echo of each waveform, -1 without any."""
-    strongest = np.full(n, -1)
-    order = np.lexsort((table.amplitude, table.waveform))
-    strongest[table.waveform[order]] = order
-    return strongest
-
-
-def _is_clear(
-    table: EchoTable, row: np.ndarray, time: np.ndarray, fwhm: float, strongest: np.ndarray | None
-) -> np.ndarray:
-    """Whether no echo of the waveform is near; the strongest may be, and others of it further off then."""
-    clear = np.ones(len(row), bool)
-    count = np.bincount(table.waveform, minlength=int(row.max(initial=0)) + 1)
-    first = np.cumsum(count) - count
-    for order in range(int(count.max(initial=0))):
-        have = np.flatnonzero(count[row] > order)
-        echo = first[row[have]] + order
-        apart = np.abs(time[have] - table.time[echo]) / fwhm
-        limit = QUIET if strongest is None else np.where(strongest[row[have]] == echo, 0.0, 0.5 * QUIET)
-        clear[have] &= apart >= limit
-    return clear
-
-
-def _touches_fill(block: WaveformBlock, row: np.ndarray, time: np.ndarray, fwhm: float) -> np.ndarray:
-    """Whether a gap between two recordings lies under the echo or next to it."""
-    fill = find_fill(block.samples)
-    if not fill.any():
-        return np.zeros(len(row), bool)
-    before = np.concatenate([np.zeros((len(fill), 1), np.int64), np.cumsum(fill, axis=1)], axis=1)
-    s = fill.shape[1]
-    low = np.clip(np.floor((time - EDGE * fwhm) / block.spacing), 0, s).astype(int)
-    high = np.clip(np.ceil((time + EDGE * fwhm) / block.spacing) + 1, 0, s).astype(int)
-    return before[row, high] > before[row, low]
-
-
 def _inject(
     block: WaveformBlock,
     table: EchoTable,
     solver: Solver,
     templates: Sequence[Template],
     noise: QuietNoise,
-    places: _Places,
+    places: Places,
     rng: np.random.Generator,
 ) -> Injected:
-    k = len(places.row)
-    system = solver.system.of(block)
-    limit = clip_level(block, system)
-    height, which = _draw_pulses(templates, noise.std, k, rng)
+    limit = clip_level(block, solver.system.of(block))
+    height, which = _draw_pulses(templates, noise.std, len(places.row), rng)
+    if (block.samples >= limit).any(axis=1).mean() > CLIPPED:
+        _raise_some(height, which, templates, limit - solver.system.of(block).baseline, rng)
     lag = np.arange(block.samples.shape[1]) * block.spacing - places.time[:, None]
-    pulse = np.empty(lag.shape)
+    signal = np.empty(lag.shape)
     for number in np.unique(which):
-        pulse[which == number] = templates[number].evaluate(lag[which == number])
+        rows = which == number
+        signal[rows] = height[rows, None] * templates[number].evaluate(lag[rows])
     samples = block.samples[places.row]
     exact = unround(samples, solver.expect(block, table)[places.row], noise, rng)
-    added = add_signal(samples, exact, height[:, None] * pulse, limit)
-    core = np.abs(lag) < solver.fwhm
-    clipped = ((added >= limit) & core).any(axis=1)
-    found = solver.run(bare_block(block, added))
+    added = add_signal(samples, exact, signal, limit)
+    clipped = ((added >= limit) & (np.abs(lag) < solver.fwhm)).any(axis=1)
     gain, delay, sigma = np.array([(t.gain, t.delay, t.sigma) for t in templates])[which].T
-    amplitude, time = gain * height, places.time + delay
-    truth, is_new, is_host = _truth(table, places, amplitude, time, sigma)
-    match = match_echoes(found, truth, TOLERANCE * solver.fwhm)
+    true = np.stack([places.time + delay, gain * height, sigma], axis=1)
+    return _compare(solver.run(bare_block(block, added)), table, places, true, clipped, solver.fwhm)
+
+
+def _compare(
+    found: EchoTable, table: EchoTable, places: Places, true: np.ndarray, clipped: np.ndarray, fwhm: float
+) -> Injected:
+    """What was found of the injected echoes; true: their times, amplitudes and sigmas (k, 3)."""
+    k = len(true)
+    truth, is_new, is_host = _list_truth(table, places, true)
+    match = match_echoes(found, truth, TOLERANCE * fwhm)
     place = np.full(len(truth), -1)
     place[match.truth] = match.found
-    mine = place[is_new]
     kept = np.ones(k, bool)
     kept[truth.waveform[is_host]] = place[is_host] >= 0
-    near = places.strongest >= 0
+    mine = place[is_new]
     hit = (mine >= 0) & kept
     errors, reported = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
-    true = np.stack([time, amplitude, sigma], axis=1)
     for column, name in enumerate(("time", "amplitude", "sigma")):
         errors[hit, column] = getattr(found, name)[mine[hit]] - true[hit, column]
         reported[hit, column] = getattr(found, f"{name}_err")[mine[hit]]
-    paired = np.bincount(found.waveform[match.found], minlength=k)
-    hosts = np.where(near, places.strongest, 0)
-    many = len(table) > 0
-    apart = (places.time - table.time[hosts]) / solver.fwhm if many else np.zeros(k)
-    return Injected(
-        near=near,
-        separation=np.where(near, apart, np.nan),
-        host=np.where(near, table.amplitude[hosts] if many else 0.0, np.nan),
-        amplitude=amplitude,
-        clipped=clipped,
-        found=hit,
-        extra=found.count(k) - paired,
-        errors=errors,
-        reported=reported,
-    )
+    near = places.strongest >= 0
+    separation, host = np.full(k, np.nan), np.full(k, np.nan)
+    separation[near] = (places.time[near] - table.time[places.strongest[near]]) / fwhm
+    host[near] = table.amplitude[places.strongest[near]]
+    extra = found.count(k) - np.bincount(found.waveform[match.found], minlength=k)
+    return Injected(near, separation, host, true[:, 1], clipped, hit, extra, errors, reported)
 
 
 def _draw_pulses(
@@ -258,6 +168,20 @@ def _draw_pulses(
     return height, which
 
 
+def _raise_some(
+    height: np.ndarray, which: np.ndarray, templates: Sequence[Template], room: float, rng: np.random.Generator
+) -> None:
+    """Makes some heights exceed what the digitizer can hold, in place. room: from the baseline to its limit [DN].
+
+    Flat targets only: what a fit cannot see in a widened echo it would see in one made stronger.
+    """
+    over = rng.random(len(height)) < CLIPPED_INJECTED
+    strong = [number for number, template in enumerate(templates) if template.tier == templates[-1].tier]
+    flat = sorted(strong, key=lambda number: templates[number].fwhm)[: len(strong) // 2 + 1]
+    height[over] = room * rng.uniform(1.0, MOST_CLIPPED, over.sum())
+    which[over] = rng.choice(flat, over.sum())
+
+
 def add_signal(samples: np.ndarray, exact: np.ndarray, signal: np.ndarray, limit: float) -> np.ndarray:
     """Raw counts with a signal added as if the digitizer had seen both.
 
@@ -270,24 +194,18 @@ def add_signal(samples: np.ndarray, exact: np.ndarray, signal: np.ndarray, limit
     return np.where(keep, samples, added).astype(samples.dtype)
 
 
-def _truth(
-    table: EchoTable, places: _Places, amplitude: np.ndarray, time: np.ndarray, sigma: np.ndarray
-) -> tuple[EchoTable, np.ndarray, np.ndarray]:
+def _list_truth(table: EchoTable, places: Places, true: np.ndarray) -> tuple[EchoTable, np.ndarray, np.ndarray]:
     """The echoes that the copies hold; rows of the injected ones in order of the copies, and of the hosts."""
-    k = len(places.row)
+    k = len(true)
     count = np.bincount(table.waveform, minlength=int(places.row.max(initial=0)) + 1)
     first = np.cumsum(count) - count
     number = count[places.row]
     copy = np.repeat(np.arange(k), number)
     old = np.repeat(first[places.row] - (np.cumsum(number) - number), number) + np.arange(len(copy))
-    waveform = np.r_[copy, np.arange(k)]
     is_new = np.repeat((False, True), (len(copy), k))
     is_host = np.r_[places.strongest[copy] == old, np.zeros(k, bool)]
+    before = np.stack([table.time, table.amplitude, table.sigma], axis=1)[old]
     truth = EchoTable.build(
-        waveform,
-        np.r_[table.time[old], time],
-        np.r_[table.amplitude[old], amplitude],
-        np.r_[table.sigma[old], sigma],
-        attributes={"new": is_new, "host": is_host},
+        np.r_[copy, np.arange(k)], *np.concatenate([before, true]).T, attributes={"new": is_new, "host": is_host}
     )
     return truth, np.flatnonzero(truth.attributes["new"]), np.flatnonzero(truth.attributes["host"])
