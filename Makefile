@@ -2,7 +2,8 @@
 #   make demo      simulate a forest strip, run it, compare the result with the truth
 #   make test      the fast tests          make test-all   all of them
 #   make papers    the tables of five papers on simulated data
-#   make bench     error against run time  make lint       ruff       make clean   remove what was made
+#   make bench     error against run time  make docs       the documentation as a site, in site/
+#   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
 VENV   := .venv
@@ -10,7 +11,7 @@ BIN    := $(VENV)/bin
 DEMO   := demo
 BENCH  := bench
 
-.PHONY: demo test test-all papers bench lint clean
+.PHONY: demo test test-all papers bench docs lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -24,6 +25,10 @@ $(VENV)/.run: pyproject.toml | $(BIN)/python
 
 $(VENV)/.test: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $@ $(VENV)/.run
+
+$(VENV)/.docs: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@ $(VENV)/.run
 
 demo: $(VENV)/.run
@@ -51,9 +56,13 @@ bench: $(VENV)/.test
 	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
 	$(BIN)/wavebatch bench --scene mixed --scene open --scene forest --scene empty --promises -o $(BENCH)
 
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "site: site/index.html"
+
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .
 
 clean:
-	rm -rf $(VENV) $(DEMO) $(BENCH) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	rm -rf $(VENV) $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

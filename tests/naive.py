@@ -271,3 +271,28 @@ def gauss_newton(y, x, start, iterations):
         if not np.isfinite(parameters).all() or (parameters[[0, 2]] <= 0).any():
             return np.full_like(parameters, np.nan)
     return parameters
+
+
+def crlb_joint(time, amplitude, sigma, noise_std, spacing, n_samples):
+    """Least standard deviations of time, amplitude and sigma, each (k, n), of k Gaussian echoes in each of n waveforms.
+
+    All 3 k parameters of a waveform are unknown together: the bound of overlapping and truncated echoes.
+    time [ns after sample 0], amplitude [count], sigma [ns]: (k, n); noise_std scalar or (n,).
+    Parameters that the samples cannot tell at all (a singular Fisher matrix) get infinity.
+    """
+    k, n = time.shape
+    x = np.arange(n_samples)[:, None, None] * spacing
+    z = (x - time) / sigma
+    pulse = np.exp(-0.5 * z * z)
+    slope = amplitude / sigma * pulse * z
+    jacobian = np.concatenate([slope, pulse, slope * z], axis=1)
+    scale = np.sqrt((jacobian**2).sum(axis=0))
+    scale = np.where(scale > 0, scale, 1.0)
+    jacobian /= scale
+    fisher = np.einsum("ipn,iqn->npq", jacobian, jacobian)
+    # Scaled columns: the diagonal is 1, so that eigenvalues say how well parameters can be told apart.
+    values, vectors = np.linalg.eigh(fisher)
+    values = np.where(values > 1e-13, values, np.nan)
+    variance = (vectors**2 / values[:, None, :]).sum(axis=2).T
+    std = np.sqrt(np.where(np.isnan(variance), np.inf, variance)) / scale * noise_std
+    return std[:k], std[k : 2 * k], std[2 * k :]

@@ -99,7 +99,7 @@ def test_names_of_files_may_hold_anything(tmp_path, name):
         assert done.exit_code == 0, done.stderr
         assert all(line.startswith(printable(str(strip))) for line in done.stderr.splitlines()), done.stderr
         assert "\x1b" not in done.stderr
-    assert "is there already" in done.stderr
+    assert "is up to date, skipped" in done.stderr
     assert json.loads((tmp_path / "batch.json").read_text("utf-8"))["strips"][0]["strip"] == str(strip)
     strip.write_bytes(b"nothing")
     done = CliRunner().invoke(main, ["run", str(strip), *out, "--overwrite"])

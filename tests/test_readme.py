@@ -1,16 +1,20 @@
-"""The README names every command, column, flag, profile and exit code, and its chain loads."""
+"""The README is short, names every command and profile, and its two first commands are targets of the Makefile."""
 
 import re
-import textwrap
 from pathlib import Path
 
 import pytest
 
+import wavebatch
 from wavebatch.cli import COMMANDS
-from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
-from wavebatch.stages.chain_file import list_profiles, parse_chain
+from wavebatch.stages.chain_file import list_profiles
 
-TEXT = (Path(__file__).resolve().parent.parent / "README.md").read_text("utf-8")
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "README.md").read_text("utf-8")
+
+
+def test_it_is_short():
+    assert len(TEXT.splitlines()) <= 250
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
@@ -18,21 +22,25 @@ def test_every_command_is_described(name):
     assert f"| `wavebatch {name}` |" in TEXT
 
 
-@pytest.mark.parametrize("column", [c for c in COLUMNS.values() if c.extra_bytes], ids=lambda column: column.name)
-def test_every_column_is_described_as_it_is_declared(column):
-    assert f"| {column.name} | {column.unit} | {column.meaning} |" in TEXT
-
-
-@pytest.mark.parametrize("flag", list(EchoFlag), ids=lambda flag: flag.name)
-def test_every_flag_is_described_as_it_is_declared(flag):
-    assert f"| {int(flag)} | {flag.name} | {FLAG_MEANINGS[flag]} |" in TEXT
-
-
 def test_profiles_are_named():
-    for name in list_profiles():
-        assert name in TEXT
+    for name in (*list_profiles(), "auto"):
+        assert f"`{name}`" in TEXT
 
 
-def test_the_chain_in_it_loads():
-    block = re.search(r"(?m)^    \[\[chain\]\]\n(?:    .*\n|\n)+", TEXT)
-    assert len(parse_chain(textwrap.dedent(block.group()), "README").steps) == 5
+def test_the_first_commands_are_two_targets_of_the_makefile():
+    block = re.search(r"## Try it\n\n((?:    .*\n)+)", TEXT).group(1)
+    commands = [line.split("#")[0].split() for line in block.splitlines()]
+    assert commands == [["make", "demo"], ["make", "test"]]
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    for target in re.findall(r"`?make ([a-z]+)", TEXT):
+        assert re.search(rf"(?m)^{target}:", makefile), target
+
+
+def test_the_python_example_uses_public_names():
+    names = set(re.findall(r"\bwb\.(\w+)", TEXT))
+    assert len(names) > 4 and names <= set(wavebatch.__all__)
+
+
+def test_versions_agree():
+    for name in ("CITATION.cff", "CHANGELOG.md"):
+        assert wavebatch.__version__ in (ROOT / name).read_text("utf-8")

@@ -1,4 +1,7 @@
-"""The waveforms of published experiments, as ALGORITHMS.md 1 states them: for tests and examples/papers."""
+"""The waveforms of published experiments, as docs/algorithms.md 1 describes them.
+
+The scripts of this folder and some tests use them; Wagner's is a scene of tools.simulate.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.tools.simulate.draws import FoldedWidth, LogNormal, WithinDepth
-from wavebatch.tools.simulate.given import FINE, fine_recording, simulate_echoes
+from wavebatch.tools.simulate.given_echoes import FINE, fine_recording, simulate_echoes
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.scenes import Scene
@@ -27,7 +30,7 @@ WAGNER = Scene(
 """WithinDepth deeper than the window: times evenly over all of it."""
 
 PULSE_SIGMA = 5.0 / FWHM_PER_SIGMA
-"""Of the pulse of Wang et al. and of Jutzi and Stilla (2005), 5 ns wide at half its maximum [ns]."""
+"""Width of the pulse of Wang et al. and of Jutzi and Stilla (2005): 5 ns at half its maximum [ns]."""
 
 WANG_CASES: dict[str, tuple[tuple[float, float], ...]] = {
     "a": ((80, 0), (100, 4)),
@@ -42,9 +45,9 @@ WANG_CASES: dict[str, tuple[tuple[float, float], ...]] = {
 def simulate_wang(
     case: str, noise_std: float, n: int, rng: np.random.Generator
 ) -> tuple[WaveformBlock, EchoTable, Recording]:
-    """n waveforms of a case of Wang's figure 5 at random phases (without noise: at none), truth and receiver.
+    """n waveforms of a case of Wang's figure 5 at random phases (without noise: at phase 0), truth and receiver.
 
-    noise_std: in the unit of WANG_CASES, of which the receiver has FINE counts.
+    noise_std: in the unit of WANG_CASES; the receiver has FINE counts per unit.
     """
     recording = fine_recording(noise_std, PULSE_SIGMA)
     amplitude, time = np.array(WANG_CASES[case], np.float64).T
@@ -73,12 +76,12 @@ def paint_slice(
 ) -> np.ndarray:
     """A slice of noise 1, (height, width): a waveform per row, with straight surfaces `snr` high and `sigma` wide.
 
-    surfaces: column at the middle row, columns per row, first row and row behind the last. Source: the slices of Jutzi
-    and Stilla (2005) as in ALGORITHMS.md 1.3.
+    surfaces: column at the middle row, columns per row, first row and row after the last. Source: the slices of Jutzi
+    and Stilla (2005), docs/algorithms.md 1.3.
     """
     image = rng.standard_normal((height, width))
     row, column = np.arange(height)[:, None], np.arange(width)
-    for middle, slope, first, behind in surfaces:
+    for middle, slope, first, end in surfaces:
         band = snr * np.exp(-0.5 * ((column - middle - slope * (row - height // 2)) / sigma) ** 2)
-        image += np.where((row >= first) & (row < behind), band, 0)
+        image += np.where((row >= first) & (row < end), band, 0)
     return image

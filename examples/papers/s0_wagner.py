@@ -1,7 +1,8 @@
 """Wagner, Roncat, Melzer, Ullrich (2007), Waveform analysis techniques in airborne laser scanning: tables 1 and 2.
 
-Maxima, Gaussian decomposition and the average square difference function (ASDF) on the same simulated waveforms; what
-the ASDF can tell apart, how exact its parabola is, and what ringing does to the number of echoes (ALGORITHMS.md 1.1).
+Maxima, Gaussian decomposition and the average square difference function (ASDF) on the same simulated waveforms: the
+resolution of the ASDF, the bias of its parabola, and the effect of ringing on the number of echoes
+(docs/algorithms.md 1.1).
 
     python examples/papers/s0_wagner.py [--seed N] [--number WAVEFORMS]
 """
@@ -28,7 +29,7 @@ from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_sy
 
 PAPER_RULE = {"rule": "paper", "interpolation": "parabola"}
 RESOLUTION = {1.0: (3.58, 3.43, 3.24, 3.14), 0.5: (4.76, 4.34, 3.95, 3.74), 0.35: (5.75, 4.97, 4.33, 4.00)}
-"""Least distance of two echoes that are two, in sigma, for fractions of 0.3, 0.2, 0.1, 0.05; by ratio of amplitudes."""
+"""Least distance of two resolved echoes [sigma], for fractions of 0.3, 0.2, 0.1, 0.05; by ratio of amplitudes."""
 FRACTIONS = (0.3, 0.2, 0.1, 0.05)
 ONCE_SMOOTHED = 4 * SMOOTH_GAIN / TWICE_SMOOTHED_GAIN
 """The specification's maxima are 4 sigma high in the waveform smoothed once; our detector smooths it twice."""
@@ -49,7 +50,7 @@ Strip = tuple[WaveformBlock, EchoTable, Noise, SystemPulse]
 
 
 def simulate(number: int, seed: int, ringing: float = 0.0) -> Strip:
-    """The waveforms of the tables, with lobes of -ringing and +ringing behind every echo."""
+    """The waveforms of the tables, with lobes of -ringing and +ringing after every echo."""
     recording = replace(WAGNER.recording, pulse=WAGNER.recording.pulse.with_ringing(ringing))
     block, truth = simulate_block(WAGNER, number, np.random.default_rng(seed), recording=recording)
     return block, truth, known_noise(recording, number), known_system(recording)
@@ -124,7 +125,7 @@ def share_counts(strip: Strip) -> dict[str, np.ndarray]:
 
 
 def table_of_resolution() -> Table:
-    """The least distance at which the paper's rule tells two echoes apart, mean over phases of the samples."""
+    """The least distance at which the paper's rule resolves two echoes, mean over phases of the samples."""
     table = Table("ASDF: least distance of two echoes [sigma]")
     recording = fine_recording(0.0, 2.0, n_samples=120)
     system = known_system(recording)

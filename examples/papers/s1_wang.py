@@ -1,7 +1,7 @@
 """Wang, Wang, Tseng, A comparison of lidar waveform decomposition models: figure 5, tables 1 and 2.
 
-Which pairs and triples a wavelet tells apart, how well Gaussians and log-normals fit skewed pulses, and what the loop
-that adds echoes at the largest residual gains (ALGORITHMS.md 1.2).
+Which pairs and triples a wavelet resolves, how well Gaussians and log-normals fit skewed pulses, and how many echoes
+the loop that adds them at the largest residual gains (docs/algorithms.md 1.2).
 
     python examples/papers/s1_wang.py [--seed N] [--number WAVEFORMS]
 """
@@ -52,7 +52,7 @@ CRITICAL = {
     ("mexican_hat", 2.0): 4.82,
     ("mexican_hat", 3.0): 6.05,
 }
-"""Least distance of echoes of 80 and 100 that are two [ns], by wavelet and scale."""
+"""Least distance of echoes of 80 and 100 that are resolved [ns], by wavelet and scale."""
 CLASSES = {
     "Leica ground": (0.104, 0.0214, 0.0094, 0.0073, 0.0089, 0.0069),
     "Leica tree": (0.184, 0.0158, 0.0103, 0.0040, 0.0100, 0.0037),
@@ -61,7 +61,7 @@ CLASSES = {
 }
 """Skew, noise over amplitude, E of Gaussian and log-normal in the paper, the same in the specification."""
 LOOP = {"urban": (0.924, 0.947), "forest": (0.613, 0.707)}
-"""Completeness of maxima and fit, and of wavelet, fit and loop, in ALGORITHMS.md 2.5."""
+"""Completeness of maxima and fit, and of wavelet, fit and loop, in docs/algorithms.md 2.5."""
 
 
 def find_wavelet(block, noise, system) -> EchoTable:

@@ -1,7 +1,7 @@
 """Jutzi, Stilla (2005), Waveform processing of laser pulses for reconstruction of surfaces in urban areas.
 
 How weak an echo the detectors find, how exact Gauss-Newton is at 20 samples per ns and from which starts it converges,
-and the straight lines that the Hough transform finds in a slice of waveforms (ALGORITHMS.md 1.3).
+and the straight lines that the Hough transform finds in a slice of waveforms (docs/algorithms.md 1.3).
 
     python examples/papers/s2_jutzi.py [--seed N] [--number WAVEFORMS]
 """
@@ -36,7 +36,7 @@ DETECTORS = {
         (0.421, 0.872, 0.996, 1, 1, 1, 1, 1),
     ),
 }
-"""Detector, share of the echoes that it finds by A/sn (ALGORITHMS.md 1.3)."""
+"""Detector, share of the echoes that it finds by A/sn (docs/algorithms.md 1.3)."""
 FALSE_ALARMS = {
     "3 sn over 5 samples": (0, 0.1, 0),
     "matched filter, false alarms 0.1 %": (0, 0.3, 0.1),

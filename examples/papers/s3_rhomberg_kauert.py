@@ -1,7 +1,7 @@
 """Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024), Angle of incidence from echo pulse width.
 
 The table of widths by angle as printed and as corrected, the footprint by Monte Carlo, the errors of angles, and what
-its figure 6 shows: angles from fitted widths minus the true ones, with their pile-up at 0 (ALGORITHMS.md 1.4).
+its figure 6 shows: angles from fitted widths minus the true ones, with their pile-up at 0 (docs/algorithms.md 1.4).
 
     python examples/papers/s3_rhomberg_kauert.py [--seed N] [--number ECHOES]
 """
@@ -14,7 +14,6 @@ from table import Table, main
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import (
-    FWHM_PER_TAU,
     angles_of_variance,
     direct_width,
     paper_table,
@@ -29,7 +28,10 @@ from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_sy
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""
-OWN = LENGTH / FWHM_PER_SIGMA
+FWHM_PER_TAU = 3.3946780749849567
+"""Full width at half maximum of t^2 exp(-t), in tau (docs/algorithms.md 1.4); of the printed t exp(-t) it is 3.5."""
+PULSE_SIGMA = LENGTH / FWHM_PER_SIGMA
+"""Standard deviation of the pulse [ns]."""
 DEGREES = (5, 10, 20, 30, 45, 60, 75)
 WIDTHS = {
     "as printed": (1.9259, 1.9725, 2.1257, 2.3534, 2.8934, 3.9601, 7.1218),
@@ -57,11 +59,11 @@ def table_of_widths() -> Table:
     table = Table("width at e^-2 [ns] by angle", 4)
     spreads = spread_of_angle(np.radians(DEGREES), HEIGHT, DIVERGENCE)
     time, curves = spread_pulse(2, spreads, LENGTH / FWHM_PER_TAU)
-    printed, fitted = paper_table(OWN), pulse_table(2.5364 / 4, 0.05)
+    printed, fitted = paper_table(PULSE_SIGMA), pulse_table(2.5364 / 4, 0.05)
     ours = {
         "as printed": 4 * np.interp(spreads, printed.spread, printed.width),
         "corrected": np.array([direct_width(time, curve, np.exp(-2.0)) for curve in curves]),
-        "Gaussian closed form": 4 * np.hypot(OWN, spreads),
+        "Gaussian closed form": 4 * np.hypot(PULSE_SIGMA, spreads),
         "4 x fitted Gaussian": 4 * np.interp(spreads, fitted.spread, fitted.width),
     }
     for name, expected in WIDTHS.items():
@@ -100,11 +102,12 @@ def table_of_errors(number: int, seed: int) -> Table:
     for snr, expected in ERRORS.items():
         for degrees, rms in zip(TRUE_DEGREES, expected, strict=True):
             true = np.radians(degrees)
-            sigma = np.hypot(OWN, spread_of_angle(true, HEIGHT, DIVERGENCE))
-            amplitude = snr * np.cos(true) * OWN / sigma
+            sigma = np.hypot(PULSE_SIGMA, spread_of_angle(true, HEIGHT, DIVERGENCE))
+            amplitude = snr * np.cos(true) * PULSE_SIGMA / sigma
             found = sigma + bound_time(amplitude, sigma, 1.0, 1.0) * rng.standard_normal(number)
             error = bound_time(amplitude, np.maximum(found, 0.2), 1.0, 1.0)
-            angle, _ = angles_of_variance(found**2 - OWN**2, 2 * found * error, np.full(number, HEIGHT), DIVERGENCE)
+            spread = found**2 - PULSE_SIGMA**2
+            angle, _ = angles_of_variance(spread, 2 * found * error, np.full(number, HEIGHT), DIVERGENCE)
             if rms is not None:
                 ours = np.degrees(np.sqrt(np.nanmean((angle - true) ** 2)))
                 table.near(f"SNR {snr}, {degrees} deg", ours, rms, within=0.05, share=0.2, spec=rms)
@@ -119,9 +122,9 @@ def table_of_errors(number: int, seed: int) -> Table:
 def fitted_angles(degrees: np.ndarray, snr: float, mode: str, rng: np.random.Generator) -> np.ndarray:
     """Angles [deg] that Gaussians fitted to simulated echoes, sampled every 0.5 ns, have for planes of `degrees`."""
     spread = spread_of_angle(np.radians(degrees), HEIGHT, DIVERGENCE)
-    recording = fine_recording(1.0, OWN, n_samples=96, spacing=0.5)
-    sigma = np.hypot(OWN, spread)
-    amplitude = snr * np.cos(np.radians(degrees)) * OWN / sigma
+    recording = fine_recording(1.0, PULSE_SIGMA, n_samples=96, spacing=0.5)
+    sigma = np.hypot(PULSE_SIGMA, spread)
+    amplitude = snr * np.cos(np.radians(degrees)) * PULSE_SIGMA / sigma
     time = 24 + rng.uniform(-0.25, 0.25, (len(degrees), 1))
     block, _ = simulate_echoes(recording, time, FINE * amplitude[:, None], sigma[:, None], rng)
     noise, system = known_noise(recording, len(block)), known_system(recording)
@@ -129,7 +132,7 @@ def fitted_angles(degrees: np.ndarray, snr: float, mode: str, rng: np.random.Gen
     angles = np.full(len(degrees), np.nan)
     alone = found.take(found.count(len(block))[found.waveform] == 1)
     width = alone.sigma.astype(np.float64)
-    variance = spread_variance(paper_table(OWN), width) if mode == "paper" else width**2 - OWN**2
+    variance = spread_variance(paper_table(PULSE_SIGMA), width) if mode == "paper" else width**2 - PULSE_SIGMA**2
     error = 2 * width * alone.sigma_err
     angles[alone.waveform] = np.degrees(angles_of_variance(variance, error, np.full(len(alone), HEIGHT), DIVERGENCE)[0])
     return angles

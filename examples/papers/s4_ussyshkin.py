@@ -1,7 +1,7 @@
 """Ussyshkin, Theriault (2011), Airborne lidar: advances in discrete return technology for 3D vegetation mapping.
 
 The return numbers and least separations that a receiver with a dead zone has in stands of plants, the lidar equation,
-and how well waveforms are modelled from discrete returns (ALGORITHMS.md 1.5).
+and how well waveforms are modelled from discrete returns (docs/algorithms.md 1.5).
 
     python examples/papers/s4_ussyshkin.py [--seed N] [--number PULSES]
 """
@@ -25,7 +25,7 @@ CORN = {0.64: (1.13, 0.90), 0.67: (1.15, 0.92)}
 
 
 def fly(stand: str, dead_zone: float, number: int, seed: int) -> ReturnStats:
-    """What `wavebatch stats` says of `wavebatch simulate canopy.STAND --sensor discrete --dead-zone METRES`."""
+    """The result of `wavebatch stats` for `wavebatch simulate canopy.STAND --sensor discrete --dead-zone METRES`."""
     with TemporaryDirectory() as folder:
         cloud = Path(folder) / "cloud.las"
         simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))

@@ -1,4 +1,4 @@
-"""What the examples share: options, tables of published and measured figures, and the exit code."""
+"""Shared by the scripts of this folder: options, tables of published and measured figures, and the exit code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ HEADS = ["figure", "paper", "spec", "ours", "accepted", ""]
 
 @dataclass
 class Table:
-    """Figures under one title: what the paper says, what ALGORITHMS.md says of a simulation, and what we measure."""
+    """Figures under one title: of the paper, of the simulation in docs/algorithms.md (`spec`), and ours."""
 
     title: str
     digits: int = 2
@@ -32,33 +32,35 @@ class Table:
         paper: float | None = None,
         spec: float | None = None,
     ) -> None:
-        """A figure that must lie from low to high; without either it is told only."""
+        """Adds a figure that must lie from low to high; without limits it is only printed."""
         ours = float(ours)
         bounded = math.isfinite(low) or math.isfinite(high)
         verdict = ("ok" if low <= ours <= high else "FAIL") if bounded else ""
-        told = [self._tell(value) for value in (paper, spec, ours)]
-        self.rows.append([name, *told, self._tell_band(low, high), verdict])
+        cells = [self._format(value) for value in (paper, spec, ours)]
+        self.rows.append([name, *cells, self._format_band(low, high), verdict])
         self.values[name] = ours
         if verdict == "FAIL":
             self.failures.append(name)
 
-    def near(self, name: str, ours: float, expected: float, *, within: float = 0.0, share: float = 0.0, **told) -> None:
-        """A figure that must be the expected one within an absolute and a relative deviation, whichever is larger."""
+    def near(
+        self, name: str, ours: float, expected: float, *, within: float = 0.0, share: float = 0.0, **known
+    ) -> None:
+        """Adds a figure that may deviate from the expected one by `within`, or by `share` of it if that is more."""
         room = max(within, share * abs(expected))
-        self.add(name, ours, expected - room, expected + room, **(told or {"spec": expected}))
+        self.add(name, ours, expected - room, expected + room, **(known or {"spec": expected}))
 
-    def _tell(self, value: float | None) -> str:
+    def _format(self, value: float | None) -> str:
         if value is None:
             return "-"
         text = f"{value:.{self.digits}f}"
         return text if value == 0 or float(text) != 0 else f"{value:.1e}"
 
-    def _tell_band(self, low: float, high: float) -> str:
+    def _format_band(self, low: float, high: float) -> str:
         if math.isinf(low) and math.isinf(high):
             return "-"
         if math.isinf(high):
-            return f">= {self._tell(low)}"
-        return f"<= {self._tell(high)}" if math.isinf(low) else f"{self._tell(low)}..{self._tell(high)}"
+            return f">= {self._format(low)}"
+        return f"<= {self._format(high)}" if math.isinf(low) else f"{self._format(low)}..{self._format(high)}"
 
     def __str__(self) -> str:
         return "\n".join(align([[self.title, *HEADS[1:]], *self.rows]))

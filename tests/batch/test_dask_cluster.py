@@ -105,7 +105,7 @@ def test_a_cluster_writes_the_same_bytes(dask, strips, tmp_path, monkeypatch):
     assert said.startswith(f"error: {broken}: ") and said.count("\n") == 1
     assert contents(tmp_path / "there") == contents(tmp_path / "local")
     skipped = run(relative, "-o", tmp_path / "there", "--scheduler", dask.address, "--resume")
-    assert skipped == (0, f"{relative}/a.las: is there already\n{relative}/b.las: is there already\n")
+    assert skipped == (0, f"{relative}/a.las: is up to date, skipped\n{relative}/b.las: is up to date, skipped\n")
 
 
 @pytest.mark.slow

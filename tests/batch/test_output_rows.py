@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from batch_tools import make_job, read_cloud, run_one
 
-from wavebatch.batch.output_rows import assemble_returns, gather_echoes
+from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.batch.unit import prepare_strip
-from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.echoes import COLUMNS, PASSED_THROUGH, Column, EchoFlag
 from wavebatch.core.errors import StageError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.group_returns import LONGEST_PULSE
@@ -166,6 +166,29 @@ def test_returns_mode_keeps_every_point_and_adds_the_matching_echo(spoilt, tmp_p
     counts = outcome.report
     assert counts.count("points_out") == counts.count("points_in") == len(points)
     assert counts.count("matched_returns") == len(matched)
+
+
+@pytest.mark.parametrize("points", ["echoes", "returns"])
+@pytest.mark.parametrize(("no_data", "empty"), [(None, 0), (250.0, 250)])
+def test_integer_columns_are_written_too(spoilt, monkeypatch, points, no_data, empty):
+    """They came out as 0 in every row once, because only floats were taken along."""
+    monkeypatch.setitem(COLUMNS, "amplitude", Column("amplitude", "u1", "-", "number of the echo", no_data))
+    prepared = prepare_strip(make_job(spoilt, points=points))
+    with StripReader(spoilt) as reader:
+        unit = reader.read_unit(0, prepared.scan)
+        blocks = reader.read_blocks(unit, 100, owned_only=points == "echoes")
+        echoes = gather_echoes(
+            unit, [(block, index, prepared.job.chain.run(block, prepared.system)) for block, index in blocks]
+        )
+    number = (np.arange(len(echoes.table)) % 200 + 1).astype(np.uint8)
+    echoes = dataclasses.replace(echoes, table=echoes.table.with_attributes(amplitude=number))
+    rows, _ = (assemble_echoes if points == "echoes" else assemble_returns)(unit, echoes, prepared.layout)
+    is_echo = (rows["echo_flags"] & PASSED_THROUGH) == 0
+    kept = number if points == "echoes" else number[echoes.table.attributes["point"] >= 0]
+    assert rows["amplitude"].dtype == np.uint8
+    assert np.array_equal(np.sort(rows["amplitude"][is_echo]), np.sort(kept))
+    assert np.count_nonzero(~is_echo) > 10 and (rows["amplitude"][~is_echo] == empty).all()
+    prepared.scan.close()
 
 
 def test_counts_are_those_of_a_loop(spoilt, tmp_path):

@@ -97,7 +97,7 @@ def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     assert "KNOWN" not in angle and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
     (remark,) = report(tmp_path / "out")["remarks"]
     assert f"incidence_angle: none of {counts['echoes']} echoes has one" in remark
-    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse of", "max_error is 10"):
+    for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse from", "max_error is 10"):
         assert number in remark
     assert remark in done.stderr
     told = f"no-data for {angle['UNCERTAIN']} of {counts['echoes']} echoes: more uncertain than max_error"
@@ -227,6 +227,11 @@ def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
     done = run(tiny_strip, "-o", tmp_path / "out", "--trajectory", path)
     assert done.exit_code == 4
     assert "do not overlap on any clock" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", "\x7f\"\\.las"])
+def test_a_calibration_of_a_strip_of_any_name_comes_back(name):
+    assert parse_calibration(format_calibration(replace(FOUND, strip=name)), "cal").strip == name
 
 
 def test_calibration_files():

@@ -85,7 +85,7 @@ def test_some_failed_is_3_none_written_is_4(tiny_strip, tmp_path):
 def test_existing_outputs(tiny_strip, done):
     refused = _run(tiny_strip, "-o", done)
     assert refused.exit_code == 4 and "--overwrite" in refused.stderr and refused.stderr.count("\n") == 1
-    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--resume").stderr.endswith("is there already\n")
+    assert _run(tiny_strip, "-o", done, "--profile", "fast", "--resume").stderr.endswith("is up to date, skipped\n")
     assert _run(tiny_strip, "-o", done, "--profile", "fast", "--overwrite").exit_code == 0
 
 

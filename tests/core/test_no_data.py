@@ -9,14 +9,14 @@ from wavebatch.core.no_data import NoData, count_reasons, explain, without_nan
 
 
 def test_json_has_null_for_what_is_no_number(capsys):
-    told = {1: math.nan, "b": [np.float64("inf"), 2, np.float32(0.5)], "c": ("x", None, True, -math.inf)}
+    given = {1: math.nan, "b": [np.float64("inf"), 2, np.float32(0.5)], "c": ("x", None, True, -math.inf)}
     expected = {"1": None, "b": [None, 2, 0.5], "c": ["x", None, True, None]}
-    assert without_nan(told) == expected
-    print_json(told)
+    assert without_nan(given) == expected
+    print_json(given)
     assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == expected
 
 
-def test_the_first_reason_that_holds_is_told_and_counted():
+def test_the_first_reason_that_applies_is_given_and_counted():
     values = np.array([1.0, np.nan, np.nan, np.nan])
     codes = explain(values, (NoData.NO_SENSOR, np.array([True, True, False, False])), (NoData.CUT, values != values))
     assert codes.tolist() == [NoData.KNOWN, NoData.NO_SENSOR, NoData.CUT, NoData.CUT]

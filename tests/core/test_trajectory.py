@@ -73,8 +73,8 @@ WEEK_START = (ADJUSTED_START + ADJUSTED) % WEEK
 )
 def test_the_clock_is_solved_from_the_data(own, strip, clocks):
     path = Trajectory.build(*flight(start=own))
-    offset, said = solve_offset(path, strip + 2.0, strip + 12.0)
-    assert clocks in said
+    offset, words = solve_offset(path, strip + 2.0, strip + 12.0)
+    assert clocks in words
     assert own + offset == pytest.approx(strip, abs=1e-3)
 
 

@@ -12,7 +12,7 @@ import pytest
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import publish
 from wavebatch.files.disk.publish import Draft, is_stream, publish_together, refuse_existing, remove_stale
-from wavebatch.surveying.system_file import write_text
+from wavebatch.files.text_file import write_text
 
 
 def write(target, text, *, overwrite=False):

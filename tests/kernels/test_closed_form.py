@@ -1,4 +1,4 @@
-"""The closed form of single echoes: the test vector of ALGORITHMS.md 4.1, and a plain weighted parabola."""
+"""The closed form of single echoes: the test vector of docs/algorithms.md 4.1, and a plain weighted parabola."""
 
 import naive
 import numpy as np

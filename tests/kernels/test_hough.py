@@ -1,4 +1,4 @@
-"""Lines in images: position and angle to the acceptance of ALGORITHMS.md 1.3 (T8), segments, scan lines."""
+"""Lines in images: position and angle to the acceptance of docs/algorithms.md 1.3 (T8), segments, scan lines."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def test_position_and_angle_meet_the_acceptance(slope):
     assert np.sqrt(np.mean(np.square(turn))) < 0.1
 
 
-def test_segments_of_one_line_are_told_apart_by_their_gap(rng):
+def test_segments_of_one_line_are_separated_by_their_gap(rng):
     image = paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)])
     lines = detect(image)
     assert sorted(round(line.length / 10) for line in lines) == [14, 14]

@@ -1,4 +1,4 @@
-"""Angles from widths: the tables of ALGORITHMS.md 1.4 (T9), the footprint by Monte Carlo, errors that are kept."""
+"""Angles from widths: the tables of docs/algorithms.md 1.4 (T9), the footprint by Monte Carlo, errors that are kept."""
 
 import numpy as np
 import pytest

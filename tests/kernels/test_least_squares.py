@@ -11,9 +11,8 @@ from wavebatch.kernels.fit.least_squares import (
     Windows,
     evaluate_model,
     fit_windows,
-    gram_matrix,
-    parameter_errors,
 )
+from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 
 NOISE = 1.0
@@ -280,7 +279,7 @@ def test_hopeless_problems_are_given_up_and_others_are_not(rng):
     np.testing.assert_array_equal(fit.parameters[1::2], free.parameters[1::2])
 
 
-def test_too_few_iterations_are_told(rng):
+def test_too_few_iterations_are_reported(rng):
     truth = draw(rng, 10, 2, apart=3.0)
     start = truth.copy()
     start[:, 1] += 1.5

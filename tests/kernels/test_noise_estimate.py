@@ -55,7 +55,7 @@ def test_waveforms_without_a_quiet_sample_give_the_first_guess():
 
 @pytest.mark.parametrize("spread", [0.0, 0.4, 1.5, 4.0])
 @pytest.mark.parametrize("std", [0.7, 1.5])
-def test_spread_of_baselines_is_told_from_noise(std, spread):
+def test_spread_of_baselines_is_separated_from_noise(std, spread):
     pooled = estimate_noise(record(std, n=3000, level=30.0, spread=spread), 6)
     assert pooled.spread == pytest.approx(spread, rel=0.08, abs=0.04)
     assert pooled.std == pytest.approx(np.hypot(std, QUANTISATION_STD), rel=0.02)

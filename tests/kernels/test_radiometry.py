@@ -1,4 +1,4 @@
-"""Calibration, backscatter and reflectance against the numbers of ALGORITHMS.md 5 (T18), and their errors."""
+"""Calibration, backscatter and reflectance against the numbers of docs/algorithms.md 5 (T18), and their errors."""
 
 import numpy as np
 import pytest

@@ -107,7 +107,7 @@ def test_keys_sort_as_indices_and_come_back(rng):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, 1e300])
 @pytest.mark.parametrize("what", [0, 1, 2])
-def test_rays_that_keys_cannot_reach_are_told(bad, what):
+def test_rays_that_keys_cannot_reach_are_refused(bad, what):
     rays = [values.copy() for values in draw_rays(np.random.default_rng(6), 5)]
     rays[what].reshape(5, -1)[2, -1] = bad
     assert fits_keys(*rays, 0.5).tolist() == [True, True, False, True, True]

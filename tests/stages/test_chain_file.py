@@ -70,7 +70,7 @@ def _wrong(old, new):
         (_wrong("= 5", "= -5"), ["(detect.maximum): threshold must lie between 0 and 1e+06, it is -5.0"]),
         (_wrong("= 3", "= 3.0"), ["steps must be an integer", "3.0"]),
         (_wrong("= 3", "= 101"), ["steps must lie between 0 and 100, it is 101"]),
-        (_wrong('stage = "noise.pooled"', "guard = 3.0"), ["[[chain]] 1", "stage is missing"]),
+        (_wrong('stage = "noise.pooled"', "guard = 3.0"), ["[[chain]] 1", "key 'stage' is missing"]),
         (_wrong('"noise.pooled"', "7"), ["[[chain]] 1", "stage must be a string"]),
         (_wrong("= 5", "= "), ["not valid TOML", "line 6"]),
         ("[chain]\nstage = 'noise.pooled'", ["[[chain]]"]),

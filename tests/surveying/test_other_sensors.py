@@ -175,9 +175,14 @@ def test_systems_of_digitizers_are_saved(tmp_path):
     write_survey(path, SavedSurvey(survey), overwrite=False)
     assert load_survey(path).survey == survey
     text = path.read_text()
-    for old, new in (("index = 9", "index = 4"), ("index = 9", "index = 0"), ("index = 9\n", "")):
-        with pytest.raises(ConfigError, match=r"\[system\]: digitizers 2: index must be a number from 1 to 255"):
-            parse_survey(text.replace(old, new), "x.toml")
+    wrong = {
+        "index = 4\n": "index 4 is there already",
+        "index = 0\n": "index must lie between 1 and 255",
+        "": "key 'index' is missing",
+    }
+    for new, words in wrong.items():
+        with pytest.raises(ConfigError, match=rf"\[system\]: \[\[digitizers\]\] 2: {words}"):
+            parse_survey(text.replace("index = 9\n", new), "x.toml")
 
 
 @pytest.mark.parametrize(("share", "seed"), [(0.12, 11), (0.2, 12)])

@@ -12,7 +12,7 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, estimate_path, find_sensor
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor
 from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
 
 
@@ -164,7 +164,7 @@ def test_height_is_the_last_resort():
     returns = ReturnTable(np.array([0, 0, 2], np.int32), np.array([10.0, 90.0, 30.0]), np.arange(3), xyz)
     above = SensorSource("flight height", height=800.0).fill(replace(block, returns=returns)).sensor
     assert above[:3, 2] == pytest.approx([786.0, 800.0, 795.0])
-    assert NOBODY.fill(block).sensor is None
+    assert UNKNOWN.fill(block).sensor is None
 
 
 @pytest.mark.parametrize(
@@ -172,10 +172,10 @@ def test_height_is_the_last_resort():
     [
         (CrsUnits("geographic"), 1.0, "coordinates are degrees"),
         (CrsUnits("geocentric"), 1.0, "coordinates are geocentric"),
-        (CrsUnits("projected", 1200 / 3937), 3.2804, "coordinates are US survey feet, in which"),
+        (CrsUnits("projected", 1200 / 3937), 3.2804, "coordinates are US survey feet, so ranges"),
         (CrsUnits("projected", 1.0, 0.3048), 1.0, "coordinates are metres with heights in international feet"),
         (CrsUnits("projected", np.nan), 1.0, "coordinates are a unit that is not known"),
-        (CrsUnits(None), 3.2798, "packet vectors are 3.280 times c/2 long, as they are in feet"),
+        (CrsUnits(None), 3.2798, "packet vectors are 3.280 times c/2 long, as in feet"),
     ],
 )
 def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):

@@ -1,7 +1,7 @@
 """Calibration from targets: files of targets, what lies in them, and a constant that gives their reflectance back."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import laspy
 import numpy as np
@@ -196,14 +196,14 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
     assert "digitizer 1, scanner channel 0:" in done.stderr and "digitizer 2, scanner" in done.stderr
     found = load_calibration(cal)
     strong, weak = found.channels
-    assert (strong["digitizer"], weak["digitizer"]) == (1, 2)
+    assert (strong.digitizer, weak.digitizer) == (1, 2)
     true = 4 / find_scene("village").light
-    assert strong["constant"] == pytest.approx(true, rel=0.01)
-    assert weak["constant"] == pytest.approx(2 * true, rel=0.02)
-    assert 0 < strong["spread"] < 0.05 and strong["echoes"] > weak["echoes"] >= 10
+    assert strong.constant == pytest.approx(true, rel=0.01)
+    assert weak.constant == pytest.approx(2 * true, rel=0.02)
+    assert 0 < strong.spread < 0.05 and strong.echoes > weak.echoes >= 10
     assert found.relative_error > 0.2
     assert parse_calibration(format_calibration(found), "cal").channels == found.channels
-    assert found.describe()["channels"] == [strong, weak]
+    assert found.describe()["channels"] == [asdict(strong), asdict(weak)]
     assert call("run", two_channels, "-o", folder, "--profile", "fast", "--calibration", cal).exit_code == 0
     cloud = laspy.read(next(folder.glob("*.laz")))
     rho, index = np.asarray(cloud["reflectance"]), np.asarray(cloud.z) < GROUND + 0.5
@@ -215,7 +215,7 @@ def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_chan
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ("digitizer = 1.5\nconstant = 1e-8\nrelative_error = 0.1", "digitizer must be a whole number"),
+        ("digitizer = 1.5\nconstant = 1e-8\nrelative_error = 0.1", "digitizer must be an integer, it is 1.5"),
         ("digitizer = 1\nscanner = 4\nconstant = 1e-8\nrelative_error = 0.1", "scanner must lie between 0 and 3"),
         ("digitizer = 0\nconstant = 1e-8\nrelative_error = 0.1", "must lie between 1 and 255"),
         ("digitizer = 1\nrelative_error = 0.1", "key 'constant' is missing"),

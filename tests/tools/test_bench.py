@@ -18,11 +18,11 @@ from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
 from wavebatch.tools.bench import command, peers, report
 from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
+from wavebatch.tools.bench.cases import CASES, list_cases, make_scene
 from wavebatch.tools.bench.command import BenchOptions, run_bench
-from wavebatch.tools.bench.hazards import CASES, make_scene
 from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
-from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures, list_cases
+from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures
 from wavebatch.tools.bench.worker import Worker, WorkerDied, peak_memory
 from wavebatch.tools.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
 

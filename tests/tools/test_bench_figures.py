@@ -2,16 +2,24 @@
 
 from dataclasses import replace
 
+import naive
 import numpy as np
 import pytest
 
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.kernels.fit.bounds import crlb, crlb_joint
-from wavebatch.tools.bench.figures import SURVEY_SCATTER, Figure, median_range, root_mean_square, share
+from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.tools.bench.figures import (
+    SURVEY_SCATTER,
+    Figure,
+    choose_cheapest,
+    find_front,
+    median_range,
+    root_mean_square,
+    share,
+)
 from wavebatch.tools.bench.promises import format_promises, judge
-from wavebatch.tools.bench.rank_chains import choose_cheapest, find_front
 from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.tools.simulate.render import paint_echoes
@@ -80,7 +88,7 @@ def test_bounds_are_the_closed_forms():
     found = find_bounds(recording, truth, 3)
     alone = crlb(np.array([50.0]), np.array([2.0]), recording.recorded_noise, 1.0)
     assert found[0] == pytest.approx(np.array(alone)[:, 0], rel=2e-3)
-    pair = crlb_joint(
+    pair = naive.crlb_joint(
         np.array([[30.0], [37.0]]),
         np.array([[80.0], [40.0]]),
         np.array([[2.6], [2.0]]),

@@ -7,9 +7,10 @@ from click.testing import CliRunner
 from wavebatch.cli import main
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.tools.bench.rank_chains import list_methods
+from wavebatch.tools.bench.cases import list_cases
+from wavebatch.tools.bench.chains import list_methods
 from wavebatch.tools.bench.report import format_document
-from wavebatch.tools.bench.stability import FAILURES, list_cases, measure_stability
+from wavebatch.tools.bench.stability import FAILURES, measure_stability
 
 
 def test_every_method_has_a_chain():

@@ -74,7 +74,7 @@ def test_many_points_without_a_time_are_matched_in_bounded_memory(tmp_path, monk
     tracemalloc.stop()
     assert result.matched_by == "gps_time" and (result.missed, result.extra) == (0, 500)
     monkeypatch.setattr(pairing, "MOST_PAIRS", 15_000)
-    with pytest.raises(InputError, match="without a time of their own"):
+    with pytest.raises(InputError, match="without a valid GPS time"):
         compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
 
 

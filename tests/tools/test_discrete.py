@@ -1,4 +1,4 @@
-"""The discrete receiver against a plain loop, and the published tables of return numbers (ALGORITHMS.md 1.5, T10)."""
+"""The discrete receiver against a plain loop, and the published tables of return numbers (docs/algorithms.md 1.5)."""
 
 import laspy
 import numpy as np

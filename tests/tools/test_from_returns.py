@@ -178,7 +178,7 @@ def test_command_line(cloud, tmp_path):
     again = run(cloud, "-o", target)
     assert again.exit_code == 1 and again.stderr.count("\n") == 1 and "exists already" in again.stderr
     strong = run(cloud, "-o", target, "--overwrite", "--gain", "10")
-    assert strong.exit_code == 0 and "stronger than the digitizer" in strong.stderr
+    assert strong.exit_code == 0 and "above the digitizer" in strong.stderr
     assert run(cloud, "-o", tmp_path / "t.las", "--intensity", "reflectance").exit_code == 2
     assert run(cloud, "-o", tmp_path / "t.las", "--power", "3").exit_code == 2
     assert run(cloud, "-o", tmp_path / "t.las", "--width", "0").exit_code == 2

@@ -128,7 +128,7 @@ def test_views_of_a_strip_are_what_a_run_gives(tiny_strip, monkeypatch):
     one, other = found.values()
     assert [view.packet for view in one][:4] == [5, 6, 7, 300]
     assert [view.point for view in one] == [view.point for view in other]
-    assert one[4].point == 0 and 400 in one[5].return_points
+    assert one[4].point == 0 and 400 in blocks[one[5].packet][0].returns.point
     for view, twin in zip(one, other, strict=True):
         block, point = blocks[view.packet]
         assert point == view.point == twin.point and view.gps_time == block.gps_time[0]
@@ -175,8 +175,8 @@ def test_without_a_wish_a_few_are_spread_over_the_strip(tiny_strip):
     ("words", "code", "message"),
     [
         ("--packet 99999", 2, "there is no packet 99999; packets are 0 to"),
-        ("--packet 5:3", 2, "there is no packet 5:3"),
-        ("--packet x", 2, "neither a number nor FIRST:BEHIND"),
+        ("--packet 5:3", 2, "'5:3' is empty; END is the number after the last one"),
+        ("--packet x", 2, "neither a number nor FIRST:END"),
         (f"--packet 0:{MOST + 1}", 2, f"{MOST} fit"),
         ("--point 99999", 2, "there is no point 99999"),
         ("--gps-time 3", 2, "no pulse lies within"),
@@ -268,8 +268,9 @@ def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
 def test_real_waveforms(riegl, leica, tmp_path):
     chain = load_profile("accurate")
     with StripReader(riegl) as reader, reader.scan() as scan:
-        views = read_views(reader, scan, find_places(reader, scan, Wanted(points=(514,)), None), chain, PULSE)
-        assert views[0].packet == 475 and 514 in views[0].return_points
+        (place,) = find_places(reader, scan, Wanted(points=(514,)), None)
+        views, unit = read_views(reader, scan, [place], chain, PULSE), reader.read_unit(place.unit, scan)
+        assert views[0].packet == 475 and unit.packet_of_point[514 - unit.start] == place.row
         assert views[0].samples.max() == pytest.approx(183, abs=20)
     pytest.importorskip("matplotlib")
     assert run(leica, "-o", tmp_path / "l.png", "--most", 1).exit_code == 0
@@ -327,7 +328,7 @@ def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, t
     assert first.decode().count("packet ") == 9 and "returns of the file" in first.decode()
     assert run(*words).exit_code == 0 and target.read_bytes() == first
     clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
-    assert clash.exit_code == 2 and "--random draws packets itself" in clash.stderr
+    assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
 
 
 def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):

@@ -1,6 +1,15 @@
-"""Strips in, clouds out: what `wavebatch run` does.
+"""Strips in, clouds out: the work of `wavebatch run`.
 
-`inputs` says which strips, `plan` what will be done, `run` gives out the units of `task`s, one per strip, to `workers`
-or a `cluster`. There `work` reads a unit, runs the chain and has `assemble` make rows of its echoes; `secondpass` adds
-columns that need a point's neighbours. `report` counts, `remarks` explains, `record` is the file beside the cloud.
+How one strip flows through the modules:
+
+1. `files.inputs` lists the strips. `preflight` checks memory and the names of the outputs, before anything is read.
+2. `run` keeps the workers busy: `processes` on this machine, or a `dask_cluster`. It opens a `strip_task` per strip,
+   writes results in order, and keeps a strip that fails from stopping the others.
+3. `strip_task` sends the preparation, then unit after unit, to the workers, writes their rows and publishes
+   the cloud.
+4. `unit` is what runs in a worker: scan and survey of the strip, then one unit from packets to rows.
+   `output_rows` makes the rows of the unit's echoes.
+5. `neighbour_pass` fills columns that need the points around an echo, tile by tile, once all rows are there.
+6. `counts` adds up what was read and written; a cloud whose counts do not add up is not written.
+   `explain` adds remarks, `report_file` writes the report next to the cloud: it means that the cloud is complete.
 """

@@ -1,9 +1,13 @@
-"""RunReport: what a run counted and how good its echoes are, apart from how long it took."""
+"""RunReport: counts and quality of a unit, a strip or a batch, apart from timing.
+
+`output_rows` makes one per unit, `strip_task` adds them up and checks the sums, `report_file` writes and reads them.
+Before you change it: `a + b` must be exact and independent of order, so histograms hold counts, never quantiles.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -35,22 +39,22 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 @dataclass(frozen=True, slots=True)
 class LogBins:
-    """Logarithmic bins: counts in them add up exactly, whatever the order; the outer ones hold what lies beyond."""
+    """Logarithmic bins; the first and the last also count the values beyond them."""
 
     low: float
     step: float
-    """Ratio of an edge to the one before it, less 1, in logarithm."""
+    """Difference of the logarithms of two neighbouring edges."""
     number: int
 
     def count(self, values: np.ndarray) -> np.ndarray:
-        """Values per bin, i8 (number,); what is not a positive number is left out."""
+        """Count values (m,) per bin, i8 (number,); values that are not positive and finite are left out."""
         values = np.asarray(values, np.float64)
         values = values[np.isfinite(values) & (values > 0)]
         place = np.floor(np.log(values / self.low) / self.step)
         return np.bincount(np.clip(place, 0, self.number - 1).astype(np.int64), minlength=self.number)
 
     def quantile(self, counts: np.ndarray, share: float) -> float | None:
-        """Centre of the bin that holds the value below which `share` of all lie; None without values."""
+        """Return the centre of the bin of the quantile `share`, from counts i8 (number,); None without values."""
         total = int(counts.sum())
         if not total:
             return None
@@ -74,39 +78,41 @@ class RunReport:
     """Counts and quality of a unit, a strip or a batch; `a + b` merges two."""
 
     counts: Mapping[str, int] = field(default_factory=dict)
-    """By name in COUNTS; what is missing is 0."""
+    """By name in COUNTS; a missing one is 0."""
     passed_through: Mapping[str, int] = field(default_factory=dict)
-    """Points written without attributes, by the flag that says why."""
+    """Points written without attributes, by the flag with the reason."""
     flags: Mapping[str, int] = field(default_factory=dict)
     """Points written per flag."""
     no_data: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
-    """Echoes per column that can lack values, and per reason in nodata.NoData; KNOWN are those that have one."""
+    """Echoes per column that can lack values and per reason in no_data.NoData; KNOWN counts those with a value."""
     remarks: tuple[str, ...] = ()
-    """Lines about a strip as a whole, for whoever reads the report."""
+    """Lines about the strip as a whole, from `explain`."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
     amplitude: np.ndarray = _zeros(AMPLITUDE_BINS.number)
     """Echoes per bin of AMPLITUDE_BINS."""
     echo_width: np.ndarray = _zeros(WIDTH_BINS.number)
     """Echoes per bin of WIDTH_BINS."""
     timing: Mapping[str, float] = field(default_factory=dict)
-    """Seconds by what they were spent on, summed over all processes."""
+    """Seconds by task, summed over all processes."""
 
     def __add__(self, other: RunReport) -> RunReport:
-        return RunReport(
-            counts=_add(self.counts, other.counts),
-            passed_through=_add(self.passed_through, other.passed_through),
-            flags=_add(self.flags, other.flags),
-            no_data=_add_reasons(self.no_data, other.no_data),
-            remarks=tuple(sorted({*self.remarks, *other.remarks})),
-            echoes_per_waveform=self.echoes_per_waveform + other.echoes_per_waveform,
-            amplitude=self.amplitude + other.amplitude,
-            echo_width=self.echo_width + other.echo_width,
-            timing=_add(self.timing, other.timing),
-        )
+        return RunReport(**{f.name: _add(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)})
 
     @classmethod
     def of_echoes(cls, per_waveform: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray) -> RunReport:
-        """The quality part, from echoes per waveform (n,) and the echoes' amplitudes [count] and sigmas [ns] (m,)."""
+        """Build the quality part.
+
+        Parameters
+        ----------
+        per_waveform : i8 (n,)
+            Echoes per waveform.
+        amplitude : f4 (m,), count
+        sigma : f4 (m,), ns
+
+        Returns
+        -------
+        RunReport
+        """
         clipped = np.minimum(per_waveform, OVERFLOW)
         return cls(
             echoes_per_waveform=np.bincount(clipped, minlength=OVERFLOW + 1),
@@ -115,19 +121,25 @@ class RunReport:
         )
 
     def count(self, name: str) -> int:
-        """One of COUNTS."""
+        """Return the count of a name in COUNTS."""
         return self.counts.get(name, 0)
 
     def check(self, points: str, where: str) -> None:
-        """Raises StageError unless every point and every echo is accounted for.
+        """Check that every point and every echo is accounted for.
 
-        points: "echoes" or "returns", what was written. where: the strip, for the message.
+        Parameters
+        ----------
+        points : str
+            What was written: "echoes" or "returns".
+        where : str
+            The strip, for the message.
+
+        Raises
+        ------
+        StageError
+            Where a sum differs.
         """
         get, passed = self.count, self.passed_through
-        if points == "echoes":
-            out = get("echoes") + sum(passed.values())
-        else:
-            out = get("matched_returns") + sum(passed.values())
         sums = {
             "points_in": get("points_with_waveform") + get("points_without_waveform") + get("points_broken"),
             "points_with_waveform": get("matched_returns") + get("unmatched_returns") + get("no_echo_returns"),
@@ -135,7 +147,7 @@ class RunReport:
             "points_broken": passed.get("BROKEN_PACKET", 0),
             "no_echo_returns": passed.get("NO_ECHO", 0) - get("unmatched_returns"),
             "echoes": get("matched_returns") + get("added_echoes"),
-            "points_out": out,
+            "points_out": get("echoes" if points == "echoes" else "matched_returns") + sum(passed.values()),
             "waveforms": int(self.echoes_per_waveform.sum()),
         }
         by_reason = [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
@@ -147,7 +159,7 @@ class RunReport:
                 )
 
     def to_json(self) -> dict[str, Any]:
-        """Counts and quality; timing is not in it."""
+        """Return counts and quality as plain values, without timing."""
         histograms = {"amplitude_dn": self.amplitude, "echo_width_ns": self.echo_width}
         return {
             "counts": {
@@ -165,7 +177,7 @@ class RunReport:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> RunReport:
-        """The report that `to_json` wrote; raises KeyError, TypeError or ValueError for anything else."""
+        """Read a report that `to_json` wrote; raises KeyError, TypeError or ValueError for any other document."""
         counts, quality = document["counts"], document["quality"]
         amplitude, echo_width = (_read_histogram(_BINS[name], quality[name]) for name in _BINS)
         return cls(
@@ -186,17 +198,16 @@ _PASSED = (EchoFlag.NO_WAVEFORM.name, EchoFlag.BROKEN_PACKET.name, EchoFlag.NO_E
 
 
 def count_flags(flags: np.ndarray) -> dict[str, int]:
-    """Rows per flag that is set at all, of `flags` u2 (m,)."""
+    """Count the rows per flag in `flags`, u2 (m,); flags that no row has are left out."""
     numbers = {flag.name: int(np.count_nonzero(flags & np.uint16(flag))) for flag in EchoFlag}
     return {name: number for name, number in numbers.items() if number}
 
 
-def _add(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: a.get(name, 0) + b.get(name, 0) for name in {**a, **b}}
-
-
-def _add_reasons(a: Mapping[str, Mapping[str, int]], b: Mapping[str, Mapping[str, int]]) -> dict[str, dict[str, int]]:
-    return {column: _add(a.get(column, {}), b.get(column, {})) for column in {**a, **b}}
+def _add(a: Any, b: Any) -> Any:
+    """The sum of two fields: mappings by key, lines of text without repeats, numbers and arrays as they are."""
+    if isinstance(a, Mapping):
+        return {name: _add(a[name], b[name]) if name in a and name in b else {**a, **b}[name] for name in {**a, **b}}
+    return tuple(sorted({*a, *b})) if isinstance(a, tuple) else a + b
 
 
 def _histogram_json(bins: LogBins, counts: np.ndarray) -> dict[str, Any]:

@@ -1,4 +1,9 @@
-"""Workers of a dask cluster that somebody else runs: the same calls, made there, on files that all machines see."""
+"""Workers of an existing dask cluster, for `wavebatch run --scheduler`; files must be visible to all machines.
+
+`Cluster` has the same methods as `processes.Workers`.
+Before you change it: the scheduler may lack wavebatch and NumPy, so it must see plain bytes only; and a cluster that
+is lost must end the run with a message, never hang it.
+"""
 
 from __future__ import annotations
 
@@ -22,20 +27,31 @@ from wavebatch.files.disk.publish import reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 PATIENCE = 60.0
-"""Seconds without a worker, or without a word of the scheduler, after which a cluster counts as lost."""
+"""Seconds without a worker, or without an answer of the scheduler, after which a cluster counts as lost."""
 _CONNECT = 10.0
+"""Seconds to wait for a connection."""
 _POLL = 5.0
+"""Seconds between two questions to the scheduler."""
 _SAME = ("wavebatch", "numpy", "scipy")
-"""Packages that must have one version everywhere, because they decide what is written."""
+"""Packages that must have one version everywhere, because results depend on them."""
 _LOUD = ("distributed", "distributed.client", "distributed.core", "distributed.utils_perf", "tornado", "asyncio")
-_ADVICE = "see that it runs, and run again with --resume: finished clouds are complete"
+_ADVICE = "check that it runs, and run again with --resume: finished clouds are complete"
 
 
 class Cluster:
-    """`submit` runs a function on any worker of the cluster at `address`; a context manager.
+    """Runs functions on the workers of a cluster; a context manager.
 
-    folder: of the outputs; temporary files that workers share lie in it, so that all of them must see it.
-    Entering raises ConfigError where the cluster cannot be reached or its workers are not fit.
+    Parameters
+    ----------
+    address : str
+        Of the scheduler.
+    folder : Path
+        Of the outputs; temporary files that workers share lie in it.
+
+    Raises
+    ------
+    ConfigError
+        When the context is entered: the cluster cannot be reached, or its workers do not fit.
     """
 
     is_remote = True
@@ -67,7 +83,7 @@ class Cluster:
         self._stack.close()
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
-        """The future result of `function(*arguments)`."""
+        """Return the future result of `function(*arguments)`; both must be picklable."""
         try:
             call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
             remote = self._client.submit(_travelling_call(), call, pure=False)
@@ -76,7 +92,7 @@ class Cluster:
         return _Promise(remote, self._translate)
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Those that are done, at least one; BrokenExecutor where the cluster is lost."""
+        """Wait for at least one future and return those done; BrokenExecutor where the cluster is lost."""
         futures = list(futures)
         self._heard = time.monotonic()
         while not (done := wait(futures, timeout=_POLL, return_when=FIRST_COMPLETED).done):
@@ -88,7 +104,7 @@ class Cluster:
         return done
 
     def restart(self) -> None:
-        """Nothing: the cluster replaces its own workers."""
+        """Do nothing: the cluster replaces workers that died."""
 
     def _count_threads(self) -> int:
         try:
@@ -98,12 +114,11 @@ class Cluster:
         return sum(self._client.nthreads().values())
 
     def _check_versions(self) -> None:
-        """Raises ConfigError where a worker has another Python, or another version of what decides the result."""
-        here = {"python": platform.python_version()}
-        self._compare("python", here["python"], self._ask(platform.python_version), lambda text: text.split(".")[:2])
-
-        tell = _travelling_versions()
-        here, there = tell(_SAME), self._ask(tell, _SAME)
+        """Raise ConfigError where a worker has another version of Python or of a package that results depend on."""
+        version = platform.python_version
+        self._compare("python", version(), self._ask(version), lambda text: text.split(".")[:2])
+        find_versions = _travelling_versions()
+        here, there = find_versions(_SAME), self._ask(find_versions, _SAME)
         for name in _SAME:
             self._compare(name, here[name], {worker: found.get(name) for worker, found in there.items()})
 
@@ -125,14 +140,14 @@ class Cluster:
                 )
 
     def _ask(self, function: Callable, *arguments: Any) -> dict[str, Any]:
-        """What each worker answers."""
+        """The answer of each worker."""
         try:
             return self._client.run(function, *arguments)
         except Exception as error:
-            raise ConfigError(f"--scheduler {self.address}: a worker cannot be asked: {_tell(error)}") from error
+            raise ConfigError(f"--scheduler {self.address}: a worker cannot be asked: {_one_line(error)}") from error
 
     def _translate(self, error: BaseException) -> BaseException:
-        """What a strip's task ended with, in our words."""
+        """The error of a call, in the words of wavebatch where it comes from the cluster."""
         from distributed import KilledWorker
         from distributed.client import FutureCancelledError
 
@@ -146,11 +161,11 @@ class Cluster:
         return error
 
     def _lost(self, reason: object) -> BrokenExecutor:
-        return BrokenExecutor(f"{self.address}: the cluster is lost ({_tell(reason)}); {_ADVICE}")
+        return BrokenExecutor(f"{self.address}: the cluster is lost ({_one_line(reason)}); {_ADVICE}")
 
 
 class _Promise(Future):
-    """The result of a remote future, as other executors give it."""
+    """A remote future with the interface of concurrent.futures."""
 
     def __init__(self, remote: Any, translate: Callable[[BaseException], BaseException]) -> None:
         super().__init__()
@@ -169,7 +184,7 @@ class _Promise(Future):
                 self.set_exception(error)
 
     def cancel(self) -> bool:
-        """Lets go of it, so that the cluster drops it too."""
+        """Cancel the call, and release it so that the cluster drops it too."""
         cancelled = super().cancel()
         with contextlib.suppress(Exception):
             self._remote.release()
@@ -177,7 +192,7 @@ class _Promise(Future):
 
 
 def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
-    """On a worker: the function's result, its temporary files in a folder that all workers see."""
+    """On a worker: the function's result; temporary files lie in a folder that all workers see."""
     use_scratch(scratch)
     try:
         return function(*arguments)
@@ -188,7 +203,7 @@ def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
 def _travelling_call() -> Callable[[bytes], bytes]:
     """A function that makes a pickled call and pickles (result, error).
 
-    It travels as code, and calls and results as bytes: the scheduler, which looks into all else, may lack wavebatch.
+    It is sent as code, calls and results as bytes: the scheduler unpickles all else, and may lack wavebatch.
     """
 
     def call(pickled: bytes) -> bytes:
@@ -206,12 +221,12 @@ def _travelling_call() -> Callable[[bytes], bytes]:
 
 
 def _travelling_versions() -> Callable[[tuple[str, ...]], dict[str, str]]:
-    """A function that tells versions of packages, without those that are not there; of wavebatch the files count too.
+    """A function that finds the versions of installed packages, and for wavebatch a checksum of its files.
 
-    It travels as code: a worker may lack wavebatch.
+    It is sent as code: a worker may lack wavebatch.
     """
 
-    def tell(names: tuple[str, ...]) -> dict[str, str]:
+    def find_versions(names: tuple[str, ...]) -> dict[str, str]:
         import importlib
         import pathlib
         import zlib
@@ -228,12 +243,12 @@ def _travelling_versions() -> Callable[[tuple[str, ...]], dict[str, str]]:
                 found[name] += f" (files {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x})"
         return found
 
-    return tell
+    return find_versions
 
 
 @contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """A client of the cluster; ConfigError where there is none."""
+    """A client of the cluster; ConfigError where it cannot be reached."""
     from distributed import Client
 
     try:
@@ -242,7 +257,7 @@ def _connected(address: str) -> Iterator[Any]:
         client = _call_in_time(2 * _CONNECT, lambda: Client(address, **options))
     except Exception as error:
         raise ConfigError(
-            f"--scheduler {address}: cannot be reached: {_tell(error)}; give the address that dask scheduler prints"
+            f"--scheduler {address}: cannot be reached: {_one_line(error)}; give the address that dask scheduler prints"
         ) from error
     try:
         yield client
@@ -252,7 +267,7 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _knock(address: str) -> None:
-    """Raises OSError or ValueError where nobody listens: a client that fails can hang, and leaves threads behind."""
+    """Raise OSError or ValueError where no scheduler listens; a client that fails can hang and leave threads."""
     scheme, separator, place = address.rpartition("://")
     if separator and scheme not in ("tcp", "tls"):
         return
@@ -263,7 +278,7 @@ def _knock(address: str) -> None:
 
 
 def _call_in_time(seconds: float, function: Callable) -> Any:
-    """The result of `function()`, which is left to itself where it takes longer: then TimeoutError."""
+    """The result of `function()`; TimeoutError where it takes longer, while its thread goes on."""
     future: Future = Future()
 
     def call() -> None:
@@ -278,9 +293,9 @@ def _call_in_time(seconds: float, function: Callable) -> Any:
 
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
-    """What dask would write to stderr about a cluster is said by our own lines."""
+    """Silence dask's own messages on stderr: wavebatch reports the same in one line."""
     import dask
-    import distributed  # noqa: F401 - sets its loggers up, which are silenced then
+    import distributed  # noqa: F401 - creates the loggers that are silenced below
 
     levels = {name: logging.getLogger(name).level for name in _LOUD}
     quiet = dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TiB"})
@@ -295,5 +310,5 @@ def _silent() -> Iterator[None]:
                 logging.getLogger(name).setLevel(level)
 
 
-def _tell(reason: object) -> str:
+def _one_line(reason: object) -> str:
     return " ".join(str(reason).split())[:200] or type(reason).__name__

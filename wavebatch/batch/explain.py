@@ -1,4 +1,8 @@
-"""What to tell about a strip that is written: columns without any value, why, and what to do; doubtful waveforms."""
+"""Remarks in the report of a strip: columns without any value, with cause and remedy, and doubtful waveforms.
+
+`strip_task` calls `find_remarks` once all rows of a strip are counted, `report_file` calls `explain_absence`.
+Before you change it: remarks depend on the strip and its counts alone, so that they are the same for every run.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +17,13 @@ from wavebatch.surveying.sensor import SensorSource
 _ANGLE = "incidence_angle"
 
 LEAST_JUDGED = 20
-"""Waveforms, or returns in waveforms with echoes, below which nothing is said about the strip."""
+"""Fewer waveforms, or returns in waveforms with echoes, are too few for a remark."""
 
 LEAST_MATCHED = 0.5
-"""Share of those returns that an echo should match."""
+"""Share of the returns in waveforms with echoes that an echo should match."""
 
 INVERTED = 5.0
-"""How much further counts reach below the baseline than above it, or than the noise, where signals go down."""
+"""Signals are inverted where counts reach this many times further below the baseline than above it."""
 
 _NEEDS: dict[str, tuple[NoData, ...]] = {
     "range": (),
@@ -28,16 +32,27 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
     "reflectance": (NoData.NOT_CALIBRATED,),
     _ANGLE: (NoData.NO_DIVERGENCE,),
 }
-"""Columns that mean something outside the file, and what they need beside the sensor's position."""
+"""Physical columns, and what each needs besides the sensor's position."""
 
 LEAST_DOUBT = 2.0
-"""Median difference of ranges by the trajectory and by the packets' vectors that is told [m]."""
+"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
 
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
-    """One line per column that was asked for and that no echo has, with the commonest reason and its remedy; one on
-    angles where the beam tells next to none; one where waveforms and returns have next to nothing in common,
-    and one on a trajectory at odds with the packets' vectors."""
+    """Find what a user should know about a strip that is written.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    report : RunReport
+        Of the whole strip.
+
+    Returns
+    -------
+    tuple of str
+        One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
+        hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
+    """
     lines = [*_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -52,7 +67,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """What speaks against the strip's waveforms, or against where its returns are said to lie in them."""
+    """Waveforms without any echo, and return locations that fit no echo."""
     waveforms, echoes, matched = (report.count(name) for name in ("waveforms", "echoes", "matched_returns"))
     near = matched + report.count("unmatched_returns")
     if waveforms >= LEAST_JUDGED and not echoes:
@@ -62,7 +77,7 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
         reason = "nothing rises far enough above the noise"
         if down > INVERTED * max(up, system.noise_std):
             reason = f"the signal falls from {system.baseline:.0f} to {system.baseline - down:.0f} DN: it is inverted"
-        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` says what the strip records"
+        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
     elif near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
         yield (
             f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
@@ -71,30 +86,36 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
-    """What the packets' vectors say against a trajectory."""
-    told = sensor.describe()
-    farther, sure = told.get("farther_than_by_vectors_m"), told.get("by_vectors_error_m")
-    if farther is not None and sure is not None and abs(farther) > max(LEAST_DOUBT, 5.0 * sure):
-        which = "farther" if farther > 0 else "nearer"
+    """A trajectory that contradicts the packet vectors."""
+    if sensor.farther is not None and abs(sensor.farther) > max(LEAST_DOUBT, 5.0 * sensor.vectors_error):
+        which = "farther" if sensor.farther > 0 else "nearer"
         yield (
-            f"range: by the trajectory echoes are {abs(farther):.1f} m {which} than by the packets' vectors, which "
-            f"are sure to {sure:.2g} m; are the heights of one above the geoid, of the other above the ellipsoid?"
+            f"range: by the trajectory echoes are {abs(sensor.farther):.1f} m {which} than by the packets' vectors, "
+            f"whose error is {sensor.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
+            "the ellipsoid?"
         )
 
 
 def explain_absence(prepared: Prepared) -> dict[str, str]:
-    """Why columns that need sensor, calibration or beam are not computed, by their names."""
+    """Explain why physical columns are not computed.
+
+    Parameters
+    ----------
+    prepared : Prepared
+
+    Returns
+    -------
+    dict of str to str
+        The reason by column.
+    """
     chain, system = prepared.job.chain, prepared.system
-    lacks = {
-        NoData.NOT_CALIBRATED: system.calibration is None,
-        NoData.NO_DIVERGENCE: system.divergence is None,
-    }
-    told = {}
+    lacks = {NoData.NOT_CALIBRATED: system.calibration is None, NoData.NO_DIVERGENCE: system.divergence is None}
+    reasons = {}
     for column, needs in _NEEDS.items():
         if column not in chain.makes:
             reason = next((REASONS[need][0] for need in needs if lacks[need]), None)
-            told[column] = reason or f"the chain has no stage attribute.{column}"
-    return told
+            reasons[column] = reason or f"the chain has no stage attribute.{column}"
+    return reasons
 
 
 def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping[str, int]) -> str:
@@ -109,10 +130,10 @@ def _explain(prepared: Prepared, report: RunReport, column: str, counts: Mapping
 
 
 def _look_out(prepared: Prepared, report: RunReport) -> AngleOutlook | None:
-    """What the strip's widths are worth; None where distance or divergence is not known."""
+    """How good angles from widths are on the strip; None where distance or divergence is unknown."""
     parameters = angle_parameters(prepared.job.chain) or {}
     divergence = parameters.get("divergence") or prepared.system.divergence
-    distance = prepared.sensor.describe().get("distance_m")
+    distance = prepared.sensor.distance
     amplitude = AMPLITUDE_BINS.quantile(report.amplitude, 0.5)
     spacing = prepared.choice.survey.figures.get("spacing_ns")
     if not (divergence and distance and amplitude and spacing):

@@ -1,9 +1,11 @@
-"""Columns that need a point's neighbours: a second pass over a strip's rows, tile by tile, before they are a cloud.
+"""Columns that need the points around an echo: a second pass over a strip's rows before the cloud is written.
 
-The rows of all units are kept in a file beside the cloud. When the last one is there, their positions are sorted into
-tiles of about as many points each, with a buffer around. Tiles are worked on anywhere, in any order; what they find is
-kept by row, and filled in while the cloud is written. A value depends on the points within the stage's radius alone,
-whatever the tiles are.
+1. `strip_task` adds the rows of all units; they wait in a temporary file next to the cloud.
+2. `cut` sorts their positions into tiles of about equal numbers of points, each with a buffer around it.
+3. Workers process tiles in any order with `process_tile`; results are kept by row.
+4. The results are filled into the rows while the cloud is written.
+
+Before you change it: a value must depend on the points within the stage's radius alone, whatever the tiles are.
 """
 
 from __future__ import annotations
@@ -31,47 +33,48 @@ from wavebatch.kernels.geometry.tiles import Tiles, cut_tiles, is_inside, sort_i
 from wavebatch.stages.chain import Step
 
 TILE_POINTS = 150_000
-"""Points of a tile, about, without its buffer."""
+"""Points of a tile without its buffer, roughly."""
 
 SAMPLE = 1 << 18
-"""Most points by which tiles are cut; then every second one is dropped."""
+"""Most points of the sample that tiles are cut by; when it is full, every second point is dropped."""
 
 PART_POINTS = 1 << 18
-"""Most points of a tile that are worked on at a time: a tile has more only where hardly any space holds very many."""
+"""Most points of a tile that are processed at a time, to bound memory where very many lie in one place."""
 
 _ENTRY = np.dtype([("row", "<i8"), ("xyz", "<i4", 3), ("ray", "<f4", 3)])
-_REASONS = {
-    Gap.KNOWN: NoData.KNOWN,
-    Gap.FEW_NEIGHBOURS: NoData.FEW_NEIGHBOURS,
-    Gap.NO_PLANE: NoData.NO_PLANE,
-    Gap.TOO_STEEP: NoData.TOO_STEEP,
-    Gap.UNCERTAIN: NoData.UNCERTAIN,
-}
 
 Found = tuple[np.ndarray, np.ndarray, RunReport]
-"""Rows (m,), ascending, what was found for them, and the time it took."""
+"""Rows i8 (m,), ascending; the values found for them, as `_found_dtype` has them; and the timing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TileTask:
-    """All that the tiles of a strip share; picklable."""
+    """Everything that the tiles of a strip share; picklable."""
 
     step: Step
     tiles: Tiles
     entries: Spool
-    """Points by tile, those of the buffer too."""
+    """Points by tile, including those of its buffer."""
     scales: tuple[float, float, float]
 
     def place(self, xyz: np.ndarray) -> np.ndarray:
-        """Positions [m] of stored coordinates, i4 (n, 3), but for the file's offset."""
+        """Return positions [m] without the file's offset, f8 (n, 3), of stored coordinates, i4 (n, 3)."""
         return xyz * np.array(self.scales)
 
 
 class SecondPass:
-    """The rows of one strip: `add` all, `cut` them into tiles, `take` what is found in each `next_tile`, read `rows`.
+    """The second pass of one strip: `add` all rows, `cut` them, `take` the result of each `next_tile`, read `rows`.
 
-    layout: of the cloud; rows come as `layout.extended(RAY)` has them. target: the cloud, beside which the rows wait.
-    tile_points: TILE_POINTS by default; the result does not depend on it.
+    Parameters
+    ----------
+    step : Step
+        Of the chain, with a second pass.
+    layout : OutputLayout
+        Of the cloud; rows that are added have `layout.extended(RAY)`.
+    target : Path
+        The cloud; temporary files lie next to it.
+    tile_points : int, optional
+        TILE_POINTS by default; the result does not depend on it.
     """
 
     def __init__(self, step: Step, layout: OutputLayout, target: Path, *, tile_points: int | None = None) -> None:
@@ -87,7 +90,7 @@ class SecondPass:
         self._sample, self._every = [np.empty((0, 3))], 1
 
     def add(self, rows: np.ndarray) -> None:
-        """Keeps rows (m,), in the order in which they will be written."""
+        """Keep rows (m,), in the order in which they will be written."""
         first = -len(self._rows) % self._every
         self._sample.append(self._place(rows[first :: self._every]))
         self._rows.add(rows)
@@ -96,13 +99,13 @@ class SecondPass:
             self._every *= 2
 
     def cut(self) -> RunReport:
-        """Sorts all rows into tiles."""
+        """Sort all rows into tiles; returns the timing."""
         start = time.perf_counter()
         reach = _reach(self._step)
         sample = np.concatenate(self._sample)
         self._sample = []
         sample = sample[np.isfinite(sample).all(axis=1)]
-        # Tiles much smaller than their buffers would list every point many times.
+        # Tiles much smaller than their buffers would list each point many times.
         tiles = cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
         self._found.extend(len(self._rows))
         self._entries = Spool(len(tiles), _ENTRY)
@@ -127,23 +130,23 @@ class SecondPass:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all that was cut is done."""
+        """Whether all tiles are done."""
         return not self._parts and not self._waiting
 
     def next_tile(self) -> tuple[bytes, int, int]:
-        """Arguments of `process_tile`, whose result is what `take` wants."""
+        """Return the arguments of `process_tile` for the next tile."""
         self._waiting += 1
         return (self._blob, *self._parts.popleft())
 
     def take(self, result: Found) -> RunReport:
-        """Keeps what was found in a tile."""
+        """Keep the result of a tile; returns its timing."""
         index, found, report = result
         self._found.put(index, found)
         self._waiting -= 1
         return report
 
     def rows(self) -> Iterator[np.ndarray]:
-        """All rows as the cloud's layout has them, with what was found."""
+        """Yield all rows in the cloud's layout, with the results filled in."""
         final = self._layout.dtype
         fields = zip(self._layout.extra_fields[len(self._layout.carried) :], self._layout.written, strict=True)
         filled = [(field, column) for field, column in fields if column.column in self._found.dtype.names]
@@ -156,13 +159,13 @@ class SecondPass:
             yield np.ascontiguousarray(plain).view(final)[:, 0]
 
     def count_reasons(self, echoes: int) -> dict[str, dict[str, int]]:
-        """Echoes of the strip by what became of them, once all rows were read; for RunReport.no_data."""
-        counts = {reason.name: int(self._gaps[gap]) for gap, reason in _REASONS.items()}
+        """Count the echoes by reason for RunReport.no_data, once all rows were read."""
+        counts = {NoData[gap.name].name: int(self._gaps[gap]) for gap in Gap if gap != Gap.NO_RAY}
         counts[NoData.NO_RAY.name] = echoes - sum(counts.values())
         return {self._found.dtype.names[0]: {name: number for name, number in counts.items() if number}}
 
     def close(self) -> None:
-        """Removes all temporary files; harmless twice."""
+        """Remove all temporary files; harmless twice."""
         self._rows.close()
         self._found.close()
         if self._entries is not None:
@@ -173,7 +176,22 @@ class SecondPass:
 
 
 def process_tile(blob: bytes, number: int, part: int) -> Found:
-    """What a tile's own points get, of those among the part's PART_POINTS; blob: a pickled TileTask."""
+    """Compute the second pass for one part of a tile.
+
+    Parameters
+    ----------
+    blob : bytes
+        A pickled TileTask.
+    number : int
+        Of the tile.
+    part : int
+        Of its PART_POINTS points.
+
+    Returns
+    -------
+    Found
+        For the points inside the tile, not for those of its buffer.
+    """
     start = time.perf_counter()
     task: TileTask = unpack(blob)
     stage = task.step.stage
@@ -229,7 +247,7 @@ def _list_entries(rows: np.ndarray, first: int) -> np.ndarray:
 
 
 def _reach(step: Step) -> float:
-    """How far around its own points a tile needs others [m]: the cells within the radius must be whole."""
+    """Width of a tile's buffer [m]: cells that the radius touches must be complete."""
     return step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
 
 

@@ -1,4 +1,9 @@
-"""From the echoes of a unit to the rows of its output: who owns what, return numbers, and what is passed through."""
+"""The output rows of a unit: one per echo or per return, with return numbers and the points that pass through.
+
+`unit.process_unit` calls `gather_echoes`, then `assemble_echoes` or `assemble_returns` (--points).
+Points of several units can share a packet. The unit that holds the packet's first point owns it and writes its echoes;
+before you change anything here, make sure that each packet and each point still has exactly one owner.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.batch.counts import RunReport, count_flags
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import count_reasons
 from wavebatch.core.units import PS_PER_NS
@@ -22,15 +27,15 @@ if TYPE_CHECKING:
     from wavebatch.files.strip.reader import Unit
 
 NEEDED = ("x", "y", "z", "point")
-"""Attribute columns without which echoes cannot become points."""
+"""Attribute columns that every point needs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnitEchoes:
-    """The echoes of all packets of a unit that were read."""
+    """The echoes of all packets that a unit read."""
 
     table: EchoTable
-    """`waveform` is the row of unit.packets; sorted by it, then time."""
+    """`waveform` is the row of unit.packets; sorted by waveform, then time."""
     nearest: np.ndarray
     """Index in the file of the packet's return nearest to each echo, i8 (m,)."""
     read: np.ndarray
@@ -41,18 +46,19 @@ class UnitEchoes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Members:
-    """Points of the unit, own ones first, then those of other units that share its packets."""
+    """Points of the unit, then the points of other units that share its packets."""
 
     own: int
+    """Number of the unit's points."""
     source: np.ndarray
     """Their records."""
     index: np.ndarray
-    """Their places in the file, i8 (k,)."""
+    """Their positions in the file, i8 (k,)."""
     packet: np.ndarray
-    """Row of unit.packets, -1 none, i8 (k,)."""
+    """Row of unit.packets, -1 for none, i8 (k,)."""
 
     def find(self, index: np.ndarray) -> np.ndarray:
-        """Rows of the points at `index` in the file."""
+        """Return the rows of the points at `index` in the file; raises StageError where one is missing."""
         rows = index - self.index[0] if self.own else np.full(len(index), -1)
         far = np.flatnonzero((rows < 0) | (rows >= self.own))
         if not len(far):
@@ -68,23 +74,35 @@ class _Members:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """What each output row is made from, in output order."""
+    """The sources of each output row, in output order."""
 
     echo: np.ndarray
     """Row of the echo table, -1 for points that are passed through, i8 (m,)."""
     source: np.ndarray
-    """Row of the members whose record it takes, i8 (m,)."""
+    """Row of the members whose record it copies, i8 (m,)."""
     owner: np.ndarray
-    """Own point that owns the packet, or the point itself: its pulse is the row's, i8 (m,)."""
+    """Point of the unit that owns the packet, or the point itself: the row is of its pulse, i8 (m,)."""
     reason: np.ndarray
     """Why it is passed through, EchoFlag, u2 (m,)."""
 
 
 def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray, EchoTable]]) -> UnitEchoes:
-    """The echoes of a unit's blocks in packet order.
+    """Collect the echoes of a unit's blocks in packet order.
 
-    results: block, row of unit.packets per waveform (n,), and the block's echoes.
-    Raises StageError where an owned packet was not read, or one was read twice.
+    Parameters
+    ----------
+    unit : Unit
+    results : iterable of (WaveformBlock, ndarray, EchoTable)
+        Block, row of unit.packets per waveform i8 (n,), and the block's echoes.
+
+    Returns
+    -------
+    UnitEchoes
+
+    Raises
+    ------
+    StageError
+        Where an owned packet was not read, or a packet was read twice.
     """
     n = len(unit.packets.owned)
     times_read = np.zeros(n, np.int64)
@@ -103,26 +121,47 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     table = EchoTable.concatenate(tables)
     if not tables:
         table = table.with_attributes(**{name: np.empty(0, "i8" if name == "point" else "f8") for name in NEEDED})
-    order = np.argsort(table.waveform, kind="stable")
-    return UnitEchoes(table.take(order), np.concatenate(nearest)[order], times_read > 0, direction)
+    near = np.concatenate(nearest)
+    if np.any(np.diff(table.waveform) < 0):  # blocks of several digitizers or lengths
+        order = np.argsort(table.waveform, kind="stable")
+        table, near = table.take(order), near[order]
+    return UnitEchoes(table, near, times_read > 0, direction)
 
 
 def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
-    """A row per echo of the packets that the unit owns, and one per point that no echo matches; with the account.
+    """Make a row per echo, and a row per point that no echo matches.
 
-    Rows are ordered by the packet's first point, then time; points without a packet stand at their own place. A return
-    that no echo of its packet matches is passed through as it is: what the vendor saw there is flagged, not lost.
+    Parameters
+    ----------
+    unit : Unit
+    echoes : UnitEchoes
+        Of the packets that the unit owns, and of no others.
+    layout : OutputLayout
+
+    Returns
+    -------
+    rows : structured array (m,)
+        Ordered by the packet's first point, then time; points without a packet keep their place.
+    report : RunReport
+
+    Raises
+    ------
+    StageError
+        Where echoes and points do not fit together.
+
+    Notes
+    -----
+    A return that no echo of its packet matches is passed through with a flag, so that no return of the vendor is lost.
     """
     members = _join_points(unit)
     owned = np.append(unit.packets.owned, False)
-    mine = np.flatnonzero(owned[echoes.table.waveform])
-    table, nearest = echoes.table.take(mine), echoes.nearest[mine]
-    point = table.attributes["point"]
-    table = table.with_flags(EchoFlag.ADDED, point < 0)
-    per_packet = np.append(table.count(len(owned) - 1), 0)
+    if not owned[echoes.table.waveform].all():
+        raise _bug(unit, "an echo lies in a packet of another unit")
+    point = echoes.table.attributes["point"]
+    table = echoes.table.with_flags(EchoFlag.ADDED, point < 0)
     found = np.zeros(len(members.index), bool)
     found[members.find(point[point >= 0])] = True
-    rows = _place_rows(unit, members, table, np.where(point >= 0, point, nearest), found, owned)
+    rows = _place_rows(unit, members, table, np.where(point >= 0, point, echoes.nearest), found, owned)
 
     records = members.source[rows.source]
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
@@ -138,18 +177,34 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
         xyz=xyz,
         return_number=number,
         number_of_returns=total,
-        columns={**_columns(table, rows.echo), "echo_flags": flags},
+        columns={**_columns(table, rows.echo, layout), "echo_flags": flags},
         matched=(rows.echo < 0) | np.append(point >= 0, False)[rows.echo],
         time=np.append(table.time, np.nan)[rows.echo],
     )
-    inside = owned[members.packet]
-    report = _count_packets(unit, table, per_packet, owned)
-    report += _count_returns(inside, per_packet[members.packet] > 0, found)
-    return output, report + _count_rows(output, rows.reason, flags)
+    return output, _count(unit, table, members.packet, found, owned[members.packet], rows.reason, flags)
 
 
 def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
-    """A row per point of the unit, unchanged but for the columns of the echo that matches it; with the account."""
+    """Make a row per point of the unit, with the columns of the echo that matches it.
+
+    Parameters
+    ----------
+    unit : Unit
+    echoes : UnitEchoes
+        Of all packets of the unit's points.
+    layout : OutputLayout
+
+    Returns
+    -------
+    rows : structured array (n,)
+        In the order of the points; standard fields are unchanged.
+    report : RunReport
+
+    Raises
+    ------
+    StageError
+        Where a packet was not read, or echoes and returns are not matched one to one.
+    """
     if not echoes.read.all():
         raise _bug(unit, "a packet of its points was not read")
     table, n = echoes.table, len(unit.points)
@@ -162,15 +217,10 @@ def assemble_returns(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tu
         raise _bug(unit, "echoes and returns are not matched one to one")
     reason = np.where(unit.point_flags > 0, unit.point_flags, np.uint16(EchoFlag.NO_ECHO)).astype(np.uint16)
     flags = np.where(found, np.append(table.flags, np.uint16(0))[echo], reason).astype(np.uint16)
-    output = layout.rows(np.asarray(unit.points), columns={**_columns(table, echo), "echo_flags": flags})
+    output = layout.rows(np.asarray(unit.points), columns={**_columns(table, echo, layout), "echo_flags": flags})
 
-    owned = np.append(unit.packets.owned, False)
-    per_packet = np.append(table.count(len(owned) - 1), 0)
-    inside = unit.packet_of_point >= 0
-    has_echoes = per_packet[unit.packet_of_point] > 0
-    report = _count_packets(unit, table.take(np.flatnonzero(owned[table.waveform])), per_packet, owned)
-    report += _count_returns(inside, has_echoes, found)
-    return output, report + _count_rows(output, np.where(found, np.uint16(0), reason), flags)
+    packet = unit.packet_of_point
+    return output, _count(unit, table, packet, found, packet >= 0, np.where(found, np.uint16(0), reason), flags)
 
 
 def _bug(unit: Unit, what: str) -> StageError:
@@ -214,7 +264,7 @@ def _place_rows(
 def _number_rows(
     pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray, layout: OutputLayout
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return number and number of returns; pulses without any waveform keep the input's."""
+    """Return number and number of returns; pulses without any waveform keep those of the input."""
     number, total, known = number_returns(pulse, xyz, direction)
     bits = records["bit_fields"].astype(np.int64)
     width = 4 if layout.source_format >= 6 else 3
@@ -223,7 +273,7 @@ def _number_rows(
 
 
 def _locations(records: np.ndarray) -> np.ndarray:
-    """Return locations [ns], for the order of points that share a packet; what is not a number comes first."""
+    """Return locations [ns], which order points that share a packet; NaN comes first."""
     return np.nan_to_num(widen(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
 
 
@@ -232,36 +282,55 @@ def _coordinates(records: np.ndarray, layout: OutputLayout) -> np.ndarray:
     return counts * np.array(layout.scales) + np.array(layout.offsets)
 
 
-def _columns(table: EchoTable, echo: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of the echoes at `echo`; not a number where it is -1."""
+def _columns(table: EchoTable, echo: np.ndarray, layout: OutputLayout) -> dict[str, np.ndarray]:
+    """The layout's columns of the echoes at `echo`; no-data where that is -1."""
     values = {**table.attributes, "echo_time": table.time}
-    return {name: np.append(v, v.dtype.type(np.nan))[echo] for name, v in values.items() if v.dtype.kind == "f"}
+    columns = {}
+    for name in (written.column for written in layout.written):
+        if name in values:
+            known = values[name]
+            # NaN becomes no-data when it is written. Integers have no NaN: they need the declared value itself.
+            empty = np.nan if known.dtype.kind == "f" else COLUMNS[name].no_data or 0
+            columns[name] = np.append(known, known.dtype.type(empty))[echo]
+    return columns
 
 
-def _count_packets(unit: Unit, table: EchoTable, per_packet: np.ndarray, owned: np.ndarray) -> RunReport:
-    """Counts of the unit's own points, of the packets it owns, and of their echoes, `table`."""
+def _count(
+    unit: Unit,
+    table: EchoTable,
+    packet: np.ndarray,
+    found: np.ndarray,
+    inside: np.ndarray,
+    reason: np.ndarray,
+    flags: np.ndarray,
+) -> RunReport:
+    """The report of a unit.
+
+    packet, found, inside: of the points (k,) that are counted as returns: row of unit.packets, whether an echo matches,
+    whether it is counted. reason, flags: of the output rows (m,).
+    """
+    owned = unit.packets.owned
+    per_packet = np.append(table.count(len(owned)), 0)
+    has_echoes = per_packet[packet] > 0
+    mine = owned[table.waveform]
+    table = table if mine.all() else table.take(mine)
     counts = {
         "points_in": len(unit.points),
-        "points_with_waveform": int(np.count_nonzero(unit.packet_of_point >= 0)),
-        "points_without_waveform": int(np.count_nonzero(unit.point_flags & np.uint16(EchoFlag.NO_WAVEFORM))),
-        "points_broken": int(np.count_nonzero(unit.point_flags & np.uint16(EchoFlag.BROKEN_PACKET))),
-        "waveforms": int(np.count_nonzero(owned)),
+        "points_with_waveform": unit.packet_of_point >= 0,
+        "points_without_waveform": unit.point_flags & np.uint16(EchoFlag.NO_WAVEFORM),
+        "points_broken": unit.point_flags & np.uint16(EchoFlag.BROKEN_PACKET),
+        "waveforms": owned,
         "echoes": len(table),
-        "added_echoes": int(np.count_nonzero(table.attributes["point"] < 0)),
+        "added_echoes": table.attributes["point"] < 0,
+        "matched_returns": inside & found,
+        "no_echo_returns": inside & ~has_echoes,
+        "unmatched_returns": inside & has_echoes & ~found,
+        "points_out": len(flags),
     }
-    account = RunReport(counts=counts, no_data=count_reasons(table.attributes))
-    return account + RunReport.of_echoes(per_packet[owned], table.amplitude, table.sigma)
-
-
-def _count_returns(inside: np.ndarray, has_echoes: np.ndarray, found: np.ndarray) -> RunReport:
-    """Counts of the points `inside` packets, by whether the packet has echoes and the point's own was found."""
-    counts = {
-        "matched_returns": int(np.count_nonzero(inside & found)),
-        "no_echo_returns": int(np.count_nonzero(inside & ~has_echoes)),
-        "unmatched_returns": int(np.count_nonzero(inside & has_echoes & ~found)),
-    }
-    return RunReport(counts=counts)
-
-
-def _count_rows(output: np.ndarray, reason: np.ndarray, flags: np.ndarray) -> RunReport:
-    return RunReport(counts={"points_out": len(output)}, passed_through=count_flags(reason), flags=count_flags(flags))
+    report = RunReport(
+        counts={name: n if isinstance(n, int) else int(np.count_nonzero(n)) for name, n in counts.items()},
+        passed_through=count_flags(reason),
+        flags=count_flags(flags),
+        no_data=count_reasons(table.attributes),
+    )
+    return report + RunReport.of_echoes(per_packet[:-1][owned], table.amplitude, table.sigma)

@@ -1,4 +1,7 @@
-"""What a run will do before it begins: memory, outputs that collide with inputs, and the plan of each strip."""
+"""Checks before a run: memory, outputs that would replace inputs, and the plan that --dry-run prints.
+
+Before you change it: nothing here may write to disk.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +25,26 @@ SMALL_BLOCK = 1024
 """Waveforms of a block when memory is short."""
 
 
-
 def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]:
-    """Number of processes and block size with which a run stays within `memory` bytes, all processes together.
+    """Choose number of processes and block size so that a run stays within a memory limit.
 
-    The process that writes counts too when there are others. Raises ConfigError where not even one process fits.
+    Parameters
+    ----------
+    options_jobs : int
+        Processes that the user asks for.
+    memory : int or None
+        Bytes for all processes together; with several, the one that writes counts too. None: no limit.
+
+    Returns
+    -------
+    jobs : int
+    block_size : int or None
+        Waveforms; None for the usual size.
+
+    Raises
+    ------
+    ConfigError
+        Where not even one process fits.
     """
     if memory is None:
         return options_jobs, None
@@ -39,7 +57,7 @@ def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]
 
 
 def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
-    """Raises ConfigError where an output would take the place of an input."""
+    """Raise ConfigError where an output would replace an input."""
     inputs = {os.path.realpath(job.path): job.path for job in jobs}
     for job in jobs:
         targets = [cloud_path(job, options.folder)]
@@ -51,20 +69,28 @@ def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
                 raise ConfigError(f"{target}: the output would replace this input; choose another output folder")
 
 
-def estimate_output(points: int, record_size: int, *, compressed: bool) -> int:
-    """Bytes that a cloud will take, roughly: LAZ needs about two fifths of LAS."""
-    return math.ceil(points * record_size * (0.4 if compressed else 1.0))
-
-
 def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
-    """What `run_batch` would do with a strip, from its headers alone; nothing is written.
+    """Describe what `run_batch` would do with a strip, from its headers alone.
 
-    Raises InputError or ConfigError where it would fail before it begins.
+    Parameters
+    ----------
+    job : StripJob
+    options : BatchOptions
+
+    Returns
+    -------
+    dict
+        Plain values: action (write or skip), strip, output, columns, points, sizes.
+
+    Raises
+    ------
+    InputError, ConfigError
+        Where the run would refuse the strip before it begins.
     """
-    done = StripTask(job, options, alone=False).start() is not None
-    with job.open() as reader:
-        facts = reader.facts
-    layout = plan_layout(job, facts)
+    task = StripTask(job, options, alone=False)
+    done = task.start() is not None
+    facts = task.facts
+    layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),
@@ -74,7 +100,6 @@ def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
         "output": str(cloud_path(job, options.folder)),
         "output_point_format": layout.point_format,
         "columns": [written.record.name for written in layout.written],
-        "estimated_bytes": estimate_output(
-            facts.point_count, layout.dtype.itemsize, compressed=job.options.format == "laz"
-        ),
+        # LAZ takes about two fifths of LAS.
+        "estimated_bytes": math.ceil(facts.point_count * layout.dtype.itemsize * (0.4 if is_laz else 1.0)),
     }

@@ -1,4 +1,8 @@
-"""Processes that work for a batch, or none: the same calls run in this process when one job is asked for."""
+"""Worker processes on this machine; with one job, the same calls run in this process.
+
+`run` submits all work through it, or through `dask_cluster.Cluster`, which has the same methods.
+Before you change it: workers must end with this process, however it ends, or they would go on writing.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +20,18 @@ from wavebatch.core.memory import keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+"""Each process works on one thread: more threads than cores only wait for each other."""
 
 
 class Workers:
-    """`submit` runs a function in one of `jobs` processes, or at once in this one if jobs is 1; a context manager.
+    """Runs functions in worker processes, or at once in this process for one job; a context manager.
 
-    The processes are spawned, so that nothing is inherited, use one thread each, and end when this process ends.
+    The processes are spawned, so that they inherit no state, use one thread each, and end when this process ends.
+
+    Parameters
+    ----------
+    jobs : int
+        Number of processes.
     """
 
     is_remote = False
@@ -29,28 +39,26 @@ class Workers:
     def __init__(self, jobs: int) -> None:
         self.jobs = jobs
         self.limit = 1 if jobs == 1 else 2 * jobs
-        """Calls that may wait for their results to be used."""
+        """Most calls that may be under way; two per process keep it busy while results are written."""
         keep_freed_memory()
         self._before = set(multiprocessing.active_children())
         self._pool: ProcessPoolExecutor | None = None
-        self._own = owning_scratch()
+        self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
 
     def __enter__(self) -> Workers:
-        self._scratch = self._own.__enter__()
+        self._scratch = self._stack.enter_context(owning_scratch())
         return self
 
     def __exit__(self, kind: type | None, *error: object) -> None:
-        try:
+        with self._stack:
             if kind is None:
                 self._shut(cancel=False)
             else:
                 self.kill()
-        finally:
-            self._own.__exit__(None, None, None)
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
-        """The future result of `function(*arguments)`."""
+        """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
             return _run_now(function, arguments)
         if self._pool is None:
@@ -62,15 +70,15 @@ class Workers:
             return self._pool.submit(function, *arguments)
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
-        """Those that are done, at least one."""
+        """Wait for at least one future and return those that are done."""
         return wait(futures, return_when=FIRST_COMPLETED).done
 
     def restart(self) -> None:
-        """Gives up the processes, of which one has died; the next `submit` starts new ones."""
+        """End all processes after one has died; the next `submit` starts new ones."""
         self.kill()
 
     def kill(self) -> None:
-        """Ends the processes at once, whatever they do."""
+        """End all processes at once."""
         if self._pool is not None:
             for child in set(multiprocessing.active_children()) - self._before:
                 child.kill()
@@ -93,7 +101,7 @@ def _run_now(function: Callable, arguments: tuple) -> Future:
 
 @contextlib.contextmanager
 def _single_threaded() -> Iterator[None]:
-    """The libraries of processes started meanwhile use one thread each."""
+    """Libraries of processes that are started inside use one thread each."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
@@ -107,7 +115,7 @@ def _single_threaded() -> Iterator[None]:
 
 
 def _start_worker(scratch: Path | None) -> None:
-    """In a new process: Ctrl-C is the parent's business, and without the parent there is nothing to do."""
+    """In a new process: leave Ctrl-C to the parent process, and end when the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_scratch(scratch)
     keep_freed_memory()

@@ -1,4 +1,8 @@
-"""The report file beside a cloud: what it says, and whether the cloud beside it is still the one asked for."""
+"""The report file next to a cloud: its contents, and the check of --resume whether a cloud is up to date.
+
+`strip_task` writes it after the cloud, so its presence means that the cloud is complete.
+Before you change it: everything but `timing` must be the same for every run of the same input and options.
+"""
 
 from __future__ import annotations
 
@@ -16,26 +20,39 @@ from wavebatch.batch.explain import explain_absence
 from wavebatch.batch.unit import Prepared, StripJob
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.text_file import write_text
 from wavebatch.stages.chain_file import effective
 from wavebatch.surveying.choose_chain import describe_choice, describe_survey
-from wavebatch.surveying.system_file import format_survey, write_text
+from wavebatch.surveying.system_file import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
 def cloud_path(job: StripJob, folder: Path) -> Path:
-    """Where the cloud of a strip goes."""
+    """Return the path of a strip's cloud."""
     return folder / f"{job.path.stem}.{job.options.format}"
 
 
 def report_path(job: StripJob, folder: Path) -> Path:
-    """Where its report goes; that it is there says that the cloud is complete."""
+    """Return the path of a strip's report."""
     return folder / f"{job.path.stem}.report.json"
 
 
 def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any]:
-    """All that decides what is written: two runs for which this is equal write the same cloud."""
+    """Describe all that decides the output: two runs with equal descriptions write the same cloud.
+
+    Parameters
+    ----------
+    job : StripJob
+    fingerprint : mapping
+        Of the strip, from `take_fingerprint`.
+
+    Returns
+    -------
+    dict
+        Plain values: version, input, options, request.
+    """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
     return {
@@ -45,19 +62,14 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
         "request": {
             "chain": job.request.describe(job.chain) or effective(job.chain),
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
-            "sensor": {
-                "trajectory": trajectory,
-                "crs": sensor.crs,
-                "lever_arm": None if sensor.lever_arm is None else list(sensor.lever_arm),
-                "height": sensor.height,
-            },
+            "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
         },
     }
 
 
 def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
-    """What scan and survey say of the strip. described: from `describe_job`."""
+    """Describe the results of scan and survey as plain values; `described` is from `describe_job`."""
     scan = prepared.scan
     fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
     return {
@@ -72,7 +84,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:
-    """The chain as it is used, and how it was chosen."""
+    """Describe the chain as it is used, and how it was chosen."""
     chosen = describe_choice(prepared.choice, prepared.job.request)
     return {"chain": effective(prepared.job.chain), "choice": chosen}
 
@@ -80,9 +92,22 @@ def describe_chain(prepared: Prepared) -> dict[str, Any]:
 def build_document(
     prepared: Prepared, described: Mapping[str, Any], report: RunReport, cloud: Path, dropped: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The report of a strip whose cloud is written; everything but `timing` is the same for every run.
+    """Build the report of a strip whose cloud is published.
 
-    described: from `describe_job`. dropped: records of the input that the cloud does not have, and why.
+    Parameters
+    ----------
+    prepared : Prepared
+    described : mapping
+        From `describe_job`.
+    report : RunReport
+    cloud : Path
+    dropped : mapping of str to str
+        Records of the input that the cloud does not have, and why.
+
+    Returns
+    -------
+    dict
+        Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
     lost = {**layout.dropped, **dropped}
@@ -110,20 +135,12 @@ def build_document(
         },
         **report.to_json(),
         "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
-        "timing": {**build_timing(report), **_tell_saving(prepared)},
+        "timing": build_timing(report),
     }
 
 
-def _tell_saving(prepared: Prepared) -> dict[str, Any]:
-    """What leaving parts out saves: microseconds per waveform of the survey's sample, as the preparation took them."""
-    seconds = prepared.choice.seconds
-    if not seconds:
-        return {}
-    return {"microseconds_per_waveform": {name: round(1e6 * value, 3) for name, value in seconds.items()}}
-
-
 def build_timing(report: RunReport) -> dict[str, Any]:
-    """Seconds by what they were spent on, and waveforms per second of all of them together."""
+    """Return seconds by task, rounded, and waveforms per second of process time."""
     total = sum(report.timing.values())
     seconds = {name: round(value, 6) for name, value in report.timing.items()}
     rate = round(report.count("waveforms") / total) if total > 0 else None
@@ -131,14 +148,28 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
-    """The document as a file that appears whole or not at all."""
+    """Write a JSON file, whole or not at all; raises InputError where it exists or cannot be written."""
     text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False)
-    # Names of files that are not UTF-8 become JSON's own escapes.
+    # Bytes of file names that are not UTF-8 are lone surrogates in Python; JSON can escape them.
     write_text(path, text.encode(errors="backslashreplace").decode() + "\n", overwrite=overwrite)
 
 
 def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:
-    """The report of a cloud in `folder` that is complete and just what this run would write; None otherwise."""
+    """Read the report of a cloud that is complete and equal to what this run would write.
+
+    Parameters
+    ----------
+    job : StripJob
+    folder : Path
+        Of the outputs.
+    described : mapping
+        From `describe_job`.
+
+    Returns
+    -------
+    RunReport or None
+        None where the cloud must be made.
+    """
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         document = json.loads(report_path(job, folder).read_text("utf-8"))
         cloud = cloud_path(job, folder)

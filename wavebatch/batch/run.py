@@ -1,4 +1,8 @@
-"""Strips x units through a chain: order, bounded memory, failures that stop one strip only, resume."""
+"""The loop of `wavebatch run`: all strips through a chain, with bounded memory, in order, despite failures.
+
+`run_batch` is the entry point for the command line, the public API and the benchmark.
+Before you change it: a failure ends its strip only, and no half-written file may remain, even after Ctrl-C.
+"""
 
 from __future__ import annotations
 
@@ -26,34 +30,34 @@ from wavebatch.files.disk.publish import remove_stale, reporting
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a strip ended."""
+    """The end of one strip."""
 
     job: StripJob
     status: str
-    """written, skipped (resume found it done) or failed."""
+    """written, skipped (resume found the cloud up to date) or failed."""
     report: RunReport = field(default_factory=RunReport)
     error: BaseException | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class BatchResult:
-    """How a batch ended: the outcome of every strip, in the order given."""
+    """The end of a batch: the outcome of every strip, in the order of the jobs."""
 
     outcomes: tuple[Outcome, ...]
     seconds: float
 
     @property
     def failed(self) -> int:
-        """Strips that are not there."""
+        """Number of strips without a cloud."""
         return sum(outcome.status == "failed" for outcome in self.outcomes)
 
     @property
     def report(self) -> RunReport:
-        """The strips' reports added up."""
+        """The sum of the strips' reports."""
         return sum((outcome.report for outcome in self.outcomes), RunReport())
 
     def to_json(self) -> dict[str, Any]:
-        """The summary of the batch; all but `timing` is the same for every run."""
+        """Return the summary of the batch as plain values; all but `timing` is the same for every run."""
         report = self.report
         strips = [
             {
@@ -65,23 +69,34 @@ class BatchResult:
             for outcome in self.outcomes
         ]
         timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
-        return {
-            "schema": BATCH_SCHEMA,
-            "version": __version__,
-            "strips": strips,
-            **report.to_json(),
-            "timing": timing,
-        }
+        head = {"schema": BATCH_SCHEMA, "version": __version__, "strips": strips}
+        return {**head, **report.to_json(), "timing": timing}
 
 
 def run_batch(
     jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None = None
 ) -> BatchResult:
-    """Writes cloud and report of every strip into the folder; a strip that fails does not stop the others.
+    """Write cloud and report of every strip; a strip that fails does not stop the others.
 
-    on_event: told what happens, as dictionaries with a key `event`: start, unit, written, skipped, failed. A failure
-    that is not the strip's own and has been told of another one has `again`.
-    Raises ConfigError before anything is started, KeyboardInterrupt after cleaning up; failures are in the result.
+    Parameters
+    ----------
+    jobs : sequence of StripJob
+    options : BatchOptions
+    on_event : callable, optional
+        Called with a dictionary for each event; its key `event` is start, unit, written, skipped or failed. `again` in
+        a failure means that the same cause was reported for another strip before.
+
+    Returns
+    -------
+    BatchResult
+        Failures of strips are in it, not raised.
+
+    Raises
+    ------
+    ConfigError
+        Before any work.
+    KeyboardInterrupt
+        After temporary files were removed.
     """
     start = time.perf_counter()
     check_outputs(jobs, options)
@@ -96,7 +111,7 @@ def run_batch(
 
 
 class _Batch:
-    """The loop: keeps the workers busy, takes results in order, lets no more than a few of them wait."""
+    """The loop: keeps the workers busy and takes the results of each strip in order; only a few may wait."""
 
     def __init__(
         self,
@@ -114,7 +129,7 @@ class _Batch:
         self._tell = on_event or (lambda event: None)
 
     def run(self) -> None:
-        """Until every strip has an outcome."""
+        """Work until every strip has an outcome."""
         while self._submit() or self._active:
             heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
             try:
@@ -126,13 +141,13 @@ class _Batch:
                     self._take(heads[future])
 
     def close(self) -> None:
-        """Removes whatever unfinished strips have left."""
+        """Remove what unfinished strips have left."""
         for strip in self._active:
             strip.drop()
         self._active.clear()
 
     def _submit(self) -> bool:
-        """Gives the workers as much as may wait for being written; whether anything is under way."""
+        """Submit calls up to the workers' limit; return whether any is under way."""
         while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
             strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
             if strip is None:
@@ -142,6 +157,7 @@ class _Batch:
         return any(strip.pending for strip in self._active)
 
     def _start_next(self) -> StripTask | None:
+        """Start the next strip that needs work; None where no other strip may start now."""
         while not (self._active and (self._again or not self._waiting or self._active[0].alone)):
             alone = bool(self._again)
             queue = self._again or self._waiting
@@ -171,7 +187,7 @@ class _Batch:
 
     @contextlib.contextmanager
     def _failing(self, strip: StripTask) -> Iterator[None]:
-        """What goes wrong inside is the end of this strip only."""
+        """An error inside ends this strip only."""
         try:
             yield
         except BrokenProcessPool:
@@ -183,7 +199,7 @@ class _Batch:
             self._end(strip, Outcome(strip.job, "failed", error=error))
 
     def _restart(self) -> None:
-        """A process has died: a strip that was alone is given up, several are tried again one by one."""
+        """A process has died: a strip that was alone fails; several are tried again one by one, to find the cause."""
         self._workers.restart()
         strips, self._active = self._active, []
         for strip in strips:
@@ -198,7 +214,7 @@ class _Batch:
         self._end(strips[0], Outcome(strips[0].job, "failed", error=error))
 
     def _give_up(self, reason: BrokenExecutor) -> None:
-        """Nobody is left to work: all strips that are not written fail for the same reason, which is told once."""
+        """No worker is left: all strips that are not written fail, for one reason that is reported once."""
         unfinished = [*self._active, *(StripTask(job, self._options, False) for job in (*self._again, *self._waiting))]
         self._again.clear()
         self._waiting.clear()
@@ -215,8 +231,8 @@ class _Batch:
         if outcome.error is not None:
             self._tell({**event, "error": outcome.error, "again": again})
         else:
-            told = outcome.report.to_json()
-            more = {"counts": told["counts"], "remarks": told["remarks"], "warnings": strip.warnings}
+            report = outcome.report.to_json()
+            more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             if strip.prepared is not None:
                 more["sensor"] = strip.prepared.sensor.describe()
             self._tell({**event, **more})

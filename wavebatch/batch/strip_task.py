@@ -1,4 +1,8 @@
-"""One strip on its way through a batch: prepared, its units processed anywhere and written here in order, published."""
+"""One strip on its way through a batch: prepared, processed by the workers, written here in order, published.
+
+`run` drives it: `start`, then `submit` and `take` until `is_complete`, then `finish`; `drop` after a failure.
+Before you change it: results are taken in the order in which they were submitted; that makes the output reproducible.
+"""
 
 from __future__ import annotations
 
@@ -12,49 +16,51 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
 from wavebatch.batch.explain import find_remarks
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.processes import Workers
-from wavebatch.batch.report_file import (
-    build_document,
-    cloud_path,
-    describe_chain,
-    describe_job,
-    describe_strip,
-    read_current,
-    report_path,
-    write_json,
-)
-from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_packed_unit
+from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_unit
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.strip.facts import StripFacts
 
 
 @dataclass(frozen=True, slots=True)
 class BatchOptions:
-    """Options of a run that change how it goes, never what it writes."""
+    """Options of a run that change how it works, never what it writes."""
 
     folder: Path
+    """Of the outputs."""
     jobs: int = 1
     scheduler: str | None = None
-    """Address of a dask cluster whose workers take the place of `jobs` processes."""
+    """Address of a dask cluster to use instead of `jobs` processes."""
     block_size: int | None = None
-    """Waveforms that go through a chain at a time; None chooses by their length."""
+    """Waveforms that go through a chain at a time; None: chosen by their length."""
     overwrite: bool = False
     resume: bool = False
 
 
 class StripTask:
-    """A strip on its way: prepared, its units submitted and written in order, then published."""
+    """The work on one strip.
+
+    Parameters
+    ----------
+    job : StripJob
+    options : BatchOptions
+    alone : bool
+        Whether no other strip may be under way: it is tried again after a worker process died.
+    """
 
     def __init__(self, job: StripJob, options: BatchOptions, alone: bool) -> None:
         self.job = job
         self.alone = alone
         self.pending: deque[Future] = deque()
+        self.facts: StripFacts | None = None
         self.prepared: Prepared | None = None
         self.written = 0
         self.warnings: list[str] = []
@@ -69,23 +75,35 @@ class StripTask:
         self._state: list[tuple[int, int]] = []
 
     def start(self) -> RunReport | None:
-        """The report where the strip is done already; InputError where it cannot be read or may not be written."""
+        """Look at strip and outputs before any work.
+
+        Returns
+        -------
+        RunReport or None
+            The report of the existing cloud, where resume finds it up to date.
+
+        Raises
+        ------
+        InputError
+            Where the strip cannot be read, or its outputs exist and may not be replaced.
+        """
         options, job = self._options, self.job
         with job.open() as reader:
-            packet_file = reader.facts.packet_file
+            self.facts = reader.facts
+        packet_file = self.facts.packet_file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
-        self._described = describe_job(job, take_fingerprint(job.path, packet_file))
+        self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
         if options.resume:
-            return read_current(job, options.folder, self._described)
+            return report_file.read_current(job, options.folder, self._described)
         if not options.overwrite:
-            refuse_existing(cloud_path(job, options.folder))
-            refuse_existing(report_path(job, options.folder))
+            refuse_existing(report_file.cloud_path(job, options.folder))
+            refuse_existing(report_file.report_path(job, options.folder))
         return None
 
     @property
     def has_more(self) -> bool:
-        """Whether something can be submitted now."""
+        """Whether there is a call to submit now."""
         if self.prepared is None:
             return not self.pending
         if self._submitted < self.prepared.units:
@@ -94,25 +112,24 @@ class StripTask:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all units are written, and all tiles of a second pass are done."""
+        """Whether all units are written and all tiles of a second pass are done."""
         if self.prepared is None or self.written < self.prepared.units:
             return False
         return self._second is None or self._second.is_complete
 
     def submit(self, workers: Workers | Cluster) -> None:
-        """The next piece of work: the preparation, then unit by unit, then the tiles of a second pass."""
+        """Submit the next call: the preparation, then unit by unit, then the tiles of a second pass."""
         if self.prepared is None:
             self.pending.append(workers.submit(prepare_strip, self.job.absolute() if workers.is_remote else self.job))
             return
         if self._submitted == self.prepared.units:
             self.pending.append(workers.submit(process_tile, *self._second.next_tile()))
             return
-        arguments = (self._blob, self._submitted, self._options.block_size)
-        self.pending.append(workers.submit(process_packed_unit, *arguments))
+        self.pending.append(workers.submit(process_unit, self._blob, self._submitted, self._options.block_size))
         self._submitted += 1
 
     def take(self) -> None:
-        """Takes the oldest result: opens the output, or writes rows to it."""
+        """Wait for the oldest call and use its result: open the output, or write rows."""
         result = self.pending.popleft().result()
         start = time.perf_counter()
         if self.prepared is None:
@@ -134,18 +151,18 @@ class StripTask:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         described = self._described
-        provenance = {**described, **describe_chain(prepared), **describe_strip(prepared, described)}
-        self._writer = CloudWriter(
-            prepared.layout,
-            cloud_path(self.job, options.folder),
-            provenance=provenance,
-            overwrite=options.overwrite or options.resume,
-        )
+        provenance = {
+            **described,
+            **report_file.describe_chain(prepared),
+            **report_file.describe_strip(prepared, described),
+        }
+        cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
+        self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
-            self._second = SecondPass(prepared.second_step, prepared.layout, cloud_path(self.job, options.folder))
+            self._second = SecondPass(prepared.second_step, prepared.layout, cloud)
 
     def _fill(self) -> None:
-        """Writes the rows that waited for a second pass."""
+        """Write the rows that waited for the second pass."""
         start = time.perf_counter()
         for rows in self._second.rows():
             self._writer.write(rows)
@@ -154,7 +171,20 @@ class StripTask:
         self._report += RunReport(no_data=no_data, timing={"write": time.perf_counter() - start})
 
     def finish(self) -> RunReport:
-        """Publishes the cloud, then its report, which says that the cloud is complete."""
+        """Publish the cloud, then its report, which means that the cloud is complete.
+
+        Returns
+        -------
+        RunReport
+            Of the whole strip.
+
+        Raises
+        ------
+        InputError
+            Where the strip has changed since `start`.
+        StageError
+            Where counts do not add up.
+        """
         options, job = self._options, self.job
         if self._second is not None:
             self._fill()
@@ -163,20 +193,21 @@ class StripTask:
         self._report += RunReport(remarks=find_remarks(self.prepared, self._report))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
-        cloud, beside = cloud_path(job, options.folder), report_path(job, options.folder)
+        cloud = report_file.cloud_path(job, options.folder)
+        report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
         if replaces:
-            beside.unlink(missing_ok=True)
+            report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
         self._writer.commit()
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
-        document = build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
-        write_json(beside, document, overwrite=replaces)
+        document = report_file.build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
+        report_file.write_json(report, document, overwrite=replaces)
         self.warnings = document["warnings"]
         self.prepared.scan.close()
         return self._report
 
     def drop(self) -> None:
-        """Forgets the strip: nothing of it remains on disk or under way."""
+        """Give the strip up: remove its files and cancel its calls."""
         for future in self.pending:
             if not future.cancel() and self.prepared is None:
                 future.add_done_callback(_close_scan)
@@ -189,10 +220,12 @@ class StripTask:
             self.prepared.scan.close()
 
     def _stat(self) -> list[tuple[int, int]]:
+        """Size and time of the input files, to see whether they change during the run."""
         stats = [os.stat(path) for path in self._files]
         return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
 
 
 def _close_scan(future: Future) -> None:
+    """A preparation that ends after its strip was dropped leaves a scan with temporary files."""
     with contextlib.suppress(Exception):
         future.result().scan.close()

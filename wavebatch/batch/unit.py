@@ -1,11 +1,15 @@
-"""What one process does: prepare a strip, and take one of its units from packets to output rows."""
+"""The work in a worker process: prepare a strip, and take one of its units from packets to output rows.
+
+`strip_task` submits `prepare_strip` once per strip and `process_unit` for each unit; `cli.run` builds the StripJob.
+Before you change it: all that travels between processes must be picklable, and rows must not depend on block size.
+"""
 
 from __future__ import annotations
 
 import functools
 import pickle
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +25,14 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.angle_limits import angle_parameters
+from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice, sample_size
-from wavebatch.surveying.flat_ground import measure_level
-from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 
 BLOCK_SAMPLES = 1 << 22
-"""Samples of a block, unless told otherwise: a whole unit of waveforms of 80; fewer, and NumPy calls dominate."""
+"""Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
 
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
@@ -59,37 +62,40 @@ class StripJob:
     """The chain, or the widest that may be chosen."""
     options: RunOptions
     request: Request = Request()
-    """How pulse and chain are found."""
+    """How pulse and chain are chosen."""
     sensor: SensorRequest = SensorRequest()
-    """Where the sensor's positions come from; asked for only if the chain needs them."""
+    """Where the sensor's positions come from; used only if the chain needs them."""
     calibration: Calibration | None = None
 
     def extend(self, chain: Chain) -> Chain:
-        """The chain with what trajectory, calibration and divergence allow; a chain that the user wrote stays."""
-        saved = self.request.system
-        divergence = self.calibration is not None and self.calibration.divergence is not None
-        divergence |= saved is not None and saved.survey.system.divergence is not None
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow."""
+        sources = (self.calibration, self.request.system and self.request.system.survey.system)
+        divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
         return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
 
+    def calibrate(self, system: SystemPulse) -> SystemPulse:
+        """Return the system pulse with the job's calibration, if it has one."""
+        return system if self.calibration is None else self.calibration.apply(system)
+
     def absolute(self) -> StripJob:
-        """The same for processes that work in another folder."""
+        """Return the job with absolute paths, for processes that work in another folder."""
         sensor = self.sensor
         if sensor.trajectory is not None:
             sensor = replace(sensor, trajectory=sensor.trajectory.absolute())
         return replace(self, path=self.path.absolute(), sensor=sensor)
 
     def open(self) -> StripReader:
-        """A reader of the strip; raises InputError where it is not one."""
+        """Open the strip; raises InputError where it cannot be read."""
         return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """All that the units of a strip share; picklable."""
+    """Everything that the units of a strip share; picklable."""
 
     job: StripJob
-    """With the chosen chain, and the columns that it computes."""
+    """With the chosen chain and the columns that it computes."""
     facts: StripFacts
     scan: StripScan
     units: int
@@ -97,39 +103,49 @@ class Prepared:
     layout: OutputLayout
     report: RunReport
     """Timing of the preparation."""
-    sensor: SensorSource = NOBODY
+    sensor: SensorSource = UNKNOWN
 
     @property
     def system(self) -> SystemPulse:
         """The pulse that the strip is run with, its calibration, and the error of the sensor's position."""
-        system = replace(self.choice.survey.system, sensor_error=self.sensor.error)
-        return system if self.job.calibration is None else self.job.calibration.apply(system)
-
+        return self.job.calibrate(replace(self.choice.survey.system, sensor_error=self.sensor.error))
 
     @property
     def second_step(self) -> Step | None:
-        """The step whose columns are filled in a second pass over the strip's points; None where none is written."""
+        """The step whose columns need a second pass over the strip's points; None where none of them is written."""
         step = self.job.chain.second_step
         return step if step is not None and set(step.stage.makes) & set(self.job.options.columns) else None
 
     @property
     def row_layout(self) -> OutputLayout:
-        """The layout of a unit's rows: the cloud's, and behind it what a second pass needs."""
+        """The layout of a unit's rows: that of the cloud, then the columns that a second pass needs."""
         return self.layout if self.second_step is None else self.layout.extended(RAY)
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
-    """Columns to write: what the chain computes and the flags; `a,b` chooses among them, `+a,+b` adds.
+    """Choose the columns to write.
 
-    Raises ConfigError for a column that does not exist or that the chain does not compute, and for a chain without
-    positions.
+    Parameters
+    ----------
+    chain : Chain
+    wanted : str, optional
+        `a,b` writes these columns only, `+a,+b` adds them. By default all columns of the chain and the flags.
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    ConfigError
+        Where a column does not exist or the chain does not compute it, and for a chain without positions.
     """
     missing = [name for name in NEEDED if name not in chain.makes]
     if missing:
         raise ConfigError(
-            f"chain {chain.name}: computes no {', '.join(missing)}, without which echoes are no points; add a "
-            "[[chain]] table with stage = \"attribute.position\""
-        )  # fmt: skip
+            f"chain {chain.name}: computes no {', '.join(missing)}, which every point needs; add a "
+            '[[chain]] table with stage = "attribute.position"'
+        )
     computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
     default = [*computed, "echo_flags"]
     entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
@@ -153,7 +169,7 @@ def _check_column(name: str, available: tuple[str, ...]) -> None:
 
 
 def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
-    """How the points of the strip's output look; raises InputError or ConfigError where that cannot be had."""
+    """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
     options = job.options
     return plan_output(
         facts,
@@ -166,9 +182,23 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
 
 
 def prepare_strip(job: StripJob) -> Prepared:
-    """Scan and survey of a strip, its chain, and the layout of its output.
+    """Scan and survey a strip, choose its chain, find the sensor, and plan its output.
 
-    Raises InputError where it cannot be processed, ConfigError where no chain serves.
+    Parameters
+    ----------
+    job : StripJob
+
+    Returns
+    -------
+    Prepared
+        Its scan holds temporary files: close it.
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be processed.
+    ConfigError
+        Where no chain meets the tolerance, or columns or format do not fit the strip.
     """
     start = time.perf_counter()
     with job.open() as reader:
@@ -185,7 +215,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             surveyed = time.perf_counter()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
-            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else NOBODY
+            sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
@@ -197,54 +227,56 @@ def prepare_strip(job: StripJob) -> Prepared:
 
 
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
-    """The choice with the widths of level ground, where angles are taken and no saved survey says them."""
+    """The choice with the widths of level ground, where angles are computed and no saved survey has them."""
     parameters = angle_parameters(job.chain)
-    if parameters is None or sensor is NOBODY or job.request.system is not None:
+    if parameters is None or sensor is UNKNOWN or job.request.system is not None:
         return choice
-    system = choice.survey.system
-    used = system if job.calibration is None else job.calibration.apply(system)
+    survey = choice.survey
+    used = job.calibrate(survey.system)
     used = replace(used, divergence=parameters["divergence"] or used.divergence)
-    blocks = (sensor.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
-    seen = measure_level(blocks, used, choice.survey.figures.get("spacing_ns", 0.0))
-    system = replace(system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
-    return replace(choice, survey=replace(choice.survey, system=system))
+    seen = sample_level(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
+    system = replace(survey.system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
+    return replace(choice, survey=replace(survey, system=system))
 
 
-def process_unit(prepared: Prepared, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
-    """Output rows of one unit, and their account.
+def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
+    """Make the output rows of one unit.
 
-    block_size: waveforms that go through the chain at a time; the rows do not depend on it.
+    Parameters
+    ----------
+    blob : bytes
+        The pickled Prepared of the strip.
+    number : int
+        Of the unit.
+    block_size : int, optional
+        Waveforms that go through the chain at a time; the rows do not depend on it.
+
+    Returns
+    -------
+    rows : structured array (m,)
+        In the strip's `row_layout`.
+    report : RunReport
     """
-    start = time.perf_counter()
-    stages: dict[str, float] = {}
+    prepared: Prepared = unpack(blob)
+    timing: dict[str, float] = {}
     echoes_mode = prepared.job.options.points == "echoes"
+    start = time.perf_counter()
     with prepared.job.open() as reader:
         unit = reader.read_unit(number, prepared.scan)
-        opened = time.perf_counter()
-        size = block_size or _block_size(unit)
-        blocks = _Stopwatch(reader.read_blocks(unit, size, owned_only=echoes_mode))
-        echoes = gather_echoes(unit, _run_blocks(prepared, blocks, stages))
-    gathered = time.perf_counter()
+        timing["read points"] = time.perf_counter() - start
+        blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)
+        echoes = gather_echoes(unit, _run_blocks(prepared, _timed(blocks, timing, "read packets"), timing))
+    start = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
     rows, report = assemble(unit, echoes, prepared.row_layout)
-    timing = {
-        **stages,
-        "read points": opened - start,
-        "read packets": blocks.seconds,
-        "assemble": time.perf_counter() - gathered,
-    }
+    timing["assemble"] = time.perf_counter() - start
     return rows, replace(report, timing=timing)
 
 
 @functools.lru_cache(maxsize=4)
 def unpack(blob: bytes) -> Any:
-    """What was pickled, unpickled once per process for the strips that are under way."""
+    """Unpickle a blob, once per process while its strip is under way."""
     return pickle.loads(blob)
-
-
-def process_packed_unit(blob: bytes, number: int, block_size: int | None) -> tuple[np.ndarray, RunReport]:
-    """`process_unit` of a pickled Prepared, which is unpickled once per process and strip."""
-    return process_unit(unpack(blob), number, block_size)
 
 
 def _block_size(unit: Unit) -> int:
@@ -253,26 +285,20 @@ def _block_size(unit: Unit) -> int:
 
 
 def _run_blocks(
-    prepared: Prepared, blocks: Iterator[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
+    prepared: Prepared, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
 ) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
     system = prepared.system
     for block, index in blocks:
         yield block, index, prepared.job.chain.run(prepared.sensor.fill(block), system, timing)
 
 
-class _Stopwatch:
-    """Iterates over something else and keeps the seconds that it took."""
-
-    def __init__(self, items: Iterator) -> None:
-        self._items = iter(items)
-        self.seconds = 0.0
-
-    def __iter__(self) -> _Stopwatch:
-        return self
-
-    def __next__(self) -> object:
+def _timed(items: Iterator, timing: dict[str, float], name: str) -> Iterator:
+    """The items; the seconds that they take are added to timing[name]."""
+    timing[name] = 0.0
+    while True:
         start = time.perf_counter()
-        try:
-            return next(self._items)
-        finally:
-            self.seconds += time.perf_counter() - start
+        item = next(items, None)
+        timing[name] += time.perf_counter() - start
+        if item is None:
+            return
+        yield item

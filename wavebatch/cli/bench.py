@@ -1,130 +1,114 @@
-"""`wavebatch bench`: error against run time."""
+"""`wavebatch bench`: error against run time.
+
+Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, one_line, print_json, report_errors, talk
-from wavebatch.cli.options import json_option
+from wavebatch.cli.messages import one_line, print_json, print_result, talk
+from wavebatch.cli.options import common_options, from_options, parse_length, seed_option
+from wavebatch.core.errors import InputError
 
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
-@click.option(
-    "--scene", "scenes", multiple=True, metavar="NAME", help="Scene: mixed, open, forest, empty, flat, stiff."
-)
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Folder for bench.json, bench.txt and the plots.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the simulated waveforms.")
-@click.option(
-    "--waveforms", type=click.IntRange(1), default=65_536, show_default=True, help="Simulated waveforms per scene."
-)
-@click.option(
-    "--pulses",
-    type=click.IntRange(0),
-    default=50_000,
-    show_default=True,
-    help="Pulses from file to file; 0 for kernels only.",
-)
-@click.option("--repeat", "repeats", type=click.IntRange(1), default=3, show_default=True, help="Turns of the timing.")
-@click.option(
-    "--tolerance", metavar="LENGTH", help="Name the cheapest chain with this error for isolated echoes: 0.02m."
-)
-@click.option(
-    "--peers/--no-peers", default=True, help="Measure gdecomp (if installed) and scipy too.  [default: peers]"
-)
-@click.option("--all-methods", is_flag=True, help="A row for every detector and every decomposer too.")
-@click.option("--stability/--no-stability", default=True, help="The stiff and extreme cases.  [default: stability]")
-@click.option("--hazard", "hazards", multiple=True, metavar="H1..H16", help="Only the cases of this hazard.")
-@click.option("--promises", is_flag=True, help="Also measure what each release promises, and say what is met.")
-@click.option("--large", is_flag=True, envvar="BENCH_LARGE", help="With --promises: memory for 10^7 pulses too.")
-@click.option(
-    "--real", is_flag=True, help="Inject echoes into the STRIPs' own waveforms, and compare surveys of their parts."
-)
-@json_option("Print the JSON document in place of the tables.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
-@debug_option
-@report_errors()
-def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, as_json: bool, **options) -> None:
-    """Error against run time of every shipped chain, the CHAIN files (.toml) and other decomposers.
+@click.option("--scene", "scenes", multiple=True, metavar="NAME",
+              help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
+@click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
+              help="Simulated waveforms per scene.")
+@click.option("--pulses", type=click.IntRange(0), default=50_000, show_default=True, metavar="N",
+              help="Pulses of the strip that is timed from file to file; 0: time the algorithms only.")
+@click.option("--repeat", "repeats", type=click.IntRange(1), default=3, show_default=True, metavar="N",
+              help="Repetitions of the timing.")
+@seed_option("Seed of the simulated waveforms.")
+@click.option("--tolerance", metavar="LENGTH",
+              help="Name the cheapest chain whose range error of isolated echoes is at most this, e.g. 0.02m.")
+@click.option("--peers/--no-peers", default=True, help="Measure gdecomp (if there) and scipy too.  [default: peers]")
+@click.option("--all-methods", is_flag=True, help="Also measure every detector and every decomposer.")
+@click.option("--stability/--no-stability", default=True,
+              help="Measure the stiff and extreme cases.  [default: stability]")
+@click.option("--hazard", "hazards", multiple=True, metavar="H1..H16",
+              help="Measure only the cases of this hazard; may be repeated.")
+@click.option("--promises", is_flag=True, help="Also measure and list what each release promises.")
+@click.option("--large", is_flag=True, envvar="BENCH_LARGE",
+              help="With --promises: measure memory for 10^7 pulses too.")
+@click.option("--real", is_flag=True,
+              help="Inject echoes into the waveforms of each STRIP and count those found, count false echoes, and "
+              "compare surveys of parts of the strip (not with --no-stability).")
+@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
+              help="Folder for bench.json, bench.txt and the plots. Existing files are replaced.")
+@common_options("json", "quiet")
+def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, **options: Any) -> None:
+    """Measure error and run time of all shipped chains, of CHAIN files (.toml) and of other decomposers.
 
-    Waveforms with known echoes are simulated like those of STRIP: its noise, baselines, pulse and echoes, as its own
-    survey finds them; or of named scenes (default: mixed). One row per chain; every figure with its standard error.
+    Waveforms with known echoes are simulated like those of STRIP: its noise, baselines, pulse and echoes come from a
+    survey of it. Without STRIP, named scenes are simulated (default: mixed). The table has one row per chain and the
+    standard error of each figure.
 
-    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its own waveforms.
-    It reports which of them are found and how right their errors are, false echoes, and surveys of halves and tiles.
-    Exit code: 0, 1 where the strip cannot be read or the folder not be written, 2 wrong usage.
-    """
-    from wavebatch.cli.options import parse_length
+    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to other waveforms of it.
+    The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
+
+    Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
+    """  # fmt: skip
     from wavebatch.tools.bench.command import BenchOptions, run_bench
     from wavebatch.tools.bench.promises import format_promises
     from wavebatch.tools.bench.report import format_document, write_outputs
 
     strips = [path for path in files if path.suffix.lower() != ".toml"]
-    say = _quiet if options["quiet"] or not sys.stderr.isatty() else talk
+    silent = options["quiet"] or not sys.stderr.isatty()
+    say = (lambda text: None) if silent else talk
     if options["real"]:
-        _bench_real(files, output, as_json, say, seed=options["seed"], stability=options["stability"])
+        if not strips or len(strips) < len(files):
+            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
+        _bench_real(strips, output, options, say)
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
-    document = run_bench(
-        BenchOptions(
-            strip=strips[0] if strips else None,
-            scenes=options["scenes"] or (() if strips else ("mixed",)),
-            chains=tuple(path for path in files if path.suffix.lower() == ".toml"),
-            tolerance_cm=parse_length(tolerance) if tolerance else None,
-            **{name: options[name] for name in _PASSED},
-        ),
-        say,
+    settings = from_options(
+        BenchOptions,
+        options,
+        strip=strips[0] if strips else None,
+        scenes=options["scenes"] or (() if strips else ("mixed",)),
+        chains=tuple(path for path in files if path.suffix.lower() == ".toml"),
+        tolerance_cm=parse_length(tolerance) if tolerance else None,
     )
+    document = run_bench(settings, say)
     text = format_document(document)
     if "promises" in document:
         text += "\n\n" + format_promises(document["promises"])
     for line in write_outputs(document, text, output) if output else []:
         talk(line)
-    if as_json:
-        print_json(document)
-    else:
-        click.echo(text)
+    print_result(options["as_json"], document, [text])
 
 
 def _bench_real(
-    strips: tuple[Path, ...], output: Path | None, as_json: bool, say: Callable[[str], None], **options: Any
+    strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
 ) -> None:
     """Measures strip after strip; one that cannot be measured is named, and the others go on."""
-    from wavebatch.core.errors import InputError
     from wavebatch.tools.bench.real import measure_real
     from wavebatch.tools.bench.real.report import format_report, write_report
 
-    if not strips:
-        raise click.UsageError("--real needs the strips to measure")
-    if any(path.suffix.lower() == ".toml" for path in strips):
-        raise click.UsageError("--real measures the chain that a strip's survey chooses; leave chain files out")
-    reports, failed = [], 0
+    reports, failed = [], False
     for path in strips:
         try:
-            reports.append(measure_real(path, say=say, **options))
+            report = measure_real(path, seed=options["seed"], stability=options["stability"], say=say)
         except InputError as error:
-            failed += 1
+            failed = True
             talk(f"error: {one_line(error)}")
             continue
+        reports.append(report)
         if output:
-            talk(write_report(reports[-1], output))
-        if not as_json:
-            click.echo(format_report(reports[-1]) + "\n")
-    if as_json:
+            talk(write_report(report, output))
+        if not options["as_json"]:
+            click.echo(format_report(report) + "\n")
+    if options["as_json"]:
         print_json({"strips": [report.to_json() for report in reports]})
     if failed:
         sys.exit(1)
-
-
-_PASSED = ("seed", "waveforms", "pulses", "repeats", "all_methods", "peers", "stability", "hazards")
-_PASSED += ("promises", "large")
-
-
-def _quiet(text: str) -> None:
-    """Says nothing."""

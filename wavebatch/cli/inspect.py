@@ -1,4 +1,7 @@
-"""`wavebatch info` and `wavebatch check`: what a strip holds, and what is wrong with strips and chain files."""
+"""`wavebatch info` shows what a strip holds, `wavebatch check` what is wrong with strips and chain files.
+
+Only prints; the facts come from `wavebatch.surveying.inspect_strip`.
+"""
 
 from __future__ import annotations
 
@@ -8,49 +11,44 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, print_json, report_errors
-from wavebatch.cli.options import direction_option, headerless_option, json_option
+from wavebatch.cli.messages import count, print_json, print_result
+from wavebatch.cli.options import common_options, strip_argument, strip_options
 from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file, describe_strip
 
 EXIT_PROBLEMS = 1
-"""`check` found something."""
+"""`check` found problems."""
 
 
 @click.command()
-@click.argument("strip", type=click.Path(path_type=Path))
-@direction_option
-@headerless_option
-@json_option()
-@debug_option
-@report_errors()
+@strip_argument
+@strip_options
+@common_options("json")
 def info(strip: Path, direction: str, headerless: bool, as_json: bool, debug: bool) -> None:
-    """What a strip holds: points, packets, descriptors, where the samples lie.
+    """Show points, wave packets, descriptors and sample values of a strip.
 
-    Reads all points and a few thousand waveforms. Exit code: 0, or 1 where the strip cannot be read.
+    Reads all points and a few thousand waveforms.
+
+    Exit code: 0 done, 1 the strip cannot be read, 2 wrong usage.
     """
     facts = describe_strip(strip, direction=direction, headerless=headerless)
-    if as_json:
-        print_json(facts)
-    else:
-        click.echo("\n".join(_list_lines(facts)))
+    print_result(as_json, facts, _list_lines(facts))
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...")
-@direction_option
-@headerless_option
-@click.option("--strict", is_flag=True, help="Let notes count as problems.")
-@json_option()
-@debug_option
-@report_errors()
+@strip_options
+@click.option("--strict", is_flag=True, help="Count notes as problems.")
+@common_options("json")
 def check(
     files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, debug: bool
 ) -> None:
-    """Problems of strips and of chain files (.toml): one line each, with where and what to do.
+    """Check strips and chain files (.toml); print one line per problem, with its place and what to do.
 
-    STRIP is a LAS or LAZ file, a glob, a folder, or @list.txt. Notes are oddities that do no harm here. Exit code: 0
-    clean, 1 problems found.
+    STRIP is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Notes are oddities that
+    wavebatch can read.
+
+    Exit code: 0 no problems, 1 problems found, 2 wrong usage.
     """
     clean, results = True, []
     for path in find_files(map(str, files)):
@@ -80,19 +78,20 @@ def _list_lines(facts: dict[str, Any]) -> list[str]:
         f"format         {kind} {facts['las_version']}, point format {facts['point_format']}",
         f"CRS            {_shorten(facts['crs'] or 'none')}",
         f"points         {facts['points']}",
-        f"with waveform  {facts['points_with_waveform']}" + (f" ({share:.1%})" if share is not None else ""),
+        f"with waveform  {facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})"),
         f"without        {facts['points_without_waveform']}, broken {facts['points_broken']}",
         f"packets        {packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)",
     ]
-    lines += [_describe_descriptor(descriptor) for descriptor in packets["descriptors"]]
+    for one in packets["descriptors"]:
+        samples_text = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
+        lines.append(f"descriptor {one['index']:<3} {samples_text}; {count(one['points'], 'point')}")
     if packets["descriptors_unused"]:
-        lines.append(f"descriptors    {packets['descriptors_unused']} more that no point refers to")
+        lines.append(f"descriptors    {packets['descriptors_unused']} more, which no point uses")
     if samples["waveforms_read"]:
         lengths = ", ".join(map(str, samples["lengths"][:8])) + (" ..." if len(samples["lengths"]) > 8 else "")
-        lines.append(
-            f"samples        {samples['least']} to {samples['largest']} in {samples['waveforms_read']} waveforms of "
-            f"{lengths} samples; {samples['waveforms_at_limit']} waveforms at the limit"
-        )
+        read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
+        values = f"{samples['least']} to {samples['largest']}"
+        lines.append(f"samples        {values} in {read} of {lengths} samples; {limited} at the limit")
     lines.append(f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}")
     if ratio is not None:
         lines.append(f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
@@ -102,14 +101,7 @@ def _list_lines(facts: dict[str, Any]) -> list[str]:
     return lines + [f"problem        {line}" for line in facts["problems"]]
 
 
-def _describe_descriptor(descriptor: dict[str, Any]) -> str:
-    return (
-        f"descriptor {descriptor['index']:<3} {descriptor['samples']} samples of {descriptor['bits']} bits, "
-        f"{descriptor['spacing_ns']:g} ns apart; {descriptor['points']} points"
-    )
-
-
 def _shorten(text: str, limit: int = 100) -> str:
-    """The text on one line, cut where it is long."""
+    """The text on one line, cut if it is longer than the limit."""
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."

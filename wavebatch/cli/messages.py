@@ -1,14 +1,20 @@
-"""What the commands print: messages and progress on stderr, errors as one line and an exit code, JSON on stdout."""
+"""What the commands print: messages, progress and one-line errors on stderr, results as text or JSON on stdout.
+
+Every command of `wavebatch.cli` uses this module. stdout holds only results, so that programs can read it; everything
+for people goes to stderr. Errors of wavebatch become one line and an exit code in `report_errors`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import json
+import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
 
@@ -23,7 +29,7 @@ EXIT_INTERRUPTED = 130
 
 
 class WrongUsage(click.ClickException):
-    """Wrong usage in one line, as all other errors are told, where click takes four."""
+    """Wrong usage as one line, like all other errors; click would print four."""
 
     exit_code = EXIT_USAGE
 
@@ -51,22 +57,22 @@ def _usage_in_one_line() -> Iterator[None]:
 
 
 class NearestGroup(click.Group):
-    """A group of commands that names the nearest one where there is none of the name; wrong usage is one line."""
+    """A group of commands that suggests the nearest name for an unknown command; wrong usage is one line."""
 
     def make_context(self, *args: Any, **options: Any) -> click.Context:
-        """As click does it, for the options of the group itself."""
+        """Parses the options of the group."""
         with _usage_in_one_line():
             return super().make_context(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """As click does it, for the commands."""
+        """Parses and runs the command."""
         with _usage_in_one_line():
             return super().invoke(ctx)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does it, with a better line."""
+        """Finds the command; fails with the nearest name for an unknown one."""
         name = args[0] if args else ""
         if name and not name.startswith("-") and name not in self.list_commands(ctx):
             from wavebatch.core.suggest import nearest
@@ -81,36 +87,61 @@ def talk(message: str) -> None:
 
 
 def printable(text: str) -> str:
-    """The text without what would change the terminal or begin another line: names of files may hold anything."""
+    """The text without control characters and line breaks: a file name may hold escape codes of the terminal."""
     return "".join(c if c.isprintable() else " " if c.isspace() else repr(c)[1:-1] for c in text)
 
 
 def print_json(value: Any) -> None:
-    """`value` as JSON with sorted keys on stdout; null for what is no number, so that every reader takes it."""
+    """Prints `value` as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
     from wavebatch.core.no_data import without_nan
 
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     click.echo(text.encode(errors="backslashreplace").decode())
 
 
+def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
+    """The result of a command on stdout: the document as JSON, or the lines."""
+    if as_json:
+        print_json(document)
+    else:
+        click.echo("\n".join(lines))
+
+
+def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
+    """The summary (a dataclass or dictionary) as JSON if --json is given, and the lines on stderr unless --quiet."""
+    if options["as_json"]:
+        print_json(summary if isinstance(summary, dict) else asdict(summary))
+    if not options["quiet"]:
+        for line in lines:
+            talk(line)
+
+
+def count(number: int, name: str) -> str:
+    """`1 echo`, `2 echoes`."""
+    if number == 1:
+        return f"1 {name}"
+    return f"{number} {name}{'es' if name.endswith(('o', 's', 'x', 'ch')) else 's'}"
+
+
+def row(name: str, values: Iterable[Any], form: str = "", *, width: int = 10) -> str:
+    """A line of a table: the name as it is, then values of one width to the right; form: of floats, NaN is `-`."""
+    texts = (("-" if math.isnan(v) else format(v, form)) if isinstance(v, float) else str(v) for v in values)
+    return name + " ".join(f"{text:>{width}}" for text in texts)
+
+
 def one_line(error: BaseException) -> str:
-    """The error's message without line breaks; a bug shows its type too."""
+    """The error's message on one line; a bug also shows its type."""
     text = printable(" ".join(str(error).split()))
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
 
 
-def debug_option(command: Callable) -> Callable:
-    """`--debug`: tracebacks instead of lines."""
-    return click.option("--debug", is_flag=True, help="Show the traceback of an error.")(command)
-
-
 def report_errors(failure: int = 1) -> Callable:
     """Decorator of a command function: wavebatch's errors become one line on stderr and an exit code.
 
     failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE, an
-    interrupt EXIT_INTERRUPTED. Where the command has a parameter `debug`, it decides whether tracebacks are shown.
+    interrupt EXIT_INTERRUPTED. The command's option `debug` prints the traceback too.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -118,13 +149,11 @@ def report_errors(failure: int = 1) -> Callable:
         def guarded(*args: Any, **options: Any) -> Any:
             try:
                 return function(*args, **options)
-            except (click.ClickException, click.exceptions.Exit, click.Abort):
+            except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
                 raise
             except KeyboardInterrupt:
                 talk("interrupted")
                 sys.exit(EXIT_INTERRUPTED)
-            except BrokenPipeError:
-                raise
             except Exception as error:
                 if options.get("debug"):
                     traceback.print_exc()
@@ -136,20 +165,18 @@ def report_errors(failure: int = 1) -> Callable:
     return decorate
 
 
-KINDS = ("auto", "bar", "json", "none")
-
-
 def counting(unit: str, quiet: bool, total: int | None = None) -> Any:
-    """A bar that counts up to `total`, on a terminal and unless `quiet`; a context manager with `update(number)`."""
+    """A progress bar up to `total`, shown on a terminal only and not if `quiet`; use it with `with`."""
     from tqdm import tqdm
 
     return tqdm(total=total, unit=f" {unit}", disable=quiet or not sys.stderr.isatty(), leave=False)
 
 
 class Progress:
-    """Takes the events of a batch. kind: one of KINDS; auto is a bar where stderr is a terminal.
+    """Shows the events of a batch.
 
-    level: -1 tells errors only, 0 also what was written, 1 also where the points went.
+    kind: `bar`, `json`, `none`, or `auto`: a bar if stderr is a terminal. level: -1 shows errors only, 0 also a line
+    per strip, 1 also how its points were processed.
     """
 
     def __init__(self, strips: Iterable[Path], kind: str, level: int, debug: bool) -> None:
@@ -174,7 +201,7 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
 
-    def tell(self, event: dict[str, Any]) -> None:
+    def show(self, event: dict[str, Any]) -> None:
         """Shows one event of `run_batch`."""
         error = event.get("error")
         if self._json:
@@ -191,11 +218,11 @@ class Progress:
         elif kind == "written" and self._level >= 0:
             self._say(printable(_summary(event, self._level > 0)))
             warnings = [f"warning: {line}" for line in event["warnings"]]
-            more = [*_tell_sensor(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
+            more = [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
-            self._say(printable(f"{strip}: is there already"))
+            self._say(printable(f"{strip}: is up to date, skipped"))
 
     def _advance(self, strip: str, share: float) -> None:
         done = round(self._sizes.get(strip, 0) * share)
@@ -219,12 +246,12 @@ def _size(path: Path) -> int:
 
 
 def _place(strip: str, line: str) -> str:
-    """The line with the strip in front, unless it names it already."""
+    """The line with the strip's name first, unless it contains the name already."""
     return line if strip in line else f"{strip}: {line}"
 
 
-def _tell_sensor(sensor: dict[str, Any]) -> Iterator[str]:
-    """Where the sensor was, and how one knows."""
+def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
+    """The sensor position and its source."""
     words = {
         "distance_m": "{:.0f} m away",
         "height_m": "{:.0f} m above the points",
@@ -233,13 +260,13 @@ def _tell_sensor(sensor: dict[str, Any]) -> Iterator[str]:
         "smoothness_m": "smooth to {:.3f} m",
         "range_error_m": "ranges to {:.3f} m",
     }
-    told = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
-    if told:
-        yield f"sensor from {sensor['source']}: {', '.join(told)}"
+    parts = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
+    if parts:
+        yield f"sensor from {sensor['source']}: {', '.join(parts)}"
 
 
 def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
-    """Per column how many echoes lack a value, one line for each reason."""
+    """For each column and reason: how many echoes have no value."""
     from wavebatch.core.no_data import REASONS, NoData
 
     for column, counts in sorted(no_data.items()):
@@ -249,18 +276,21 @@ def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:
                 yield f"{column}: no-data for {number} of {total} echoes: {REASONS[NoData[name]][0]}"
 
 
+_COUNTED = {"points_in": "point", "waveforms": "waveform", "echoes": "echo"}
+
+
 def _summary(event: dict[str, Any], long: bool) -> str:
     counts = event["counts"]
     passed = sum(counts["passed_through"].values())
-    line = (
-        f"{event['strip']}: {counts['points_in']} points, {counts['waveforms']} waveforms, {counts['echoes']} echoes, "
-        f"{passed} passed through -> {counts['points_out']} points"
-    )
+    parts = [count(counts[key], name) for key, name in _COUNTED.items()]
+    line = f"{event['strip']}: {', '.join(parts)}, {passed} passed through -> {count(counts['points_out'], 'point')}"
     if not long:
         return line
-    reasons = ", ".join(f"{name} {number}" for name, number in counts["passed_through"].items() if number)
-    flags = ", ".join(f"{name} {number}" for name, number in counts["flags"].items() if number)
+    reasons, flags = (
+        ", ".join(f"{name} {number}" for name, number in counts[key].items() if number) or "none"
+        for key in ("passed_through", "flags")
+    )
     return (
         f"{line}; returns matched {counts['matched_returns']}, unmatched {counts['unmatched_returns']}, echoes added "
-        f"{counts['added_echoes']}; passed through: {reasons or 'none'}; flags: {flags or 'none'}"
+        f"{counts['added_echoes']}; passed through: {reasons}; flags: {flags}"
     )

@@ -1,41 +1,120 @@
-"""Options that several commands have: each is declared here once, with the code that reads its value."""
+"""Options that several commands share, and the code that reads their values.
+
+Every command of `wavebatch.cli` is built from these. An option with a short form or a name used twice belongs here:
+`tests/cli/test_usage.py` checks that one name means one thing everywhere.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from wavebatch.cli.messages import report_errors
 from wavebatch.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from wavebatch.surveying.calibration import Calibration
     from wavebatch.surveying.sensor import SensorRequest
+    from wavebatch.surveying.system_file import SavedSurvey
 
-overwrite_option = click.option("--overwrite", is_flag=True, help="Replace what exists.")
-quiet_option = click.option("-q", "--quiet", is_flag=True, help="Say nothing unless something fails.")
-headerless_option = click.option("--headerless", is_flag=True, help="Take a .wdp that lacks its 60-byte header.")
+_Options = TypeVar("_Options")
+
+
+def file_option(*names: str, text: str, metavar: str = "FILE", **more: Any) -> Callable:
+    """An option whose value is a path; text: its help."""
+    return click.option(*names, type=click.Path(path_type=Path), metavar=metavar, help=text, **more)
+
+
+def output_option(text: str, metavar: str = "FILE", *, required: bool = True) -> Callable:
+    """`-o`: the file to write; text: its help."""
+    kind = click.Path(dir_okay=False, path_type=Path)
+    return click.option("-o", "--output", required=required, type=kind, metavar=metavar, help=text)
+
+
+def seed_option(text: str) -> Callable:
+    """`--seed`; text: its help."""
+    return click.option("--seed", type=click.IntRange(0), default=0, show_default=True, metavar="N", help=text)
+
+
+def together(*options: Callable) -> Callable:
+    """One decorator for several options, in this order in the help."""
+
+    def decorate(command: Callable) -> Callable:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+strip_argument = click.argument("strip", type=click.Path(path_type=Path))
+clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
+
 direction_option = click.option(
     "--direction",
     type=click.Choice(["auto", "toward", "away"]),
     default="auto",
     show_default=True,
-    help="Where packet vectors point: decided from the file, or toward or away from the sensor.",
+    help="Direction of the packet vectors: toward or away from the sensor; auto finds it from the file.",
 )
-system_option = click.option(
-    "--system",
-    "system_file",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="A saved survey (of `wavebatch survey -o`) in place of one of the strip.",
+strip_options = together(
+    direction_option,
+    click.option("--headerless", is_flag=True, help="Read a .wdp file that lacks its 60-byte header."),
 )
+system_option = file_option(
+    "--system", "system_file", text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."
+)
+calibration_option = file_option(
+    "--calibration", "calibration_file",
+    text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",
+)  # fmt: skip
+chain_options = together(
+    file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
+    click.option("--profile", metavar="auto|fast|balanced|accurate", help="Run a shipped chain; auto surveys the strip "
+                 "and chooses the cheapest chain that suits it.  [default: auto]"),
+)  # fmt: skip
+sensor_options = together(
+    file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
+                "the sensor position is estimated from the packet vectors."),
+    click.option("--lever-arm", metavar="X,Y,Z", help="Offset from trajectory to scanner: forward, right, down [m]."),
+    click.option("--crs", metavar="CRS", help="CRS of the strip, e.g. EPSG:32632; for a trajectory in degrees."),
+    click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
+                 help="Flight height above ground [m], used if neither trajectory nor vectors give the position."),
+)  # fmt: skip
+
+_COMMON = {
+    "overwrite": click.option("--overwrite", is_flag=True, help="Replace existing files."),
+    "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
+    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no messages, only errors."),
+    "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
+}
 
 
-def json_option(text: str = "Print JSON.") -> Callable:
-    """`--json`, the parameter `as_json`; text: what is printed."""
-    return click.option("--json", "as_json", is_flag=True, help=text)
+def common_options(*names: str, failure: int = 1) -> Callable:
+    """The last options of a command, by their names in _COMMON and always `--debug`, and its errors as one line.
+
+    failure: exit code as in `report_errors`.
+    """
+
+    def decorate(command: Callable) -> Callable:
+        return together(*(_COMMON[name] for name in (*names, "debug")))(report_errors(failure)(command))
+
+    return decorate
+
+
+def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
+    """The options of these names that the user gave."""
+    return {name: options[name] for name in names if options.get(name) is not None}
+
+
+def from_options(kind: type[_Options], options: Mapping[str, Any], **more: Any) -> _Options:
+    """A dataclass filled from options named like its fields; those not given keep its defaults. more: other fields."""
+    return kind(**{**given_options(options, [field.name for field in fields(kind)]), **more})
 
 
 _LENGTH_UNITS = {"m": 100.0, "cm": 1.0, "mm": 0.1}
@@ -49,25 +128,47 @@ def parse_length(text: str) -> float:
     return float(match[1]) * _LENGTH_UNITS[match[2]]
 
 
-_SENSOR_OPTIONS = (
-    click.option("--trajectory", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Where the sensor was: text with time, x, y, z, or SBET. Without it the packets' vectors say."),
-    click.option("--lever-arm", metavar="X,Y,Z", help="From the trajectory to the scanner: forward, right, down [m]."),
-    click.option("--crs", metavar="CRS", help="Of the strip, e.g. EPSG:32632, for a trajectory in degrees."),
-    click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-                 help="Above the ground, where neither a trajectory nor vectors say where the sensor was."),
-)  # fmt: skip
+def parse_span(text: str) -> tuple[int, int | None]:
+    """`7` or `5:20` as the first number and the end, which is not included; `:20` starts at 0, `5:` has no end."""
+    found = re.fullmatch(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", text)
+    if not found or text == ":":
+        raise click.BadParameter(f"{text!r} is neither a number nor FIRST:END")
+    if found[1]:
+        return int(found[1]), int(found[1]) + 1
+    first, end = int(found[2] or 0), int(found[3]) if found[3] else None
+    if end is not None and end <= first:
+        raise click.BadParameter(f"{text!r} is empty; END is the number after the last one")
+    return first, end
 
 
-def sensor_options(command: Callable) -> Callable:
-    """Options of a command that say where the sensor was, for `read_sensor`."""
-    for option in reversed(_SENSOR_OPTIONS):
-        command = option(command)
-    return command
+def parse_floats(text: str, form: str) -> tuple[float, ...]:
+    """As many numbers as the form has, e.g. `LOW:HIGH` or `W,S,E,N`."""
+    mark = ":" if ":" in form else ","
+    try:
+        numbers = tuple(float(part) for part in text.split(mark))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != form.count(mark) + 1:
+        raise click.BadParameter(f"{text!r} is not {form}")
+    return numbers
+
+
+def read_system(options: Mapping[str, Any]) -> SavedSurvey | None:
+    """The survey of --system, None without it."""
+    from wavebatch.surveying.system_file import load_survey
+
+    return load_survey(options["system_file"]) if options["system_file"] else None
+
+
+def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
+    """The calibration of --calibration, None without it."""
+    from wavebatch.surveying.calibration import load_calibration
+
+    return load_calibration(options["calibration_file"]) if options["calibration_file"] else None
 
 
 def read_sensor(options: Mapping[str, Any]) -> SensorRequest:
-    """What --trajectory, --crs, --lever-arm and --flight-height ask for; ConfigError where they cannot be meant."""
+    """The request of --trajectory, --crs, --lever-arm and --flight-height; ConfigError where they do not fit."""
     from wavebatch.surveying.sensor import SensorRequest
 
     arm = _read_lever_arm(options["lever_arm"])
@@ -77,14 +178,14 @@ def read_sensor(options: Mapping[str, Any]) -> SensorRequest:
     return SensorRequest(options["trajectory"], options["crs"], arm, options["flight_height"])
 
 
-def _read_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+def _read_lever_arm(text: str | None) -> tuple[float, ...] | None:
     """Forward, right, down [m]."""
     if text is None:
         return None
     try:
-        forward, right, down = (float(part) for part in text.split(","))
-    except ValueError as error:
+        arm = parse_floats(text, "X,Y,Z")
+    except click.BadParameter as error:
         raise ConfigError(f"--lever-arm: {text!r} must be three numbers in metres, e.g. 0.1,-0.2,0.5") from error
-    if not abs(forward) + abs(right) + abs(down) < 1000:
-        raise ConfigError(f"--lever-arm: {text!r} is no arm of a few metres")
-    return forward, right, down
+    if not sum(map(abs, arm)) < 1000:
+        raise ConfigError(f"--lever-arm: {text!r} is too long; a lever arm has a few metres")
+    return arm

@@ -1,8 +1,13 @@
-"""`wavebatch run`: the main job."""
+"""`wavebatch run`: decompose strips into point clouds.
+
+Only reads and checks options, starts the batch and turns its result into an exit code; the work is in
+`wavebatch.batch`. `plot waveform` also uses `choose_chain`.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from dataclasses import replace
@@ -11,99 +16,86 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_INTERRUPTED, EXIT_USAGE, debug_option, one_line, print_json, report_errors, talk
+from wavebatch.cli.messages import EXIT_INTERRUPTED, EXIT_USAGE, Progress, count, one_line, print_json, talk
 from wavebatch.cli.options import (
-    direction_option,
-    headerless_option,
-    overwrite_option,
+    calibration_option,
+    chain_options,
+    common_options,
     read_sensor,
     sensor_options,
+    strip_options,
     system_option,
 )
 from wavebatch.core.errors import ConfigError
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
-"""Some strips are not written; none is."""
+"""Some strips failed; all strips failed."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
-class Size(click.ParamType):
-    """Bytes, as 800M, 2G or a plain number."""
-
-    name = "size"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """The number of bytes."""
-        if isinstance(value, int):
-            return value
-        text = str(value).strip().upper().removesuffix("IB").removesuffix("B")
-        number, unit = (text[:-1], text[-1]) if text and text[-1] in "KMGT" else (text, "")
-        try:
-            size = float(number) * _UNITS[unit]
-            if size > 0:
-                return int(size)
-        except (ValueError, OverflowError):
-            pass
-        return self.fail(f"{value!r} is not a size such as 800M or 2G", param, ctx)
+def _read_size(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
+    """Bytes from `800M`, `2G` or a plain number."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)([KMGT]?)(I?B)?", text.strip().upper())
+    size = int(float(found[1]) * _UNITS[found[2]]) if found else 0
+    if not size:
+        raise click.BadParameter(f"{text!r} is not a size such as 800M or 2G")
+    return size
 
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
-@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path), metavar="DIR",
-              help="Folder of the clouds and their reports; made if it is not there.")
-@click.option("-c", "--chain", "chain_file", type=click.Path(path_type=Path), metavar="FILE", help="Chain file (TOML).")
-@click.option("--profile", metavar="auto|fast|balanced|accurate",
-              help="A shipped chain; auto: what the strip's own survey says that it needs.  [default: auto]")
+@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path),
+              metavar="DIR", help="Folder for clouds and reports; created if it does not exist.")
+@chain_options
 @click.option("--tolerance", metavar="LENGTH",
-              help="The cheapest shipped chain whose predicted range error meets this, e.g. 0.02m, decides per strip.")
+              help="For each strip, choose the cheapest shipped chain whose predicted range error is at most this, "
+              "e.g. 0.02m.")
 @system_option
 @sensor_options
-@click.option("--calibration", "calibration_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="Of `wavebatch calibrate`: adds backscatter and reflectance, with a divergence the cross section.")
-@direction_option
-@headerless_option
+@calibration_option
+@strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
-              help="A point per echo found, or the input's own points, enriched.")
-@click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
-              help="Of the clouds.")
-@click.option("--point-format", type=click.IntRange(0, 10), metavar="0-10",
-              help="Of the clouds.  [default: that of the strip without waveforms]")
+              help="Write one point per echo, or the input points with the attributes of their echoes.")
+@click.option("--columns", metavar="LIST", help="a,b writes only these columns; +a,+b adds them to the usual ones.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
-              show_default=True, help="Names and units of the extra bytes.")
-@click.option("--columns", metavar="LIST", help="a,b writes these columns only; +a,+b adds them to the usual ones.")
-@click.option("--keep-packets", is_flag=True, help="Keep the waveforms: their point format and the packets themselves.")
+              show_default=True, help="Naming scheme for names and units of the extra bytes.")
+@click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
+              help="File format of the clouds.")
+@click.option("--point-format", type=click.IntRange(0, 10), metavar="0-10",
+              help="LAS point format of the clouds.  [default: that of the strip without waveforms]")
+@click.option("--keep-packets", is_flag=True, help="Copy the waveforms too: point format and packets stay as they are.")
 @click.option("--jobs", type=click.IntRange(0), metavar="N",
-              help="Processes; 0 means one per processor. The result is the same for any number.  [default: 1]")
+              help="Processes; 0: one per processor. The result does not depend on it.  [default: 1]")
 @click.option("--scheduler", metavar="ADDRESS",
-              help="Of a dask cluster, e.g. tcp://10.0.0.1:8786: its workers take the place of --jobs. They must see "
-              "strips and DIR under the same names, and have the same wavebatch.")
-@click.option("--memory", type=Size(), metavar="SIZE", help="Most memory for all processes together, e.g. 2G.")
+              help="Use the workers of this dask cluster instead of --jobs, e.g. tcp://10.0.0.1:8786. They must see "
+              "strips and DIR under the same paths, and have the same wavebatch.")
+@click.option("--memory", callback=_read_size, metavar="SIZE", help="Most memory of all processes together, e.g. 2G.")
 @click.option("--block-size", type=click.IntRange(1), metavar="N",
-              help="Waveforms processed at a time; the result is the same for any number.  [default: by their length]")
-@overwrite_option
-@click.option("--resume", is_flag=True, help="Leave outputs that are complete and up to date, make all others anew.")
-@click.option("--dry-run", is_flag=True, help="Print what would be done with each strip, and touch nothing.")
+              help="Waveforms processed at once. The result does not depend on it.  [default: by their length]")
+@click.option("--resume", is_flag=True, help="Skip strips whose output is complete and up to date; redo the others.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done with each strip; write nothing.")
 @click.option("--report", type=click.Path(dir_okay=False, allow_dash=True), metavar="FILE",
-              help="Summary of all strips as JSON; - is stdout.")
+              help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
-              help="auto: a bar on a terminal only. json: one line per event on stdout.")
-@click.option("-q", "--quiet", is_flag=True, help="Errors only.")
-@click.option("-v", "--verbose", is_flag=True, help="Say more about each strip.")
-@debug_option
-@report_errors(failure=EXIT_NOTHING)
+              help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
+@click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
+@common_options("overwrite", "quiet", failure=EXIT_NOTHING)
 def run(**options: Any) -> None:
-    """Strips in, enriched point clouds out.
+    """Decompose strips into enriched point clouds.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each strip
-    becomes DIR/<stem>.laz and DIR/<stem>.report.json; the report is written last and says that the cloud is complete.
+    gives DIR/<stem>.laz and DIR/<stem>.report.json. The report is written last: if it exists, the cloud is complete.
 
     \b
-    Exit codes: 0 every strip is written
-                2 wrong usage or chain file, nothing was started; or no chain meets the tolerance
-                3 some strips failed, the others are written
-                4 no strip is written
-                130 interrupted; --resume goes on
+    Exit codes:
+      0    all strips are written
+      2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
+      3    some strips failed, the others are written
+      4    all strips failed
+      130  interrupted; --resume continues
     """  # fmt: skip
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -115,7 +107,7 @@ def run(**options: Any) -> None:
     try:
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
-        talk("interrupted: finished clouds are complete, nothing half-written remains; --resume goes on")
+        talk("interrupted: finished clouds are complete, no partial file remains; --resume continues")
         sys.exit(EXIT_INTERRUPTED)
 
 
@@ -227,11 +219,10 @@ def _read_tolerance(text: str | None) -> float | None:
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.report_file import write_json
     from wavebatch.batch.run import run_batch
-    from wavebatch.cli.messages import Progress
 
     level = -1 if options["quiet"] else int(options["verbose"])
     with Progress([job.path for job in jobs], options["progress"], level, options["debug"]) as progress:
-        result = run_batch(jobs, batch_options, progress.tell)
+        result = run_batch(jobs, batch_options, progress.show)
     if level > 0:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
@@ -247,7 +238,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
 
 
 def exit_code(failed: int, strips: int) -> int:
-    """0 every strip is there, EXIT_SOME_FAILED some are not, EXIT_NOTHING none is."""
+    """0 if all strips are written, EXIT_NOTHING if none is, else EXIT_SOME_FAILED."""
     if not failed:
         return 0
     return EXIT_NOTHING if failed == strips else EXIT_SOME_FAILED
@@ -266,12 +257,12 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             talk(f"error: {one_line(error)}")
             continue
         click.echo(
-            f"{plan['strip']}: {plan['action']} {plan['output']}: {plan['points']} points, format "
+            f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
     by = jobs[0].request.describe(jobs[0].chain)
     if by is not None:
-        click.echo(f"\n# chosen per strip ({by}); the most that it can be:", nl=False)
+        click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
     click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
     return exit_code(failed, len(jobs))

@@ -1,4 +1,7 @@
-"""`wavebatch stages`: every algorithm, with parameters, source and an example."""
+"""`wavebatch stages`: every algorithm, with parameters, source and an example.
+
+The texts come from the docstrings of the stages and from `wavebatch.stages.chain.STAGES`; nothing is repeated here.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, print_json, report_errors
-from wavebatch.cli.options import json_option
+from wavebatch.cli.messages import print_result
+from wavebatch.cli.options import common_options
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 
@@ -18,26 +21,24 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("name", required=False)
-@json_option("For programs.")
-@debug_option
-@report_errors()
+@common_options("json")
 def stages(name: str | None, as_json: bool, debug: bool) -> None:
-    """The algorithms that a chain is made of: all of them, or one with its parameters, source and a TOML example."""
+    """List the algorithms that a chain can use, or explain the one called NAME.
+
+    The explanation has its parameters with units and ranges, its source, and an example for a chain file.
+
+    Exit code: 0 done, 2 no stage has this name.
+    """
     from wavebatch.stages.chain import KINDS, STAGES
 
     if name is not None and name not in STAGES:
-        told = nearest(name, STAGES)
-        raise ConfigError(f"no stage {name!r}; {told if '?' in told else '`wavebatch stages` lists them'}")
+        hint = nearest(name, STAGES)
+        raise ConfigError(f"no stage {name!r}; {hint if '?' in hint else '`wavebatch stages` lists them'}")
     order = list(KINDS)
     chosen = [STAGES[name]] if name else sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
-    if as_json:
-        print_json([_describe(stage) for stage in chosen])
-    elif name:
-        click.echo(_explain(STAGES[name]))
-    else:
-        width = max(len(stage.name) for stage in chosen)
-        for stage in chosen:
-            click.echo(f"{stage.name:<{width}}  {stage.summary}")
+    width = max(len(stage.name) for stage in chosen)
+    lines = [_explain(STAGES[name])] if name else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
+    print_result(as_json, [_describe(stage) for stage in chosen], lines)
 
 
 def _types(parameter: Parameter) -> str:
@@ -48,25 +49,21 @@ def _types(parameter: Parameter) -> str:
 
 
 def _describe(stage: Stage) -> dict[str, Any]:
+    """The document of a stage for --json."""
     from wavebatch.stages.chain_file import format_step
 
-    defaults = {name: parameter.default for name, parameter in stage.parameters.items()}
+    parameters = {
+        name: {"type": _types(one), "default": one.default, "range": one.range, "meaning": one.meaning}
+        for name, one in stage.parameters.items()
+    }
     return {
         "name": stage.name,
         "kind": stage.kind,
         "text": _prose(stage),
         "makes": list(stage.makes),
         "needs": list(stage.needs),
-        "parameters": {
-            name: {
-                "type": _types(parameter),
-                "default": parameter.default,
-                "range": parameter.range,
-                "meaning": parameter.meaning,
-            }
-            for name, parameter in stage.parameters.items()
-        },
-        "example": format_step(stage.name, defaults),
+        "parameters": parameters,
+        "example": format_step(stage.name, {name: one["default"] for name, one in parameters.items()}),
     }
 
 
@@ -79,20 +76,21 @@ def _prose(stage: Stage) -> str:
 
 
 def _explain(stage: Stage) -> str:
+    """The stage as text."""
     from wavebatch.core.echoes import COLUMNS
 
-    told = _describe(stage)
-    parts = [f"{stage.name}\n\n{told['text']}"]
+    described = _describe(stage)
+    parts = [f"{stage.name}\n\n{described['text']}"]
     if stage.makes:
         known = [COLUMNS[name] for name in stage.makes if name in COLUMNS]
         parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
     if stage.needs:
         parts.append(f"Needs: {', '.join(stage.needs)}")
-    if told["parameters"]:
-        lines = []
-        for name, p in told["parameters"].items():
-            limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
-            lines.append(f"  {name} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
+    lines = []
+    for name, p in described["parameters"].items():
+        limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""
+        lines.append(f"  {name} ({p['type']}{limits}, default {p['default']}): {p['meaning']}")
+    if lines:
         parts.append("Parameters:\n" + "\n".join(lines))
-    parts.append("In a chain file:\n\n" + told["example"].rstrip())
+    parts.append("In a chain file:\n\n" + described["example"].rstrip())
     return "\n\n".join(parts)

@@ -1,4 +1,7 @@
-"""`wavebatch stats`: return numbers, separations and flags of point clouds."""
+"""`wavebatch stats`: return numbers, separations and flags of point clouds.
+
+Reads options and writes the text, the CSV table and the JSON document; counting is in `wavebatch.tools.return_stats`.
+"""
 
 from __future__ import annotations
 
@@ -6,56 +9,49 @@ import csv
 import io
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
-from wavebatch.cli.options import json_option, overwrite_option
+from wavebatch.cli.messages import print_json, row, talk
+from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
-from wavebatch.surveying.system_file import write_text
+from wavebatch.files.text_file import write_text
 from wavebatch.tools.return_stats.areas import AreaStats, Grid, PolygonSet
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
 EXIT_UNREADABLE = 1
-"""A cloud could not be read; the others are counted."""
+"""A cloud could not be read; the others were counted."""
 
 SHOWN = 20
-"""Areas of a cloud that are printed; a table of all of them goes to -o or --json."""
+"""Areas of a cloud that are printed: about a screen; -o and --json have all of them."""
 
 
 @click.command()
-@click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
+@clouds_argument
 @click.option("--area", "size", type=float, metavar="SIZE",
-              help="Count by square cells with sides of SIZE, in the unit of the coordinates, too.")
-@click.option("--polygons", type=click.Path(path_type=Path), metavar="FILE",
-              help="Count by the polygons of a GeoJSON file too; the first one counts where they overlap.")
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), metavar="FILE.csv",
-              help="A table with a row per cloud and area.")
-@overwrite_option
-@json_option("Print JSON: `files`, and `total` over all of them.")
-@debug_option
-@report_errors()
+              help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
+@file_option("--polygons", text="Also count in the polygons of this GeoJSON file; where polygons overlap, the first "
+             "one counts.")
+@output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
+@common_options("overwrite", "json")
 def stats(
-    clouds: tuple[Path, ...],
-    size: float | None,
-    polygons: Path | None,
-    output: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    debug: bool,
+    clouds: tuple[Path, ...], size: float | None, polygons: Path | None, output: Path | None, overwrite: bool,
+    as_json: bool, debug: bool,
 ) -> None:
-    """How many returns the pulses of CLOUDs have, how far apart they are, and which flags they carry.
+    """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
 
-    CLOUD is a LAS or LAZ file with its points in any order, a glob, a folder, or @list.txt. Warns what the sensor's
-    dead zone and its largest number of returns hide. A pulse belongs to the area of its first return, with all of its
-    returns. Exit code: 0, or 1 where a cloud cannot be read (the others are counted), 2 wrong usage.
+    CLOUD is a LAS or LAZ file with points in any order, a glob, a folder, or @list.txt with one of these per line. A
+    pulse belongs, with all its returns, to the area of its first return. Warnings say what the dead zone and the
+    largest number of returns of the sensor hide.
+
+    Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
     if output is not None and not overwrite:
         refuse_existing(output)
@@ -73,53 +69,53 @@ def stats(
     each, total = count_returns(files, skip, divisions=divisions)
     if output is not None:
         write_text(output, _format_table(each, total), overwrite=overwrite)
+    shown = [*each, total] if len(files) > 1 else each
     if as_json:
         print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
-    else:
-        shown = [*each, total] if len(files) > 1 else each
-        click.echo("\n\n".join("\n".join(_list_lines(one)) for one in shown), nl=bool(shown))
+    elif shown:
+        click.echo("\n\n".join("\n".join(_list_lines(one)) for one in shown))
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 
-def _list_lines(found: ReturnStats) -> list[str]:
-    lines = [
-        found.cloud,
-        f"points         {found.points}",
-        f"pulses         {found.pulses} (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each"
-        if found.pulses
-        else "pulses         0",
-    ]
+def _list_lines(found: ReturnStats) -> Iterator[str]:
+    yield found.cloud
+    yield f"points         {found.points}"
+    pulses = f" (by {found.pulses_by}), {found.returns_per_pulse:.3f} returns each" if found.pulses else ""
+    yield f"pulses         {found.pulses}{pulses}"
     numbers = sorted({*found.by_number, *found.by_count})
     if numbers:
-        lines.append(f"{'k':>14}  {'return k':>10}  {'k returns':>10}")
+        yield f"{'k':>14}  {'return k':>10}  {'k returns':>10}"
     for k in numbers:
-        lines.append(f"{k:>14}  {found.by_number.get(k, 0):>10.2%}  {found.by_count.get(k, 0):>10.2%}")
+        yield f"{k:>14}  {found.by_number.get(k, 0):>10.2%}  {found.by_count.get(k, 0):>10.2%}"
     if found.separations["all"].pairs:
-        lines.append(f"{'separation':<14}  {'pairs':>10}  {'mean m':>10}  {'least m':>10}")
+        yield f"{'separation':<14}  {'pairs':>10}  {'mean m':>10}  {'least m':>10}"
         for name, one in found.separations.items():
-            lines.append(f"{name:>14}  {one.pairs:>10}  {one.mean:>10.3f}  {one.least:>10.3f}")
-    if found.flags is not None:
-        lines += [f"{name:<22}  {number:>10}" for name, number in found.flags.items() if number]
-    return lines + [f"warning        {line}" for line in found.warnings] + _list_areas(found.areas)
+            yield f"{name:>14}  {one.pairs:>10}  {one.mean:>10.3f}  {one.least:>10.3f}"
+    for name, number in (found.flags or {}).items():
+        if number:
+            yield f"{name:<22}  {number:>10}"
+    yield from (f"warning        {line}" for line in found.warnings)
+    yield from _list_areas(found.areas)
 
 
-def _list_areas(areas: Sequence[AreaStats]) -> list[str]:
-    if not areas:
-        return []
-    most = max(max(area.by_count) for area in areas[:SHOWN])
-    width = max(len(area.name) for area in areas[:SHOWN])
-    head = ("pulses", "each", *(f"{k} of pulse" for k in range(1, most + 1)), "pairs", "mean m", "least m")
-    lines = [f"{'area':<{width}} " + " ".join(f"{name:>10}" for name in head)]
-    for area in areas[:SHOWN]:
-        shares = " ".join(f"{area.by_count.get(k, 0):>10.2%}" for k in range(1, most + 1))
-        apart = f"{area.pairs:>10} {area.mean:>10.3f} {area.least:>10.3f}".replace("nan", "  -")
-        lines.append(f"{area.name:<{width}} {area.pulses:>10} {area.returns_per_pulse:>10.3f} {shares} {apart}")
-    left = len(areas) - SHOWN
-    return lines + ([f"and {left} more areas; -o FILE.csv and --json have all of them"] if left > 0 else [])
+def _list_areas(areas: Sequence[AreaStats]) -> Iterator[str]:
+    shown, left = areas[:SHOWN], len(areas) - SHOWN
+    if not shown:
+        return
+    numbers = range(1, max(max(area.by_count) for area in shown) + 1)
+    width = max(len(area.name) for area in shown)
+    head = ("pulses", "each", *(f"{k} of pulse" for k in numbers), "pairs", "mean m", "least m")
+    yield row(f"{'area':<{width}} ", head)
+    for area in shown:
+        shares = [f"{area.by_count.get(k, 0):.2%}" for k in numbers]
+        values = (area.pulses, area.returns_per_pulse, *shares, area.pairs, area.mean, area.least)
+        yield row(f"{area.name:<{width}} ", values, ".3f")
+    if left > 0:
+        yield f"and {left} more areas; -o FILE.csv and --json have all of them"
 
 
 def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
-    """CSV: a row per cloud and per area of it; of several clouds also of all together."""
+    """CSV: one row per cloud and per area of it; for several clouds also the total."""
     every = [*each, total] if len(each) > 1 else each
     rows = [(one.cloud, part) for one in every for part in (one, *one.areas)]
     numbers = range(1, 1 + max((max(part.by_number, default=0) for _, part in rows), default=0))
@@ -142,7 +138,7 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
 
 
 def _cell(value: Any) -> Any:
-    """Nothing for what is unknown."""
+    """The value for the table; an unknown number is an empty cell."""
     if not isinstance(value, float):
         return value
     return f"{value:.10g}" if math.isfinite(value) else ""

@@ -1,4 +1,7 @@
-"""`wavebatch survey`: what sensor and scene of a strip are, and which chain they need."""
+"""`wavebatch survey`: noise, pulse and scene of a strip, and the chain that they need.
+
+Calls the survey and prints it; the measurements are in `wavebatch.surveying`.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import debug_option, print_json, report_errors, talk
-from wavebatch.cli.options import direction_option, headerless_option, json_option, overwrite_option
+from wavebatch.cli.messages import count, print_result, talk
+from wavebatch.cli.options import common_options, output_option, strip_argument, strip_options
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
@@ -19,31 +22,29 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("strip", type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), metavar="SYSTEM.toml",
-              help="Write pulse, noise and all else that was found; for `wavebatch run --system`.")
+@strip_argument
+@output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
 @click.option("--chain", "chain_file", type=click.Path(dir_okay=False, path_type=Path), metavar="CHAIN.toml",
-              help="Write the cheapest chain that serves, with a comment on each part; for `wavebatch run --chain`.")
+              help="Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.")
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
-              help="Waveforms to look at, spread over the strip.  [default: 8192, fewer where they are long]")
-@direction_option
+              help="Waveforms to look at, spread over the strip.  [default: 8192, fewer if they are long]")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
-              help="Full angle of the beam between the 1/e^2 points: says what angles its widths tell; kept in -o.")
-@headerless_option
-@overwrite_option
-@json_option()
-@debug_option
-@report_errors()
+              help="Full angle of the beam between the 1/e^2 points [mrad]: adds whether echo widths can give "
+              "incidence angles; saved in SYSTEM.toml.")
+@strip_options
+@common_options("overwrite", "json")
 def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: bool, **options: Any) -> None:
-    """What sensor and scene of a strip are, and what of a chain they need.
+    """Measure noise, pulse and scene of a strip, and choose the chain that they need.
 
-    Noise, baseline, system pulse, ringing, saturation, shares of empty, single and overlapped waveforms, and every
-    part of a chain that the scene does not need, with the reason. Exit code: 0, or 1 where the strip cannot be surveyed
-    or a file not be written.
+    Prints noise, baseline, system pulse, ringing and saturation, the shares of empty, single and overlapped waveforms,
+    and for each optional part of a chain whether the strip needs it and why.
+
+    Exit code: 0 done, 1 the strip cannot be surveyed or a file cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
+    from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
-    from wavebatch.surveying.system_file import write_survey, write_text
+    from wavebatch.surveying.system_file import write_survey
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
@@ -55,13 +56,10 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
         write_survey(output, saved, overwrite=overwrite)
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
-    if as_json:
-        print_json(_document(saved, facts))
-    else:
-        click.echo("\n".join(_lines(saved, facts)))
+    print_result(as_json, _document(saved, facts), _lines(saved, facts))
     for target in (output, chain_file):
         if target is not None:
-            talk(f"{target} is written")
+            talk(f"{target}: written")
 
 
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
@@ -117,8 +115,7 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
         "system": describe_system(saved.survey.system),
         "figures": {name: float(value) for name, value in saved.survey.figures.items()},
         "decisions": [
-            {"part": decision.part, "needed": bool(decision.needed), "reason": decision.reason}
-            for decision in saved.survey.decisions
+            {"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in saved.survey.decisions
         ],
         "chain": chain_text(saved.survey),
     }
@@ -126,8 +123,8 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
 
 def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     figures, direction = saved.survey.figures, facts["direction"]
-    yield _line("strip", f"{facts['strip']}: {facts['points']} points, {facts['packets']} packets")
-    yield _line("surveyed", f"{saved.survey.waveforms} waveforms")
+    yield _line("strip", f"{facts['strip']}: {count(facts['points'], 'point')}, {count(facts['packets'], 'packet')}")
+    yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
     samples = f"{figures['n_samples']:.0f} of {figures['bits']:.0f} bits, {figures['spacing_ns']:g} ns apart"
     yield _line("samples", samples)
     yield _line("ADC range", f"counts {figures['least_count']:.0f} to {figures['largest_count']:.0f}")
@@ -151,13 +148,10 @@ def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("noise", f"{system.noise_std:.3f} DN for thresholds and errors, chosen from")
     for kind, value in system.noise_by_kind.items():
         yield f"  {kind.replace('_', ' '):18}{value:.3f} DN"
-    if system.noise_gain > 0:
-        strong = figures["amplitude_99"]
-        grown = system.noise_gain * strong
-        text = f"variance grows by {system.noise_gain:.4f} DN2 per DN, {grown:.2f} DN2 at {strong:.0f} DN"
-    else:
-        text = "none"
-    yield _line("signal noise", text)
+    strong = figures["amplitude_99"]
+    grown = f"{system.noise_gain * strong:.2f} DN2 at {strong:.0f} DN"
+    text = f"variance grows by {system.noise_gain:.4f} DN2 per DN, {grown}"
+    yield _line("signal noise", text if system.noise_gain > 0 else "none")
 
 
 def _name_model(system: SystemPulse) -> str:
@@ -170,28 +164,27 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     from wavebatch.core.units import FWHM_PER_SIGMA
 
     system, figures = saved.survey.system, saved.survey.figures
-    width = system.sigma_ref * FWHM_PER_SIGMA
-    model = _name_model(system)
-    yield _line("system pulse", f"{model}; s_ref {system.sigma_ref:.4f} ns, full width at half maximum {width:.3f} ns")
+    width = f"s_ref {system.sigma_ref:.4f} ns, full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"
+    yield _line("system pulse", f"{_name_model(system)}; {width}")
     for weight, delay, sigma in system.components:
         yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
     yield _line("pulse models", f"from {figures.get('isolated_echoes', 0):.0f} isolated echoes; misfit per amplitude")
     if "misfit_goal" not in figures:
-        yield "  too few to learn a pulse from: the Gaussian of their width is used"
+        yield "  too few to learn a pulse from: a Gaussian of their width is used"
     else:
         yield from _misfit_lines(saved)
     yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")
     yield _line("ringing", f"{100 * system.ringing:.2f} % of the amplitude at most")
     yield _line("acceptance", f"one more echo must lower chi2 by {system.acceptance:g}")
     if system.misfit:
-        text = "of strong echoes to the pulse of weaker ones; what it explains adds no echo"
+        text = "of the amplitude between strong and weaker echoes; residuals within it add no echo"
         yield _line("misfit", f"{100 * system.misfit:g} % {text}")
 
 
 def _digitizer_lines(saved: SavedSurvey) -> Iterator[str]:
-    for index, own in saved.survey.system.digitizers.items():
-        noise = f"baseline {own.baseline:.3f} DN, noise {own.noise_std:.3f} DN"
-        yield _line(f"digitizer {index}", f"{noise}; {_name_model(own)}; s_ref {own.sigma_ref:.4f} ns")
+    for index, one in saved.survey.system.digitizers.items():
+        noise = f"baseline {one.baseline:.3f} DN, noise {one.noise_std:.3f} DN"
+        yield _line(f"digitizer {index}", f"{noise}; {_name_model(one)}; s_ref {one.sigma_ref:.4f} ns")
 
 
 def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:
@@ -208,7 +201,7 @@ def _misfit_lines(saved: SavedSurvey) -> Iterator[str]:
 
 def _scene_lines(saved: SavedSurvey) -> Iterator[str]:
     system, figures = saved.survey.system, saved.survey.figures
-    clipped = "none seen"
+    clipped = "none found"
     if system.saturation is not None:
         clipped = f"at {system.saturation:.0f} DN, in {100 * figures['saturated_share']:.2f} % of the waveforms"
     yield _line("saturation", clipped)

@@ -1,1 +1,4 @@
-"""What everything else is made of: units, errors, the types that flow through a chain, and the table of columns."""
+"""Shared types and constants: units, errors, waveform blocks, echo tables and the declaration of every column.
+
+All other rooms import from here; core imports nothing from them.
+"""

@@ -1,4 +1,8 @@
-"""Echoes: the table that flows through a chain, and the one declaration of its columns and flags."""
+"""The echo table that flows through a chain, and the one declaration of its columns and flags.
+
+Every stage returns an EchoTable. The cloud writer, the report and the tests of the README read COLUMNS and EchoFlag.
+Names, bits and dtypes are written to files: do not change those that exist, add new ones at the end.
+"""
 
 from __future__ import annotations
 
@@ -12,73 +16,67 @@ from wavebatch.core.errors import StageError
 
 
 class EchoFlag(IntFlag):
-    """What is known to be wrong or special about an echo; the bits of the `echo_flags` column."""
+    """What is known to be wrong or special about an echo: the bits of the `echo_flags` column."""
 
-    NOT_CONVERGED = 1
-    AT_BOUND = 2
-    NEAR_EDGE = 4
-    SATURATED = 8
-    OVERLAPPED = 16
-    WEAK = 32
-    RINGING_SUSPECT = 64
-    NARROW = 128
-    NO_WAVEFORM = 256
-    BROKEN_PACKET = 512
-    NO_ECHO = 1024
-    UNANCHORED = 2048
-    MERGED = 4096
-    ADDED = 8192
-    AMPLITUDE_UNRELIABLE = 16384
-    RETURN_LIMIT = 32768
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str) -> EchoFlag:
+        """A flag with its meaning; combinations of flags have none."""
+        flag = int.__new__(cls, value)
+        flag._value_ = value
+        flag.meaning = meaning
+        return flag
+
+    NOT_CONVERGED = 1, "the fit stopped before it converged; values are the last accepted ones"
+    AT_BOUND = 2, "a fitted parameter lies at the edge of its allowed range"
+    NEAR_EDGE = 4, "the echo is cut by the start or the end of the waveform"
+    SATURATED = 8, "samples under the echo are at the digitizer's limit"
+    OVERLAPPED = 16, "fitted together with at least one neighbouring echo"
+    WEAK = 32, "amplitude below 5 noise standard deviations"
+    RINGING_SUSPECT = 64, "may be ringing or an after-pulse of a stronger echo before it"
+    NARROW = 128, "narrower than the system pulse"
+    NO_WAVEFORM = 256, "point has no waveform (descriptor index 0 or packet size 0); passed through"
+    BROKEN_PACKET = 512, "packet lies outside the file or does not fit its descriptor; point passed through"
+    NO_ECHO = 1024, "waveform holds no echo for this point; point passed through"
+    UNANCHORED = 2048, "no return of the packet matches an echo; position from the raw return location"
+    MERGED = 4096, "two echoes too close to be told apart were merged into this one"
+    ADDED = 8192, "echo that the input does not have as a return"
+    AMPLITUDE_UNRELIABLE = 16384, "so much of the echo is saturated that its amplitude is a guess"
+    RETURN_LIMIT = 32768, "return number exceeds what the point format can hold; written as the largest"
 
 
-FLAG_MEANINGS: dict[EchoFlag, str] = {
-    EchoFlag.NOT_CONVERGED: "the fit stopped before it converged; values are the last accepted ones",
-    EchoFlag.AT_BOUND: "a fitted parameter lies at the edge of its allowed range",
-    EchoFlag.NEAR_EDGE: "the echo is cut by the start or the end of the waveform",
-    EchoFlag.SATURATED: "samples under the echo are at the digitizer's limit",
-    EchoFlag.OVERLAPPED: "fitted together with at least one neighbouring echo",
-    EchoFlag.WEAK: "amplitude below 5 noise standard deviations",
-    EchoFlag.RINGING_SUSPECT: "may be ringing or an after-pulse of a stronger echo before it",
-    EchoFlag.NARROW: "narrower than the system pulse",
-    EchoFlag.NO_WAVEFORM: "point has no waveform (descriptor index 0 or packet size 0); passed through",
-    EchoFlag.BROKEN_PACKET: "packet lies outside the file or does not fit its descriptor; point passed through",
-    EchoFlag.NO_ECHO: "waveform holds no echo for this point; point passed through",
-    EchoFlag.UNANCHORED: "no return of the packet matches an echo; position from the raw return location",
-    EchoFlag.MERGED: "two echoes too close to be told apart were merged into this one",
-    EchoFlag.ADDED: "echo that the input does not have as a return",
-    EchoFlag.AMPLITUDE_UNRELIABLE: "so much of the echo is saturated that its amplitude is a guess",
-    EchoFlag.RETURN_LIMIT: "return number exceeds what the point format can hold; written as the largest",
-}
+FLAG_MEANINGS: dict[EchoFlag, str] = {flag: flag.meaning for flag in EchoFlag}
+"""Meaning of each flag, as the README lists it."""
 
 UNCLEAN = (
     EchoFlag.OVERLAPPED | EchoFlag.MERGED | EchoFlag.SATURATED | EchoFlag.NEAR_EDGE | EchoFlag.NOT_CONVERGED
     | EchoFlag.AT_BOUND
 )  # fmt: skip
-"""Echoes with one of these say little of sensor and surface: their width or amplitude is not that of one echo."""
+"""Flags of echoes whose width or amplitude is not that of one echo. Calibration and the survey leave them out."""
 
 PASSED_THROUGH = EchoFlag.NO_WAVEFORM | EchoFlag.BROKEN_PACKET | EchoFlag.NO_ECHO
-"""Points with one of these are not echoes that somebody found."""
+"""Flags of points that were copied from the input: no echo was found for them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Declaration of one per-echo quantity: it feeds the README table, the LAS extra bytes and the report."""
+    """Declaration of one per-echo quantity, used by the README's table, the LAS extra bytes and the report."""
 
     name: str
+    """Name in files and reports."""
     dtype: str
+    """NumPy type code of the values in files."""
     unit: str
+    """Unit as text; "-" where there is none."""
     meaning: str
+    """One line for the table of columns."""
     no_data: float | None = -9999.0
+    """Value that stands for NaN in files; None where every value is valid."""
     extra_bytes: bool = True
-    """False for quantities that are LAS fields of their own (x, y, z) or never leave the program."""
+    """False for quantities that are LAS fields already (x, y, z) or that are not written to files."""
 
 
-def _columns(*columns: Column) -> dict[str, Column]:
-    return {column.name: column for column in columns}
-
-
-COLUMNS: dict[str, Column] = _columns(
+_COLUMNS = (
     Column("amplitude", "f4", "DN", "peak of the echo above the baseline"),
     Column("echo_time", "f4", "ns", "centre of the echo after the first sample of its packet"),
     Column("echo_width", "f4", "ns", "full width at half maximum"),
@@ -113,8 +111,11 @@ COLUMNS: dict[str, Column] = _columns(
     Column("ray_z", "f4", "-", "upward component of the unit vector away from the sensor", extra_bytes=False),
 )
 
+COLUMNS: dict[str, Column] = {column.name: column for column in _COLUMNS}
+"""Every column by its name."""
+
 RAY = ("ray_x", "ray_y", "ray_z")
-"""Columns of a stage with a second pass: the direction in which each echo was seen."""
+"""Columns that a stage with a second pass needs: the direction in which each echo was seen."""
 
 
 _FIELDS: dict[str, type] = {
@@ -128,31 +129,39 @@ _FIELDS: dict[str, type] = {
     "residual": np.float32,
     "flags": np.uint16,
 }
+"""Core columns and their dtypes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EchoTable:
-    """m echoes sorted by waveform, then time: found, fitted or true. Errors that nobody computed are NaN."""
+    """m echoes sorted by waveform, then time: found, fitted or simulated.
+
+    Errors that no stage computed are NaN. Tables are not changed in place: methods return new ones.
+    """
 
     waveform: np.ndarray
-    """Row of the block, i4 (m,)."""
+    """Row of the block, int32 (m,)."""
     time: np.ndarray
-    """Centre of the echo after sample 0 [ns], f8 (m,)."""
+    """Centre of the echo after sample 0, float64 (m,), ns."""
     amplitude: np.ndarray
-    """Peak above the baseline [count], f4 (m,)."""
+    """Peak above the baseline, float32 (m,), count."""
     sigma: np.ndarray
-    """Gaussian standard deviation [ns], f4 (m,)."""
+    """Gaussian standard deviation, float32 (m,), ns."""
     time_err: np.ndarray
+    """One standard deviation of time, float32 (m,), ns."""
     amplitude_err: np.ndarray
+    """One standard deviation of amplitude, float32 (m,), count."""
     sigma_err: np.ndarray
+    """One standard deviation of sigma, float32 (m,), ns."""
     residual: np.ndarray
-    """Root mean square of the fit's residuals in the echo's cluster [noise std], f4 (m,)."""
+    """Root mean square of the fit's residuals in the echo's cluster, float32 (m,), in noise standard deviations."""
     flags: np.ndarray
-    """EchoFlag bits, u2 (m,)."""
+    """EchoFlag bits, uint16 (m,)."""
     attributes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Optional columns by name (see COLUMNS), each (m,)."""
+    """Optional columns by name (see COLUMNS), arrays (m,)."""
 
     def __len__(self) -> int:
+        """Number of echoes."""
         return len(self.waveform)
 
     @classmethod
@@ -163,31 +172,40 @@ class EchoTable:
         amplitude: np.ndarray,
         sigma: np.ndarray,
         *,
-        time_err: np.ndarray | None = None,
-        amplitude_err: np.ndarray | None = None,
-        sigma_err: np.ndarray | None = None,
-        residual: np.ndarray | None = None,
-        flags: np.ndarray | None = None,
         attributes: Mapping[str, np.ndarray] | None = None,
+        **others: np.ndarray,
     ) -> EchoTable:
-        """A table with the right dtypes, sorted by waveform, then time; what is not given is NaN, or no flag."""
-        m = len(waveform)
-        nan = np.full(m, np.nan, np.float32)
+        """A table from columns in any order of rows and any numeric dtype.
+
+        Parameters
+        ----------
+        waveform : int (m,)
+            Row of the block.
+        time, amplitude, sigma : float (m,), ns, count, ns
+            Centre, peak and Gaussian standard deviation of each echo.
+        attributes : mapping of arrays (m,), optional
+            Further columns by name.
+        **others : arrays (m,)
+            Other core columns: time_err, amplitude_err, sigma_err, residual (NaN if not given), flags (0 if not given).
+
+        Returns
+        -------
+        EchoTable
+            With the dtypes of the core columns, sorted by waveform, then time.
+
+        Raises
+        ------
+        TypeError
+            A name in `others` is not a core column.
+        """
+        nan = np.full(len(waveform), np.nan, np.float32)
         given = {
-            "waveform": waveform,
-            "time": time,
-            "amplitude": amplitude,
-            "sigma": sigma,
-            "time_err": nan if time_err is None else time_err,
-            "amplitude_err": nan if amplitude_err is None else amplitude_err,
-            "sigma_err": nan if sigma_err is None else sigma_err,
-            "residual": nan if residual is None else residual,
-            "flags": np.zeros(m, np.uint16) if flags is None else flags,
+            **dict.fromkeys(("time_err", "amplitude_err", "sigma_err", "residual"), nan),
+            "flags": np.zeros(len(waveform), np.uint16),
+            **{"waveform": waveform, "time": time, "amplitude": amplitude, "sigma": sigma, **others},
         }
-        table = cls(
-            **{name: np.ascontiguousarray(given[name], dtype=dtype) for name, dtype in _FIELDS.items()},
-            attributes=dict(attributes or {}),
-        )
+        core = {name: np.ascontiguousarray(values, dtype=_FIELDS.get(name)) for name, values in given.items()}
+        table = cls(**core, attributes=dict(attributes or {}))
         step = np.diff(table.waveform)
         if np.any(step < 0) or np.any((step == 0) & (np.diff(table.time) < 0)):
             table = table.take(np.lexsort((table.time, table.waveform)))
@@ -196,8 +214,7 @@ class EchoTable:
     @classmethod
     def empty(cls) -> EchoTable:
         """A table without echoes."""
-        none = np.empty(0)
-        return cls.build(none, none, none, none)
+        return cls.build(*np.empty((4, 0)))
 
     def take(self, rows: np.ndarray) -> EchoTable:
         """The echoes at `rows` (indices or mask), in that order."""
@@ -205,31 +222,65 @@ class EchoTable:
         return EchoTable(**core, attributes={name: values[rows] for name, values in self.attributes.items()})
 
     def with_attributes(self, **columns: np.ndarray) -> EchoTable:
-        """A new table with `columns` added or replaced."""
+        """A new table with `columns`, arrays (m,), added or replaced.
+
+        Raises
+        ------
+        StageError
+            A column does not have one value per echo.
+        """
         for name, values in columns.items():
             if len(values) != len(self):
                 raise StageError(f"column {name} has {len(values)} values for {len(self)} echoes")
         return replace(self, attributes={**self.attributes, **columns})
 
     def with_flags(self, flag: EchoFlag, where: np.ndarray) -> EchoTable:
-        """A new table in which `flag` is set too for the echoes `where` is true."""
-        flags = self.flags | np.where(where, np.uint16(flag), np.uint16(0))
-        return replace(self, flags=flags.astype(np.uint16))
+        """A new table in which `flag` is also set for the echoes where `where`, bool (m,), is true."""
+        return replace(self, flags=self.flags | np.where(where, np.uint16(flag), np.uint16(0)))
 
     def count(self, n: int) -> np.ndarray:
-        """Echoes per waveform of a block of n, i8 (n,)."""
+        """Number of echoes in each of the n waveforms of a block, int64 (n,)."""
         return np.bincount(self.waveform, minlength=n)
 
-    @staticmethod
-    def concatenate(tables: Iterable[tuple[EchoTable, int]]) -> EchoTable:
-        """Tables one behind the other; each comes with what is added to its waveform rows."""
-        tables = [(table, shift) for table, shift in tables]
-        if not tables:
-            return EchoTable.empty()
-        names = list(tables[0][0].attributes)
-        if any(set(table.attributes) != set(names) for table, _ in tables):
+    def to_numpy(self) -> np.ndarray:
+        """The table as one structured array (m,): a field per core column, then one per attribute, with their dtypes.
+
+        Examples
+        --------
+        >>> rows = echoes.to_numpy()
+        >>> rows["amplitude"][rows["flags"] == 0].mean()
+        """
+        columns = {**{name: getattr(self, name) for name in _FIELDS}, **self.attributes}
+        rows = np.empty(len(self), [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
+        for name, values in columns.items():
+            rows[name] = values
+        return rows
+
+    @classmethod
+    def concatenate(cls, tables: Iterable[EchoTable | tuple[EchoTable, int]]) -> EchoTable:
+        """One table of all echoes of several tables, in the order given.
+
+        Parameters
+        ----------
+        tables : iterable of EchoTable or (EchoTable, int)
+            Tables with the same attributes; the number, 0 if not given, is added to the waveform rows of its table.
+
+        Returns
+        -------
+        EchoTable
+            Not sorted again: give the tables in the order of their waveforms, or `build` the result.
+
+        Raises
+        ------
+        StageError
+            The tables have different attributes.
+        """
+        pairs = [(table, 0) if isinstance(table, EchoTable) else table for table in tables]
+        if not pairs:
+            return cls.empty()
+        names = list(pairs[0][0].attributes)
+        if any(set(table.attributes) != set(names) for table, _ in pairs):
             raise StageError("tables with different columns cannot be joined")
-        core = {name: np.concatenate([getattr(table, name) for table, _ in tables]) for name in _FIELDS}
-        core["waveform"] = np.concatenate([table.waveform + np.int32(shift) for table, shift in tables])
-        attributes = {name: np.concatenate([table.attributes[name] for table, _ in tables]) for name in names}
-        return EchoTable(**core, attributes=attributes)
+        core = {name: np.concatenate([getattr(table, name) for table, _ in pairs]) for name in _FIELDS}
+        core["waveform"] = np.concatenate([table.waveform + np.int32(shift) for table, shift in pairs])
+        return cls(**core, attributes={name: np.concatenate([t.attributes[name] for t, _ in pairs]) for name in names})

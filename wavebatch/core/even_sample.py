@@ -1,4 +1,8 @@
-"""An even sample of rows that come in pieces: enough for medians and percentiles, whatever the number of rows."""
+"""An evenly spaced sample of rows that arrive in pieces: enough for medians and percentiles of any number of rows.
+
+Used by statistics that run over whole strips. The sample must not depend on the size of the pieces, because results
+must be the same for any block size and any number of jobs.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,16 @@ import numpy as np
 
 
 class EvenSample:
-    """All rows up to a limit, then every second, fourth ... of them; the same for any size of the pieces.
+    """Keeps all rows up to a limit, then every second, every fourth ... row.
 
-    limit: most rows that are kept; None: LIMIT.
+    Parameters
+    ----------
+    limit : int, optional
+        Largest number of rows that are kept; LIMIT if not given.
     """
 
     LIMIT = 1_000_000
+    """Keeps percentiles right to about 0.1 % in some 10 MB per column."""
 
     def __init__(self, limit: int | None = None) -> None:
         self.limit = limit or self.LIMIT
@@ -22,7 +30,7 @@ class EvenSample:
         self._kept = 0
 
     def add(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Takes in rows: columns (k, ...) of the same names every time."""
+        """Adds rows: columns are arrays (k, ...) by name, with the same names every time."""
         start, number = -self.seen % self.step, _length(columns)
         self.seen += number
         # Copies, because slices would keep the whole records alive.
@@ -34,7 +42,7 @@ class EvenSample:
             self.step *= 2
 
     def read(self) -> dict[str, np.ndarray]:
-        """The sample's columns, rows in order; empty where nothing was taken in."""
+        """The columns of the sample, rows in order of arrival; empty when no rows were added."""
         if len(self._parts) > 1:
             names = self._parts[0]
             self._parts = [{name: np.concatenate([part[name] for part in self._parts]) for name in names}]

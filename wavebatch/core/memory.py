@@ -1,4 +1,7 @@
-"""Memory that NumPy frees stays with the process: kernels allocate the same few megabytes thousands of times."""
+"""Keeps freed NumPy memory inside the process, because kernels allocate the same few megabytes thousands of times.
+
+Called once at the start of each worker process. It changes speed only, never results.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,19 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of glibc's mallopt(3)."""
 
 KEEP = 128 << 20
-"""Bytes of freed memory that a process may keep."""
+"""Freed memory that a process may keep [bytes]: the arrays of one block need less."""
 
 
 def keep_freed_memory() -> bool:
-    """Asks glibc not to hand freed arrays back to the kernel; True where that was possible.
+    """Asks glibc to keep freed arrays instead of returning them to the operating system.
 
-    By default every array above some 100 kB is returned when freed and faulted in again page by page when the next
-    one is made, which costs more than the arithmetic on it. Does nothing on other C libraries.
+    By default every array above about 100 kB is returned when freed and mapped page by page when the next one is made,
+    which costs more than the arithmetic on it.
+
+    Returns
+    -------
+    bool
+        True where it worked; False on other C libraries, where nothing changes.
     """
     if not sys.platform.startswith("linux"):
         return False

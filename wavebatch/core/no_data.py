@@ -1,7 +1,7 @@
-"""Why an echo has no value in a column: one code per echo, beside the column, so that reports can say how many and why.
+"""Why an echo has no value in a column: one code per echo and column, so that reports can count the reasons.
 
-The codes of column `c` are the attribute `c_reason`, u1; they never leave the program. What is unknown is NaN in arrays
-and null in JSON.
+Stages write the codes of column `c` as attribute `c_reason` (uint8); the report counts them; clouds do not hold them.
+Unknown values are NaN in arrays and null in JSON. The order of the codes is the order in which reasons are tried.
 """
 
 from __future__ import annotations
@@ -13,69 +13,82 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.units import LEAST_PULSE_WIDTH
+
 
 class NoData(IntEnum):
-    """Why an echo has no value; the first of them that holds, in this order."""
+    """Why an echo has no value: the first reason that applies, in this order."""
 
-    KNOWN = 0
-    NO_SENSOR = 1
-    NOT_CALIBRATED = 2
-    NO_DIVERGENCE = 3
-    SHORT_PULSE = 4
-    SHARED_PULSE = 5
-    OVERLAPPED = 6
-    SATURATED = 7
-    CUT = 8
-    UNSETTLED = 9
-    NO_ANGLE = 10
-    TOO_STEEP = 11
-    UNCERTAIN = 12
-    OTHER = 13
-    NO_RAY = 14
-    FEW_NEIGHBOURS = 15
-    NO_PLANE = 16
+    meaning: str
+    remedy: str
 
+    def __new__(cls, value: int, meaning: str, remedy: str) -> NoData:
+        """A code with its meaning, and what the user can do about it."""
+        code = int.__new__(cls, value)
+        code._value_, code.meaning, code.remedy = value, meaning, remedy
+        return code
 
-REASONS: dict[NoData, tuple[str, str]] = {
-    NoData.NO_SENSOR: (
-        "nobody knows where the sensor was",
-        "give --trajectory, or --flight-height",
-    ),
-    NoData.NOT_CALIBRATED: (
+    KNOWN = 0, "", ""
+    NO_SENSOR = 1, "the position of the sensor is not known", "give --trajectory, or --flight-height"
+    NOT_CALIBRATED = (
+        2,
         "the strip is not calibrated",
         "give --calibration (of `wavebatch calibrate`), or ask for relative_backscatter instead",
-    ),
-    NoData.NO_DIVERGENCE: (
+    )
+    NO_DIVERGENCE = (
+        3,
         "the beam's divergence is not known",
         "put divergence_mrad of the data sheet into SYSTEM.toml or CAL.toml",
-    ),
-    NoData.SHORT_PULSE: (
-        "the system pulse is shorter than 0.85 samples, so that widths depend on where the samples lie",
-        "nothing mends that; leave the stage out",
-    ),
-    NoData.SHARED_PULSE: ("shares its pulse with other echoes, and so the light", "sum the echoes of a pulse instead"),
-    NoData.OVERLAPPED: ("overlaps another echo, or was merged with one", "its width is not that of one surface"),
-    NoData.SATURATED: ("saturated", "fly higher, or with less power"),
-    NoData.CUT: ("cut by the start or the end of its waveform", "record longer waveforms"),
-    NoData.UNSETTLED: ("its fit did not converge, or ended at a bound", "try a slower decompose stage"),
-    NoData.NO_ANGLE: ("its incidence angle is not known", "see why incidence_angle is not, or set surface"),
-    NoData.TOO_STEEP: ("struck at more than 80 degrees, or widened by more than a slope", "nothing mends that"),
-    NoData.UNCERTAIN: (
+    )
+    SHORT_PULSE = (
+        4,
+        f"the system pulse is shorter than {LEAST_PULSE_WIDTH} samples: widths depend on where the samples lie",
+        "there is no remedy; leave the stage out",
+    )
+    SHARED_PULSE = 5, "shares the light of its pulse with other echoes", "sum the echoes of a pulse instead"
+    OVERLAPPED = (
+        6,
+        "overlaps another echo, or was merged with one",
+        "there is no remedy; its width is not that of one surface",
+    )
+    SATURATED = 7, "saturated", "fly higher, or with less power"
+    CUT = 8, "cut by the start or the end of its waveform", "record longer waveforms"
+    UNSETTLED = 9, "its fit did not converge, or ended at a bound", "try a slower decompose stage"
+    NO_ANGLE = 10, "its incidence angle is not known", "see why incidence_angle is not, or set surface"
+    TOO_STEEP = 11, "incidence angle above 80 degrees, or broader than any slope explains", "there is no remedy"
+    UNCERTAIN = (
+        12,
         "more uncertain than max_error",
         "raise max_error, or take angles from the points around (stage attribute.incidence_angle_normals)",
-    ),
-    NoData.OTHER: ("its fit gave no usable value", "see its flags"),
-    NoData.NO_RAY: ("its packet has no direction, or it is no point of the cloud", "write --points echoes"),
-    NoData.FEW_NEIGHBOURS: ("fewer points around it than min_points", "raise radius"),
-    NoData.NO_PLANE: ("the points around it are no plane that it lies in", "lower radius; plants have none"),
-}
-"""Per reason what it means, and what can be done about it."""
+    )
+    OTHER = 13, "its fit gave no usable value", "see its flags"
+    NO_RAY = 14, "its packet has no direction, or it is not a point of the cloud", "write --points echoes"
+    FEW_NEIGHBOURS = 15, "fewer points around it than min_points", "raise radius"
+    NO_PLANE = 16, "the points around it do not form a plane that it lies in", "lower radius; plants have no plane"
+
+
+REASONS: dict[NoData, tuple[str, str]] = {code: (code.meaning, code.remedy) for code in NoData if code.meaning}
+"""Meaning of each reason, and what the user can do about it."""
 
 SUFFIX = "_reason"
+"""Ending of the names of attributes that hold codes."""
 
 
 def explain(values: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]) -> np.ndarray:
-    """Code of the first case that holds for each value that is not finite, KNOWN for the others, u1 (m,)."""
+    """The reason code of each value of a column.
+
+    Parameters
+    ----------
+    values : float (n,)
+        The column; finite values are KNOWN.
+    *cases : (NoData, bool or bool (n,))
+        Reasons in order, with where they apply. The first one that applies counts; OTHER where none does.
+
+    Returns
+    -------
+    uint8 (n,)
+        Codes of NoData.
+    """
     codes = np.zeros(len(values), np.uint8)
     rows = np.flatnonzero(~np.isfinite(values))
     if not len(rows):
@@ -89,7 +102,7 @@ def explain(values: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]) -> np.
 
 
 def without_nan(value: Any) -> Any:
-    """The same numbers, lists and dictionaries for JSON: None for what is no finite number, names as text."""
+    """Numbers, lists and dictionaries made ready for JSON: None for NaN and infinity, dictionary keys as text."""
     if isinstance(value, Mapping):
         return {str(key): without_nan(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
@@ -100,7 +113,18 @@ def without_nan(value: Any) -> Any:
 
 
 def count_reasons(attributes: Mapping[str, np.ndarray]) -> dict[str, dict[str, int]]:
-    """Echoes per column that has reasons, and per reason that occurs, KNOWN among them."""
+    """Number of echoes per reason, for each column of a table that has reasons.
+
+    Parameters
+    ----------
+    attributes : mapping of arrays (m,)
+        Attributes of an EchoTable.
+
+    Returns
+    -------
+    dict of dict of int
+        By column, then by the name of the code; codes that do not occur are left out, KNOWN is counted too.
+    """
     counts = {}
     for name, codes in attributes.items():
         if name.endswith(SUFFIX):

@@ -1,4 +1,4 @@
-"""The nearest known word, for messages about an unknown one."""
+"""The nearest known word, for error messages about an unknown one; used wherever users type names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`did you mean 'x'?` where something alike is known, else the list of what is."""
+    """`did you mean 'x'?` where a known word is similar, otherwise the list of known words."""
     known = list(known)
     near = difflib.get_close_matches(word, known, 1)
     if near:

@@ -1,4 +1,8 @@
-"""Where the sensor was at any time: positions over time, interpolated where they are dense enough, NaN elsewhere."""
+"""Where the sensor was at any time: positions over time, interpolated where they are dense, NaN elsewhere.
+
+Made by the reader of trajectory files and by the survey from packet vectors; used for ranges. LAS files and
+trajectories use different GPS clocks: `solve_offset` finds the difference.
+"""
 
 from __future__ import annotations
 
@@ -9,38 +13,52 @@ import numpy as np
 from wavebatch.core.errors import InputError
 
 WEEK = 604_800.0
-"""Seconds of a GPS week."""
+"""Length of a GPS week [s]."""
 
 ADJUSTED = 1e9
-"""What LAS takes off standard GPS time [s]."""
+"""Adjusted standard GPS time is standard GPS time minus this [s] (LAS 1.4, global encoding bit 0)."""
 
 LONGEST_GAP = 1.0
-"""Time between two positions that is always bridged [s]."""
+"""Gaps between two positions up to this are always bridged [s]."""
 
 GAP_STEPS = 5.0
-"""Usual steps between positions that are bridged too."""
+"""Gaps up to this many usual steps are bridged too."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """Positions of the sensor over time; picklable."""
+    """Positions of the sensor over time. It can be pickled, so that worker processes can use it."""
 
     time: np.ndarray
-    """Ascending, as in the strip [s], f8 (k,)."""
+    """Ascending times on the clock of the strip, float64 (k,), s."""
     xyz: np.ndarray
-    """f8 (k, 3) [m]."""
+    """Positions, float64 (k, 3), m."""
     velocity: np.ndarray
-    """f8 (k, 3) [m/s]."""
+    """Velocities, float64 (k, 3), m/s."""
     gap: float
-    """Steps longer than this are not bridged [s]."""
+    """Longest step between positions that is bridged [s]."""
 
     @classmethod
     def build(
         cls, time: np.ndarray, xyz: np.ndarray, velocity: np.ndarray | None = None, gap: float | None = None
     ) -> Trajectory:
-        """A trajectory from positions in any order; velocities by differences where they are not given.
+        """A trajectory from positions in any order; rows with NaN and repeated times are dropped.
 
-        Raises InputError where there are fewer than two different times with positions.
+        Parameters
+        ----------
+        time : float (n,), s
+            Times of the positions.
+        xyz : float (n, 3), m
+            Positions.
+        velocity : float (n, 3), m/s, optional
+            Velocities; from differences of the positions if not given.
+        gap : float, s, optional
+            Longest step that is bridged; LONGEST_GAP or GAP_STEPS usual steps, whichever is longer, if not given.
+
+        Raises
+        ------
+        InputError
+            There are fewer than two different times with positions.
         """
         time, xyz = np.asarray(time, np.float64), np.asarray(xyz, np.float64)
         good = np.flatnonzero(np.isfinite(time) & np.isfinite(xyz).all(axis=1))
@@ -59,7 +77,19 @@ class Trajectory:
         return replace(self, time=self.time + seconds)
 
     def between(self, start: float, stop: float, step: float = 0.04) -> Trajectory:
-        """The part within [start, stop] and one position beyond either end, no denser than about `step` [s]."""
+        """The part that covers [start, stop], thinned.
+
+        Parameters
+        ----------
+        start, stop : float, s
+            One position beyond each end is kept.
+        step : float, s
+            Wanted time between positions.
+
+        Returns
+        -------
+        Trajectory
+        """
         first = max(int(np.searchsorted(self.time, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.time, stop)) + 1, len(self.time))
         first = max(min(first, last - 2), 0)
@@ -78,13 +108,12 @@ class Trajectory:
         known = (u >= 0) & (u <= 1) & (step <= self.gap)
         u = np.where(known, u, np.nan)
         a, b = u * u * (3 - 2 * u), u * (1 - u)
-        rise = (b * (1 - u) * step, -b * u * step)
-        parts = (1 - a, self.xyz[early]), (a, self.xyz[late]), (rise[0], self.velocity[early]), (
-            rise[1], self.velocity[late])  # fmt: skip
-        return sum(weight[:, None] * values for weight, values in parts)
+        weights = (1 - a, a, b * (1 - u) * step, -b * u * step)
+        values = (self.xyz[early], self.xyz[late], self.velocity[early], self.velocity[late])
+        return sum(weight[:, None] * value for weight, value in zip(weights, values, strict=True))
 
     def gaps(self, start: float, stop: float) -> list[tuple[float, float]]:
-        """Stretches of [start, stop] without a position, as (from, to) [s]."""
+        """Parts of [start, stop] without a position, as (from, to) [s]."""
         wide = np.flatnonzero(np.diff(self.time) > self.gap)
         empty = [(-np.inf, float(self.time[0])), *zip(self.time[wide], self.time[wide + 1], strict=True)]
         empty.append((float(self.time[-1]), np.inf))
@@ -92,7 +121,7 @@ class Trajectory:
         return [(float(a), float(b)) for a, b in cut if b > a]
 
     def share_known(self, start: float, stop: float) -> float:
-        """Share of [start, stop] that has positions."""
+        """Share of [start, stop] that has positions, 0 to 1."""
         length = max(stop - start, 1e-9)
         return 1.0 - sum(b - a for a, b in self.gaps(start, stop)) / length
 
@@ -111,18 +140,34 @@ def _differentiate(time: np.ndarray, xyz: np.ndarray, broken: np.ndarray) -> np.
 
 
 def solve_offset(known: Trajectory, start: float, stop: float) -> tuple[float, str]:
-    """Seconds to add to the trajectory's times so that it covers the strip's [start, stop], and which clocks they are.
+    """Seconds to add to the trajectory's times so that it covers the strip, and which clocks the two use.
 
-    Standard GPS time, the same less 1e9 (adjusted), and seconds of the week are told apart by what overlaps.
-    Raises InputError where nothing does.
+    Tries standard GPS time, adjusted standard GPS time (1e9 s less) and seconds of the week; takes what covers most.
+
+    Parameters
+    ----------
+    known : Trajectory
+        Positions with the times of their file.
+    start, stop : float, s
+        First and last time of the strip.
+
+    Returns
+    -------
+    (float, str)
+        The offset [s], and a few words for the report.
+
+    Raises
+    ------
+    InputError
+        No pair of clocks makes them overlap.
     """
     middle, half = 0.5 * (start + stop), 0.5 * (float(known.time[-1]) + float(known.time[0]))
     candidates = [(0.0, "the same clock")]
     candidates += [(-ADJUSTED, "standard to adjusted GPS time"), (ADJUSTED, "adjusted to standard GPS time")]
     if -WEEK < known.time[0] < 2 * WEEK:
         for shift, clock in ((0.0, "standard"), (-ADJUSTED, "adjusted")):
-            said = f"seconds of the week to {clock} GPS time"
-            candidates += [(offset, said) for offset in _whole_weeks(shift, middle - half)]
+            clocks = f"seconds of the week to {clock} GPS time"
+            candidates += [(offset, clocks) for offset in _whole_weeks(shift, middle - half)]
     if 0 <= start <= WEEK < known.time[0]:
         for shift in (0.0, ADJUSTED):
             candidates += [(offset, "GPS time to seconds of the week") for offset in _whole_weeks(shift, middle - half)]
@@ -140,15 +185,27 @@ def solve_offset(known: Trajectory, start: float, stop: float) -> tuple[float, s
 
 
 def _whole_weeks(shift: float, wanted: float) -> list[float]:
-    """Offsets near the wanted one that are `shift` and a whole number of weeks."""
+    """Offsets near `wanted` that are `shift` plus a whole number of weeks."""
     week = np.rint((wanted - shift) / WEEK)
     return [float(shift + (week + k) * WEEK) for k in (-1, 0, 1)]
 
 
 def apply_lever_arm(xyz: np.ndarray, attitude: np.ndarray, arm: tuple[float, float, float]) -> np.ndarray:
-    """Positions of the scanner (n, 3) from those of the trajectory.
+    """Positions of the scanner from positions of the trajectory.
 
-    attitude: roll, pitch, heading [rad] (n, 3), heading clockwise from north; arm: forward, right, down [m].
+    Parameters
+    ----------
+    xyz : float64 (n, 3), m
+        Positions of the trajectory: east, north, up.
+    attitude : float64 (n, 3), rad
+        Roll, pitch, heading; heading clockwise from north.
+    arm : three floats, m
+        From the trajectory's point to the scanner: forward, right, down.
+
+    Returns
+    -------
+    float64 (n, 3), m
+        Positions of the scanner.
     """
     roll, pitch, heading = attitude.T
     forward, right, down = arm

@@ -1,4 +1,4 @@
-"""Physical constants and the few conversions between units that more than one module needs."""
+"""Physical constants, statistical constants and conversions that several rooms use; nothing here may be tuned."""
 
 import math
 
@@ -9,15 +9,33 @@ HALF_C = C / 2
 """One-way distance per two-way travel time [m/ns]."""
 
 PS_PER_NS = 1000.0
+"""LAS waveform packets count time in picoseconds; everything else here is in nanoseconds."""
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian, in standard deviations (2.354820)."""
 
 SQRT_PI = math.sqrt(math.pi)
+"""Integral of a Gaussian squared, in amplitude squared times sigma."""
 SQRT_2PI = math.sqrt(2.0 * math.pi)
+"""Integral of a Gaussian, in amplitude times sigma."""
 
 QUANTISATION_STD = 1.0 / math.sqrt(12.0)
 """Standard deviation of rounding to whole counts (0.2887): no noise estimate may be lower."""
 
+SQUARED_NORMAL_MEDIAN = 0.455
+"""Median of the square of a standard normal number."""
+
+LEAST_PULSE_WIDTH = 0.85
+"""Width of the system pulse [samples] below which fitted widths depend on where samples lie.
+
+Source: docs/algorithms.md 1.4.
+"""
+
+AIR_ATTENUATION = 0.22
+"""Attenuation of the air, one way [dB/km].
+
+The default that others use; no source for it was found (docs/algorithms.md 5, 9).
+"""
+
 MAD_TO_STD = 1.4826
-"""Median absolute deviation of a normal distribution to its standard deviation."""
+"""Median absolute deviation of a normal distribution times this is its standard deviation."""

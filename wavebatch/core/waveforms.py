@@ -1,4 +1,8 @@
-"""What a chain works on, as frozen dataclasses of arrays: waveforms with their returns and noise, the system pulse."""
+"""What a chain works on, as frozen dataclasses of arrays: waveforms with their returns, their noise, the system pulse.
+
+Readers and the simulator make blocks, the survey makes the SystemPulse, stages read both. Arrays may be views of files:
+never write into them. The meaning, dtype and unit of a field stand below it, and only there.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +12,29 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from wavebatch.core.errors import StageError
-from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.units import AIR_ATTENUATION, HALF_C, QUANTISATION_STD
 
 
 @dataclass(frozen=True, slots=True)
 class Digitizer:
-    """How samples were made: one LAS wave packet descriptor in nanoseconds and volts."""
+    """How samples were made: one LAS wave packet descriptor, in nanoseconds and volts."""
 
     index: int
+    """Index of the descriptor in the file, 1 to 255."""
     bits: int
+    """Bits per sample."""
     n_samples: int
+    """Samples per waveform."""
     spacing: float
     """Time between two samples [ns]."""
     gain: float = 1.0
-    """Volts per count."""
+    """Volts per count [V]."""
     offset: float = 0.0
-    """Volts at count zero."""
+    """Volts at count zero [V]."""
 
     @property
     def width(self) -> int:
-        """Bytes of a sample that is stored in whole ones."""
+        """Bytes of the smallest integer that holds a sample."""
         return 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
 
     @property
@@ -38,46 +45,49 @@ class Digitizer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReturnTable:
-    """The input's returns that share the packets of a block, sorted by waveform, then point."""
+    """The k returns of the input that refer to the packets of a block, sorted by waveform, then point."""
 
     waveform: np.ndarray
-    """Row of the block that holds the packet, i4 (k,)."""
+    """Row of the block that holds the packet, int32 (k,)."""
     time: np.ndarray
-    """Return location after sample 0 [ns], f8 (k,)."""
+    """Return location after sample 0, float64 (k,), ns."""
     point: np.ndarray
-    """Index of the point in its file, i8 (k,)."""
+    """Index of the point in its file, int64 (k,)."""
     xyz: np.ndarray
-    """Coordinates of the return [m], f8 (k, 3)."""
+    """Coordinates of the return, float64 (k, 3), m."""
 
     def __len__(self) -> int:
+        """Number of returns."""
         return len(self.waveform)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaveformBlock:
-    """n waveforms of one digitizer and one length, with where they lie in space."""
+    """n waveforms of one digitizer with s samples each, and where they lie in space."""
 
     digitizer: Digitizer
+    """How the samples were made."""
     samples: np.ndarray
-    """Raw counts, u1/u2/u4 (n, s), read-only."""
+    """Raw counts, uint8, uint16 or uint32 (n, s), read-only."""
     first: int
-    """Address of the block: the point that owns its first waveform."""
+    """Address of the block: index in the file of the point that its first waveform belongs to."""
     point: np.ndarray
-    """Index in the file of the first point that refers to the packet, i8 (n,)."""
+    """Index in the file of the first point that refers to the packet, int64 (n,)."""
     gps_time: np.ndarray
-    """f8 (n,) [s]."""
+    """Time of the pulse, float64 (n,), s."""
     origin: np.ndarray
-    """Position of sample 0 from the raw return location, f8 (n, 3) [m]."""
+    """Position of sample 0 from the raw return location, float64 (n, 3), m."""
     direction: np.ndarray
-    """Away from the sensor, as long as the light's one-way path per two-way ns, f8 (n, 3) [m/ns]."""
+    """Away from the sensor, float64 (n, 3), m/ns: its length is the one-way distance per two-way travel time."""
     returns: ReturnTable | None = None
-    """The input's returns in these packets; None for waveforms that never had any."""
+    """Returns of the input in these packets; None for simulated waveforms without returns."""
     sensor: np.ndarray | None = None
-    """Position of the sensor at each pulse, f8 (n, 3) [m]; None where nobody knows it."""
+    """Position of the sensor at each pulse, float64 (n, 3), m; None where it is not known."""
     scanner: np.ndarray | None = None
-    """Scanner channel of each pulse, u1 (n,); None where points have none: all are 0."""
+    """Scanner channel of each pulse, uint8 (n,); None where the points have no such field: all are channel 0."""
 
     def __len__(self) -> int:
+        """Number of waveforms."""
         return len(self.samples)
 
     @property
@@ -87,14 +97,31 @@ class WaveformBlock:
 
     @classmethod
     def from_samples(
-        cls,
-        samples: np.ndarray,
-        *,
-        spacing: float = 1.0,
-        bits: int | None = None,
-        first: int = 0,
+        cls, samples: np.ndarray, *, spacing: float = 1.0, bits: int | None = None, first: int = 0
     ) -> WaveformBlock:
-        """A block without geometry from raw counts (n, s): for simulation, tests and use from Python."""
+        """A block without geometry, for simulation, tests and use from Python.
+
+        Parameters
+        ----------
+        samples : uint8, uint16 or uint32 (n, s), count
+            Raw counts.
+        spacing : float, ns
+            Time between two samples.
+        bits : int, optional
+            Bits of the digitizer; those of the dtype if not given.
+        first : int
+            Address of the block.
+
+        Returns
+        -------
+        WaveformBlock
+            At the origin of the coordinates, looking straight down.
+
+        Raises
+        ------
+        StageError
+            The samples are not unsigned integers, or not two-dimensional.
+        """
         samples = np.ascontiguousarray(samples)
         if samples.ndim != 2 or samples.dtype.kind != "u":
             raise StageError(f"samples must be unsigned integers (n, s), got {samples.dtype} {samples.shape}")
@@ -108,11 +135,11 @@ class WaveformBlock:
             point=np.arange(first, first + n, dtype=np.int64),
             gps_time=np.zeros(n),
             origin=np.zeros((n, 3)),
-            direction=np.tile([0.0, 0.0, -0.149896229], (n, 1)),
+            direction=np.tile([0.0, 0.0, -HALF_C], (n, 1)),
         )
 
     def rows(self, rows: np.ndarray | slice) -> WaveformBlock:
-        """The block restricted to `rows`; returns are kept with their waveforms."""
+        """The block restricted to the waveforms at `rows` (indices, mask or slice), with the returns of these."""
         index = np.arange(len(self))[rows]
         returns = self.returns
         if returns is not None:
@@ -124,36 +151,31 @@ class WaveformBlock:
             returns = ReturnTable(at[keep], returns.time[keep], returns.point[keep], returns.xyz[keep])
         samples = self.samples[index]
         samples.flags.writeable = False
-        return replace(
-            self,
-            samples=samples,
-            first=int(self.point[index[0]]) if len(index) else self.first,
-            point=self.point[index],
-            gps_time=self.gps_time[index],
-            origin=self.origin[index],
-            direction=self.direction[index],
-            returns=returns,
-            sensor=None if self.sensor is None else self.sensor[index],
-            scanner=None if self.scanner is None else self.scanner[index],
-        )
+        given = {
+            name: getattr(self, name) for name in ("point", "gps_time", "origin", "direction", "sensor", "scanner")
+        }
+        parts = {name: values if values is None else values[index] for name, values in given.items()}
+        first = int(self.point[index[0]]) if len(index) else self.first
+        return replace(self, samples=samples, first=first, returns=returns, **parts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Level without signal, and its spread, per waveform [count]."""
+    """Level without signal, and its spread, for each of n waveforms."""
 
     baseline: np.ndarray
-    """f4 (n,)."""
+    """Level without signal, float32 (n,), count."""
     std: np.ndarray
-    """f4 (n,): standard deviation of one recorded sample, never below QUANTISATION_STD."""
+    """Standard deviation of one recorded sample, float32 (n,), count; never below QUANTISATION_STD."""
 
     def __len__(self) -> int:
+        """Number of waveforms."""
         return len(self.baseline)
 
 
 @dataclass(frozen=True, slots=True)
 class SystemPulse:
-    """What the strip's survey says of sensor and scene; the same for every block of one digitizer."""
+    """What the survey found out about sensor and scene of a strip: the same for every block of one digitizer."""
 
     sigma_ref: float
     """Gaussian standard deviation of the echo of a flat target [ns]."""
@@ -164,59 +186,72 @@ class SystemPulse:
     noise_std: float = QUANTISATION_STD
     """Noise of one sample that thresholds and errors use [count]."""
     noise_by_kind: Mapping[str, float] = field(default_factory=dict)
-    """The estimates noise_std was chosen from: quiet, smoothed, tail, core ... [count]."""
+    """The estimates that noise_std was chosen from: quiet, smoothed, tail, core ... [count]."""
     noise_gain: float = 0.0
-    """Signal-dependent variance per count of signal (H12) [count]."""
+    """Signal-dependent noise variance per count of signal [count] (docs/algorithms.md H12)."""
     kappa: float = 0.0
-    """Skew of the system pulse (0 = Gaussian)."""
+    """Skew of the system pulse; 0 for a Gaussian."""
     components: tuple[tuple[float, float, float], ...] = ()
-    """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when not learned."""
+    """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
     saturation: float | None = None
-    """Count at which the survey saw samples clipped; None: only the digitizer's largest count is."""
+    """Count from which samples are clipped, as the survey saw; None if only the digitizer's largest count is."""
     acceptance: float = 15.0
-    """Least fall of chi2 for which an echo is added."""
+    """Smallest fall of chi2 for which an echo is added."""
     misfit: float = 0.0
-    """How far strong echoes deviate from the pulse, as a share of them: falls of chi2 that this explains add none."""
+    """How far strong echoes deviate from the pulse, as a share of their amplitude. A fall of chi2 that this explains
+    does not add an echo.
+    """
     level_variance: float = 0.0
-    """Of level ground's echoes seen from above, less the system pulse's [ns2]; not positive: surveys see slopes too."""
+    """Variance of echoes of level ground seen from above, minus that of the system pulse [ns2]: zero or negative,
+    because the echoes that the pulse was learned from come from slopes too.
+    """
     width_scatter: float = 0.0
-    """Scatter of echo widths of one and the same surface beyond what fits say [ns]: no model of a pulse is right."""
+    """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
     divergence: float | None = None
-    """Full angle of the beam between the 1/e^2 points [mrad]; None where nobody knows it."""
+    """Full angle of the beam between the 1/e^2 points [mrad]; None where it is not known."""
     calibration: float | None = None
-    """C' of kernels/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
+    """Constant C' of kernels/physics/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
     calibration_err: float = 0.0
-    """Standard deviation of the calibration, relative."""
+    """Relative standard deviation of the calibration."""
     channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
-    """The same two of channels that have a calibration of their own, by index of the digitizer and scanner channel."""
-    attenuation: float = 0.22
-    """Of the light on its way through the air, one way [dB/km]."""
+    """Calibration and its relative error of single channels, by (index of the digitizer, scanner channel)."""
+    attenuation: float = AIR_ATTENUATION
+    """Attenuation of the light in the air, one way [dB/km]."""
     sensor_error: float = 0.0
     """Standard deviation of the distance to the sensor's position [m]."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)
-    """Pulse and noise of digitizers that record otherwise than the strip's commonest one, by their index."""
+    """Pulse and noise of digitizers that record differently from the commonest one of the strip, by their index."""
 
     def __post_init__(self) -> None:
+        """Checks the one value that everything divides by."""
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
 
     def of(self, block: WaveformBlock) -> SystemPulse:
-        """The system of the block's digitizer: its own pulse and noise, with what is known of the strip as a whole."""
-        own = self.digitizers.get(block.digitizer.index)
-        if own is None:
+        """The system of the block's digitizer: its pulse and noise, and what is known of the whole strip."""
+        other = self.digitizers.get(block.digitizer.index)
+        if other is None:
             return self
         whole = ("divergence", "calibration", "calibration_err", "channels", "attenuation", "sensor_error")
-        return replace(own, **{name: getattr(self, name) for name in whole})
+        return replace(other, **{name: getattr(self, name) for name in whole})
 
     def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:
-        """Calibration of each waveform's channel, NaN where it has none, and its relative error, f8 (n,)."""
+        """Calibration of each waveform's channel.
+
+        Returns
+        -------
+        constant : float64 (n,), 1/(m2 count ns)
+            NaN where the channel is not calibrated.
+        error : float64 (n,)
+            Relative standard deviation.
+        """
         n = len(block)
         constant = np.full(n, np.nan if self.calibration is None else self.calibration)
         error = np.full(n, self.calibration_err)
-        for (digitizer, scanner), (own, own_err) in self.channels.items():
+        for (digitizer, scanner), (value, value_err) in self.channels.items():
             if digitizer == block.digitizer.index:
                 same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
-                constant[same], error[same] = own, own_err
+                constant[same], error[same] = value, value_err
         return constant, error

@@ -141,7 +141,7 @@ def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.
         import pyproj
     except ImportError as error:
         raise InputError(
-            f"{path}: the trajectory is in degrees: pip install 'wavebatch[crs]' (pyproj), or give x, y, z in the "
+            f"{path}: the trajectory is in degrees: pip install 'wavebatch[gis]' (pyproj), or give x, y, z in the "
             "strip's CRS"
         ) from error
     try:

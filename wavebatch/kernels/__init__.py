@@ -1,1 +1,5 @@
-"""Array kernels: arrays in, arrays out; times in samples, waveforms along the last axis."""
+"""Kernels: the arithmetic, as functions from arrays to arrays.
+
+Stages and tools call them. A kernel knows no files, blocks, options or logging, and the result for one waveform must
+not depend, bit for bit, on the other waveforms of its block.
+"""

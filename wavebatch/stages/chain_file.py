@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-import tomllib
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -12,9 +9,16 @@ from typing import Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.stages.chain import STAGES, Chain, Parameter, Stage, Step
-
-_TYPE_WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", type(None): "nothing"}
+from wavebatch.files.toml_file import (
+    TomlTable,
+    check_range,
+    check_type,
+    format_toml,
+    format_value,
+    parse_toml,
+    read_toml_text,
+)
+from wavebatch.stages.chain import STAGES, Chain, Stage, Step
 
 
 def list_profiles() -> list[str]:
@@ -31,28 +35,14 @@ def load_profile(name: str) -> Chain:
 
 def load_chain(path: Path | str) -> Chain:
     """The chain of a TOML file; raises ConfigError that names file, table, key and the nearest known word."""
-    try:
-        text = Path(path).read_text("utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: chain file cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: chain file is not UTF-8 text (byte {error.start})") from error
-    return parse_chain(text, str(path))
+    return parse_chain(read_toml_text(path, "chain file"), str(path))
 
 
 def parse_chain(text: str, name: str) -> Chain:
     """The chain that TOML text describes; `name` stands in front of every error message."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: not valid TOML: {error}") from error
-    for key in document:
-        if key != "chain":
-            raise ConfigError(f"{name}: unknown table or key {key!r}; {nearest(key, ['chain'])}")
-    tables = document.get("chain", [])
-    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        raise ConfigError(f"{name}: chain must be written as [[chain]] tables, one per stage")
-    steps = tuple(_read_step(table, f"{name}: [[chain]] {number}") for number, table in enumerate(tables, 1))
+    document = parse_toml(text, name)
+    document.check_keys(["chain"])
+    steps = tuple(map(_read_step, document.tables("chain")))
     return Chain(steps, name)
 
 
@@ -63,55 +53,30 @@ def effective(chain: Chain) -> str:
 
 def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
     """One [[chain]] table as TOML text; parameters that are None are left out."""
-    lines = ["[[chain]]", f'stage = "{stage}"']
-    lines += [f"{name} = {_format_value(value)}" for name, value in parameters.items() if value is not None]
-    return "\n".join(lines) + "\n"
+    return format_toml({"chain": [{"stage": stage, **parameters}]}).lstrip()
 
 
 def _shipped() -> Any:
     return resources.files("wavebatch") / "stages" / "profiles"
 
 
-def _format_value(value: Any) -> str:
-    if isinstance(value, bool | str):
-        return json.dumps(value)
-    return repr(value)
-
-
-def _read_step(table: Mapping[str, Any], where: str) -> Step:
-    if "stage" not in table:
-        raise ConfigError(f'{where}: key stage is missing; name one, for example stage = "detect.maximum"')
-    name = table["stage"]
-    if not isinstance(name, str):
-        raise ConfigError(f"{where}: stage must be a string, it is {name!r}")
+def _read_step(table: TomlTable) -> Step:
+    table.check_keys(table.values, ["stage"], 'name one, for example stage = "detect.maximum"')
+    name = table.get("stage", str)
     if name not in STAGES:
-        raise ConfigError(f"{where}: unknown stage {name!r}; {nearest(name, STAGES)}")
-    where = f"{where} ({name})"
-    values = {key: value for key, value in table.items() if key != "stage"}
-    return Step(STAGES[name], {key: _read_value(STAGES[name], key, value, where) for key, value in values.items()})
+        raise ConfigError(f"{table.where}: unknown stage {name!r}; {nearest(name, STAGES)}")
+    stage, where = STAGES[name], f"{table.where} ({name})"
+    TomlTable(table.values, where).check_keys(["stage", *stage.parameters])
+    keys = (key for key in table.values if key != "stage")
+    return Step(stage, {key: _read_value(stage, key, table.values[key], f"{where}: {key}") for key in keys})
 
 
 def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
-    parameter = stage.parameters.get(key)
-    if parameter is None:
-        raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, ['stage', *stage.parameters])}")
-    value = _check_type(parameter, value, f"{where}: {key}")
+    parameter = stage.parameters[key]
+    value = check_type(value, parameter.types, where)
     if parameter.choices is not None and value not in parameter.choices:
-        choices = ", ".join(_format_value(choice) for choice in parameter.choices)
-        raise ConfigError(f"{where}: {key} must be one of {choices}, it is {_format_value(value)}")
-    if parameter.range is not None and not parameter.range[0] <= value <= parameter.range[1]:
-        low, high = parameter.range
-        raise ConfigError(f"{where}: {key} must lie between {low:g} and {high:g}, it is {value!r}")
-    return value
-
-
-def _check_type(parameter: Parameter, value: Any, where: str) -> Any:
-    """The value in the parameter's type: integers are taken for numbers, nothing else is converted."""
-    if float in parameter.types and isinstance(value, int) and not isinstance(value, bool):
-        value = value if int in parameter.types else float(value)
-    elif type(value) not in parameter.types:
-        words = " or ".join(_TYPE_WORDS.get(kind, kind.__name__) for kind in parameter.types)
-        raise ConfigError(f"{where} must be {words}, it is {value!r}")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where} must be a finite number, it is {value!r}")
+        choices = ", ".join(map(format_value, parameter.choices))
+        raise ConfigError(f"{where} must be one of {choices}, it is {format_value(value)}")
+    if parameter.range is not None:
+        check_range(value, *parameter.range, where)
     return value

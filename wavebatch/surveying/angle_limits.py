@@ -1,4 +1,8 @@
-"""Whether echo widths of a sensor can tell angles of surfaces at all: the error to expect, and a sentence on it."""
+"""Whether the echo widths of a sensor can measure slopes at all: the error to expect, with the numbers it comes from.
+
+`wavebatch survey --divergence` asks before a run, the report of a run asks afterwards.
+Before you change it: stage attribute.incidence_angle must use the same limits, or predictions and columns disagree.
+"""
 
 from __future__ import annotations
 
@@ -7,35 +11,34 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
-from wavebatch.stages.attribute.width_angle import LEAST_WIDTH
 from wavebatch.stages.chain import Chain
-from wavebatch.surveying import Decision, Survey
-from wavebatch.surveying.auto_chain import ANGLE
+from wavebatch.surveying import Decision, Part, Survey
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.flat_ground import measure_level
-from wavebatch.surveying.sensor import SensorRequest, find_sensor
+from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 SLOPE = 30.0
-"""Angle at which the error is predicted [deg]: where widths tell most (ALGORITHMS 1.4)."""
+"""Slope at which the error is predicted [deg]: widths are most sensitive there (docs/algorithms.md 1.4)."""
 
 REFERENCE_ERROR = 0.003
-"""Of the system pulse's width, relative, as stage incidence_angle takes it."""
+"""Error of the system pulse's width, relative: the default of stage attribute.incidence_angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class AngleOutlook:
-    """What angles from widths are worth on a strip."""
+    """How good angles from widths will be on a strip."""
 
     error: float
-    """Standard deviation of the angle of a plane at SLOPE [deg]; inf where nothing is learned from a width."""
+    """Standard deviation of the angle of a plane at SLOPE [deg]; inf where widths say nothing about it."""
     max_error: float
-    """Largest one that is written [deg]."""
+    """Largest error of an angle that is written [deg]."""
     reason: str
-    """All of it in numbers."""
+    """The numbers as a sentence."""
 
     @property
     def possible(self) -> bool:
@@ -44,7 +47,7 @@ class AngleOutlook:
 
 
 def angle_parameters(chain: Chain) -> dict[str, Any] | None:
-    """Parameters with which a chain takes angles from widths; None where it takes none."""
+    """Return the parameters of a chain's last stage attribute.incidence_angle; None where it has none."""
     steps = [step for step in chain.steps if step.stage.name == "attribute.incidence_angle"]
     return steps[-1].effective() if steps else None
 
@@ -52,14 +55,35 @@ def angle_parameters(chain: Chain) -> dict[str, Any] | None:
 def predict_angles(
     system: SystemPulse, spacing: float, distance: float, divergence: float, amplitude: float, max_error: float = 10.0
 ) -> AngleOutlook:
-    """The outlook for echoes of a typical amplitude [count] from `distance` [m] under a beam of `divergence` [mrad].
+    """Predict the error of angles from widths for echoes of a typical amplitude.
 
-    spacing: between samples [ns]; max_error [deg]. Errors are those of the Cramer-Rao bound, in the system's noise.
+    Parameters
+    ----------
+    system : SystemPulse
+    spacing : float
+        Between samples [ns].
+    distance : float
+        Sensor to ground [m].
+    divergence : float
+        Full angle of the beam between the 1/e^2 points [mrad].
+    amplitude : float
+        Of a typical echo [count].
+    max_error : float
+        Largest error of an angle that is written [deg].
+
+    Returns
+    -------
+    AngleOutlook
+
+    Notes
+    -----
+    Width errors are the Cramer-Rao bound with the system's noise (docs/algorithms.md 2.1); the angle is that of 1.4.
     """
     width = system.sigma_ref / spacing
     own = float(np.sqrt(max(system.sigma_ref**2 + system.level_variance, 1e-12)))
-    if width < LEAST_WIDTH:
-        reason = f"the system pulse is {width:.2f} samples wide, {LEAST_WIDTH} are needed for widths to mean a slope"
+    if width < LEAST_PULSE_WIDTH:
+        needed = f"{LEAST_PULSE_WIDTH} are needed for widths to mean a slope"
+        reason = f"the system pulse is {width:.2f} samples wide, {needed}"
         return AngleOutlook(np.inf, max_error, reason)
     added = float(spread_of_angle(np.radians(SLOPE), distance, 1e-3 * divergence))
     sigma = float(np.hypot(own, added))
@@ -71,33 +95,67 @@ def predict_angles(
     least = np.sqrt(2.0 * np.hypot(own * width_err, own * own * REFERENCE_ERROR))
     facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))
     reason = (
-        f"from {distance:.0f} m a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse of "
-        f"{own:.3g} ns to {sigma:.4g} ns, which echoes of {amplitude:.0f} DN over a noise of {system.noise_std:.3g} DN "
-        f"tell to {width_err:.2g} ns: that is an angle to {error:.1f} degrees ({facing:.1f} where it "
-        f"faces the sensor), and max_error is {max_error:g}"
+        f"at {distance:.0f} m, a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse from "
+        f"{own:.3g} ns to {sigma:.4g} ns; echoes of {amplitude:.0f} DN with a noise of {system.noise_std:.3g} DN "
+        f"give this width to {width_err:.2g} ns, so the angle to {error:.1f} degrees ({facing:.1f} where the surface "
+        f"faces the sensor); max_error is {max_error:g}"
     )
     return AngleOutlook(error, max_error, reason)
 
 
-def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float) -> Survey:
-    """The survey with a beam of `divergence` [mrad], the variance of level ground, and a decision about angles.
+def sample_level(
+    reader: StripReader, scan: StripScan, source: SensorSource, system: SystemPulse, spacing: float
+) -> SystemPulse:
+    """Measure the widths of level ground on a sample of a strip; see `flat_ground.measure_level`.
 
-    Raises InputError for strips that are not in metres.
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    source : SensorSource
+        Positions of the sensor.
+    system : SystemPulse
+        With the beam's divergence.
+    spacing : float
+        Of the samples that are used [ns].
+
+    Returns
+    -------
+    SystemPulse
+        With the variance and the scatter of level ground.
+    """
+    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
+    return measure_level(blocks, system, spacing)
+
+
+def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float) -> Survey:
+    """Add the beam's divergence, the variance of level ground, and a decision about angles to a survey.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    survey : Survey
+    divergence : float
+        Full angle of the beam between the 1/e^2 points [mrad].
+
+    Returns
+    -------
+    Survey
+
+    Raises
+    ------
+    InputError
+        Where the coordinates are not in metres.
     """
     system = replace(survey.system, divergence=divergence)
     source = find_sensor(reader, scan, SensorRequest())
-    distance = source.describe().get("distance_m")
-    if distance is None:
-        reason = "nobody knows where the sensor was: give --trajectory to `wavebatch run`"
-        return _decide(replace(survey, system=system), needed=False, reason=reason)
-    spacing = survey.figures["spacing_ns"]
-    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
-    system = measure_level(blocks, system, spacing)
-    outlook = predict_angles(system, spacing, distance, divergence, survey.figures["amplitude_50"])
-    return _decide(replace(survey, system=system), needed=outlook.possible, reason=outlook.reason)
-
-
-def _decide(survey: Survey, *, needed: bool, reason: str) -> Survey:
-    """The survey with this decision about angles in place of its own."""
-    others = tuple(decision for decision in survey.decisions if decision.part != ANGLE)
-    return replace(survey, decisions=(*others, Decision(ANGLE, needed, reason)))
+    if source.distance is None:
+        outlook = AngleOutlook(np.inf, 0.0, "the sensor's position is unknown: give --trajectory to `wavebatch run`")
+    else:
+        spacing = survey.figures["spacing_ns"]
+        system = sample_level(reader, scan, source, system, spacing)
+        outlook = predict_angles(system, spacing, source.distance, divergence, survey.figures["amplitude_50"])
+    others = (decision for decision in survey.decisions if decision.part != Part.ANGLE)
+    decisions = (*others, Decision(Part.ANGLE, outlook.possible, outlook.reason))
+    return replace(survey, system=system, decisions=decisions)

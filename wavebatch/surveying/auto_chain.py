@@ -1,65 +1,66 @@
-"""The cheapest chain that serves a surveyed strip: what its scene does not need is left out, with the reason."""
+"""The automatic chain: the cheapest one that serves a surveyed strip, with a comment on each part that is left out.
+
+`choose_chain` calls it for `wavebatch run`, `wavebatch survey --chain` writes its text.
+Before you change it: a part may be left out only where nothing is lost against the accurate profile.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import format_step, parse_chain
-from wavebatch.surveying import Decision, Survey
+from wavebatch.surveying import Decision, Part, Survey
 
 LOST = 0.005
-"""Share of the waveforms with echoes that may hold overlapping ones for fits not to grow.
+"""Largest share of overlapping echoes, among the waveforms with echoes, at which growth is turned off.
 
-Without growth about half of the echoes in such waveforms are not found: a quarter of a percent of all at most.
+Without growth about half of the echoes in such waveforms are lost: 0.25 % of all echoes at most.
 """
-
-GROWTH, PRIOR, WIDTH, ANGLE = "growth of fits", "width prior", "echo width", "incidence angle"
-"""Parts of a chain that decisions of a survey are about and that this module treats on their own."""
 
 _NAME = "profile auto"
 
 
 def choose_chain(survey: Survey) -> Chain:
-    """The cheapest chain that loses nothing on the surveyed strip (ALGORITHMS 4.4)."""
+    """Return the cheapest chain that loses nothing on the surveyed strip (docs/algorithms.md 4.4)."""
     return parse_chain(chain_text(survey), _NAME)
 
 
 def decide(survey: Survey) -> tuple[Decision, ...]:
-    """What the chosen chain has and what it leaves out, each with the reason.
+    """Decide which parts the automatic chain keeps.
 
-    As the survey decided, but for two parts. Fits stop growing only where overlapping echoes are so rare, and the
-    sample so large, that next to nothing can be lost. The width prior stays: it acts on overlapping echoes only, so
-    that it costs nothing elsewhere, and the few pairs of an open scene are wrong without it.
+    Parameters
+    ----------
+    survey : Survey
+
+    Returns
+    -------
+    tuple of Decision
+        The survey's decisions, except two. Growth is turned off only where overlapping echoes are so rare, and the
+        sample so large, that next to nothing can be lost. The width prior always stays: it acts on overlapping echoes
+        only, so it costs nothing elsewhere, and the few pairs of an open scene are wrong without it.
     """
     needed = {decision.part: decision for decision in survey.decisions}
-    grows = _decide_growth(survey)
-    needed[GROWTH] = grows
-    if PRIOR in needed:
+    needed[Part.GROWTH] = _decide_growth(survey)
+    if Part.PRIOR in needed:
         reason = "acts on overlapping echoes only and costs nothing where there are none"
-        needed[PRIOR] = Decision(PRIOR, True, reason)
-    # Without divergence and range there is no angle, so that needing it makes no chain have it.
-    return tuple(decision for decision in needed.values() if decision.part != ANGLE or not decision.needed)
-
-
-def left_out(survey: Survey) -> tuple[Decision, ...]:
-    """The decisions of `decide` that leave something out."""
-    return tuple(decision for decision in decide(survey) if not decision.needed)
+        needed[Part.PRIOR] = Decision(Part.PRIOR, True, reason)
+    # Angles need divergence and range, which come from other files: a survey alone cannot add them to a chain.
+    return tuple(decision for decision in needed.values() if decision.part != Part.ANGLE or not decision.needed)
 
 
 def _decide_growth(survey: Survey) -> Decision:
-    told = {decision.part: decision for decision in survey.decisions}.get(GROWTH)
     share, filled = _overlapped(survey)
-    if told is None or not filled:
-        return Decision(GROWTH, True, "the survey does not say how many echoes overlap")
+    if not filled or all(decision.part != Part.GROWTH for decision in survey.decisions):
+        return Decision(Part.GROWTH, True, "the survey does not say how many echoes overlap")
     number = share * filled
-    # Two standard deviations of a count above it, and no less than a few: small samples prove little.
+    # Upper limit of the share: two standard deviations of the count above it, and at least four waveforms more,
+    # because a small sample without overlaps proves little.
     most = (number + 2 + 2 * math.sqrt(number + 1)) / filled
     found = f"of the {filled:.0f} waveforms with echoes {100 * share:.2f} % hold overlapping ones"
     limit = f"at most {100 * most:.2f} % by this sample, the limit is {100 * LOST:g} %"
-    return Decision(GROWTH, most >= LOST, f"{found}; {limit}")
+    return Decision(Part.GROWTH, most >= LOST, f"{found}; {limit}")
 
 
 def _overlapped(survey: Survey) -> tuple[float, float]:
@@ -72,22 +73,21 @@ def _overlapped(survey: Survey) -> tuple[float, float]:
 
 
 def chain_text(survey: Survey) -> str:
-    """The chosen chain as TOML; every part that is left out stands where it would be, as a comment with its reason."""
+    """Return the automatic chain as TOML; each part left out stands at its place as a comment with the reason."""
     decisions = {decision.part: decision for decision in decide(survey)}
-    width = decisions.get(WIDTH, Decision(WIDTH, True, ""))
-    decompose: dict[str, Any] = {} if decisions[GROWTH].needed else {"max_echoes": 1}
+    width = decisions.get(Part.WIDTH, Decision(Part.WIDTH, True, ""))
     lines = [
         f"# Chosen by a survey of {survey.waveforms} waveforms: what the strip does not need is left out. Pulse, noise",
         "# and clipping are not in here: they come with the survey (`--system`), and so do the parts they need.",
         "",
         format_step("noise.pooled", {}),
         format_step("detect.maximum", {}),
-        *(_comment(part) for part in decisions.values() if part.part not in (WIDTH, ANGLE)),
-        format_step("decompose.adaptive", decompose),
+        *(_comment(decision) for part, decision in decisions.items() if part not in (Part.WIDTH, Part.ANGLE)),
+        format_step("decompose.adaptive", {} if decisions[Part.GROWTH].needed else {"max_echoes": 1}),
         format_step("attribute.amplitude", {}),
     ]
     lines += [format_step("attribute.echo_width", {})] if width.needed else [_comment(width), ""]
-    lines += [_comment(decisions[ANGLE]), ""] if ANGLE in decisions else []
+    lines += [_comment(decisions[Part.ANGLE]), ""] if Part.ANGLE in decisions else []
     return "\n".join([*lines, format_step("attribute.position", {})])
 
 
@@ -97,11 +97,22 @@ def _comment(decision: Decision) -> str:
 
 
 def without_columns(columns: tuple[str, ...], widest: Chain, chain: Chain) -> tuple[str, ...]:
-    """The columns that `chain` computes, of those that were chosen for the widest one."""
+    """Drop the columns that the widest chain computes and the chosen one does not.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        Chosen for the widest chain.
+    widest, chain : Chain
+
+    Returns
+    -------
+    tuple of str
+    """
     lost = set(widest.makes) - set(chain.makes)
     return tuple(name for name in columns if name not in lost)
 
 
 def widest_chain() -> Chain:
-    """The chain with everything that `choose_chain` may leave out: what columns can be asked for."""
+    """Return the automatic chain with all parts: its columns are those that a user can ask for."""
     return choose_chain(Survey(SystemPulse(sigma_ref=1.0), 0, {}, ()))

@@ -1,19 +1,21 @@
-"""CAL.toml: the calibration constant of a sensor, where it comes from, and the stages that it and the sensor allow."""
+"""The calibration of a sensor: its constant, the file CAL.toml, and the stages that it adds to a chain.
+
+`targets` measures a calibration, `wavebatch calibrate` writes it, `wavebatch run` reads it for each strip.
+Before you change it: files of earlier versions must stay readable.
+"""
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml, read_toml_text
 from wavebatch.stages.chain import STAGES, Chain, Step
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -21,78 +23,122 @@ CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
 """Columns that need the sensor's position."""
 
-_NUMBERS = {
-    "constant": (1e-30, 1e30, None, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"),
-    "relative_error": (0.0, 10.0, None, "standard deviation of the constant, relative"),
-    "attenuation_db_km": (0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
-    "divergence_mrad": (1e-3, 100.0, math.nan, "full angle of the beam between the 1/e^2 points; needed for m2"),
-}
-_SECTION = (0.0, 1e30, math.nan, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission")
-_MORE_NUMBERS = {
-    "section_constant": _SECTION,
-    "digitizer": (1, 255, None, "index of the wave packet descriptor"),
-    "scanner": (0, 3, 0, "scanner channel of the points"),
-    "spread": (0.0, 1e6, 0.0, "of the echoes' constants, relative, robust standard deviation"),
-    "echoes": (0, 1e12, 0, "that it comes from"),
-}
-_CHANNEL = ("digitizer", "scanner", "constant", "relative_error", "spread", "echoes")
-_TEXTS = ("schema", "version", "strip", "date", "conditions")
-_TABLES = ("fingerprint", "target", "channel")
+_NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
+    "constant": (
+        "constant", 1e-30, 1e30, REQUIRED, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"
+    ),
+    "relative_error": ("relative_error", 0.0, 10.0, REQUIRED, "standard deviation of the constant, relative"),
+    "attenuation_db_km": ("attenuation", 0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
+    "divergence_mrad": (
+        "divergence", 1e-3, 100.0, None, "full angle of the beam between the 1/e^2 points; needed for m2"
+    ),
+    "section_constant": (
+        "section_constant", 0.0, 1e30, None, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
+    ),
+}  # fmt: skip
+"""Numbers of the file by key: field of Calibration, least and largest value, default, meaning."""
+
+_HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
+_TEXTS = ("strip", "date", "conditions")
+
+
+@dataclass(frozen=True, slots=True)
+class TargetResult:
+    """What one reference target gave; the last three are None where it has too few echoes."""
+
+    name: str
+    reflectance: float
+    echoes: int
+    """Clean single echoes on the target."""
+    constant: float | None = None
+    """Median of the echoes' constants [1/(m2 count ns)]."""
+    spread: float | None = None
+    """Robust standard deviation of the echoes' constants, relative."""
+    incidence_deg: float | None = None
+    """Median angle between ray and normal [deg]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelConstant:
+    """The calibration of one channel: a digitizer together with a scanner channel."""
+
+    digitizer: int
+    """Index of the wave packet descriptor."""
+    scanner: int
+    """Scanner channel of the points."""
+    constant: float
+    relative_error: float
+    spread: float = 0.0
+    """Robust standard deviation of the echoes' constants, relative."""
+    echoes: int = 0
+    """Echoes that the constant was measured from."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What turns amplitudes into backscatter; picklable."""
+    """Constants that turn amplitudes into backscatter; picklable."""
 
     constant: float
+    """C' [1/(m2 count ns)]."""
     relative_error: float
+    """Standard deviation of the constant, relative."""
     attenuation: float = 0.22
-    """[dB/km]."""
+    """Of the air, one way [dB/km]."""
     divergence: float | None = None
-    """[mrad]; None where nobody gave it."""
+    """Full angle of the beam between the 1/e^2 points [mrad]; None where unknown."""
     strip: str = ""
     date: str = ""
     conditions: str = ""
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
-    targets: tuple[Mapping[str, Any], ...] = ()
-    """What each reference target gave: name, reflectance, echoes, constant, spread."""
-    channels: tuple[Mapping[str, Any], ...] = ()
-    """Channels with a constant of their own: digitizer, scanner, constant, relative_error, spread, echoes."""
+    """Of the strip that was measured."""
+    targets: tuple[TargetResult, ...] = ()
+    channels: tuple[ChannelConstant, ...] = ()
+    """Channels that have a constant of their own."""
 
     @property
     def section_constant(self) -> float | None:
-        """C_cal [1/(m2 count ns)]; None where nobody gave the divergence."""
+        """C_cal [1/(m2 count ns)]; None where the divergence is unknown."""
         return None if self.divergence is None else 0.25 * math.pi * (1e-3 * self.divergence) ** 2 * self.constant
 
     def apply(self, system: SystemPulse) -> SystemPulse:
-        """The system with this calibration; a divergence of its own stays."""
+        """Return the system pulse with this calibration; a divergence that the system has already stays."""
         return replace(
             system,
             calibration=self.constant,
             calibration_err=self.relative_error,
-            channels={
-                (row["digitizer"], row["scanner"]): (row["constant"], row["relative_error"]) for row in self.channels
-            },
+            channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
 
     def describe(self) -> dict[str, Any]:
-        """For reports."""
+        """Return the calibration as plain values for reports."""
         return {
-            "constant": self.constant,
-            "relative_error": self.relative_error,
-            "attenuation_db_km": self.attenuation,
-            "divergence_mrad": self.divergence,
-            "section_constant": self.section_constant,
+            **{key: getattr(self, name) for key, (name, *_) in _NUMBERS.items()},
             "strip": self.strip,
             "date": self.date,
-            "channels": [dict(row) for row in self.channels],
+            "channels": [asdict(row) for row in self.channels],
         }
 
 
 def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:
-    """The chain with the stages that what is known allows, behind those it has; as it is where it has them."""
+    """Add the physical stages that the given inputs allow to the end of a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+    sensor : bool
+        Whether the user gave a trajectory or a flight height.
+    calibrated : bool
+        Whether there is a calibration.
+    divergence : bool
+        Whether the beam's divergence is known.
+
+    Returns
+    -------
+    Chain
+        The same object where the chain has these stages already.
+    """
     names = ["attribute.range"] if sensor or calibrated or divergence else []
     names += ["attribute.incidence_angle"] if divergence else []
     names += ["attribute.backscatter_coefficient"] if calibrated else []
@@ -104,101 +150,83 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
 
 
 def needs_sensor(chain: Chain) -> bool:
-    """Whether a chain computes anything that needs the sensor's position."""
+    """Return whether a chain computes a column that needs the sensor's position."""
     return any(name in NEEDS_SENSOR for name in chain.makes)
 
 
 def format_calibration(found: Calibration) -> str:
-    """TOML text; `parse_calibration` gives the same calibration again."""
-    lines = ["# A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."]
-    texts = (CALIBRATION_SCHEMA, __version__, found.strip, found.date, found.conditions)
-    lines += [f"{key} = {json.dumps(value)}" for key, value in zip(_TEXTS, texts, strict=True)]
-    values = (found.constant, found.relative_error, found.attenuation, found.divergence, found.section_constant)
-    numbers = {**_NUMBERS, "section_constant": _SECTION}
-    for (key, (*_, meaning)), value in zip(numbers.items(), values, strict=True):
-        if value is not None:
-            lines.append(f"{key} = {float(value)!r}  # {meaning}")
-    for word, tables in (("channel", found.channels), ("target", found.targets)):
-        for table in tables:
-            lines += ["", f"[[{word}]]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
-    plain = {key: value for key, value in found.fingerprint.items() if not isinstance(value, Mapping)}
-    if plain:
-        lines += ["", "[fingerprint]", *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
-    return "\n".join(lines) + "\n"
+    """Return the TOML text of a calibration; `parse_calibration` gives the same constants again."""
+    numbers = {key: getattr(found, name) for key, (name, *_) in _NUMBERS.items()}
+    document = {
+        "schema": CALIBRATION_SCHEMA,
+        "version": __version__,
+        **{key: getattr(found, key) for key in _TEXTS},
+        **{key: None if value is None else float(value) for key, value in numbers.items()},
+        "channel": [asdict(row) for row in found.channels] or None,
+        "target": [asdict(row) for row in found.targets] or None,
+        "fingerprint": {key: item for key, item in found.fingerprint.items() if not isinstance(item, Mapping)} or None,
+    }
+    return format_toml(document, heading=_HEADING, comments={key: row[-1] for key, row in _NUMBERS.items()})
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """The calibration of a file; ConfigError in one line that names file and key."""
-    try:
-        text = Path(path).read_text("utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: calibration file cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: calibration file is not UTF-8 text (byte {error.start})") from error
-    return parse_calibration(text, str(path))
+    """Read a calibration file; raises ConfigError, in one line, where it cannot be read or is wrong."""
+    return parse_calibration(read_toml_text(path, "calibration file"), str(path))
 
 
 def parse_calibration(text: str, name: str) -> Calibration:
-    """The calibration that TOML text describes; `name` stands in front of every error message."""
-    try:
-        document = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{name}: not valid TOML: {error}") from error
-    keys = (*_TEXTS, *_NUMBERS, "section_constant", *_TABLES)
-    for key in document:
-        if key not in keys:
-            raise ConfigError(f"{name}: unknown key {key!r}; {nearest(key, keys)}")
-    if document.get("schema") != CALIBRATION_SCHEMA:
-        raise ConfigError(f"{name}: schema is {document.get('schema')!r}, this version reads {CALIBRATION_SCHEMA!r}")
-    constant, error, attenuation, divergence = (_read_number(document, key, name) for key in _NUMBERS)
-    texts = {key: str(document.get(key, "")) for key in ("strip", "date", "conditions")}
-    divergence = None if math.isnan(divergence) else divergence
-    channels = _read_channels(document.get("channel", []), name)
-    found = Calibration(constant, error, attenuation, divergence, **texts, channels=channels)
-    if "section_constant" in document:
-        _check_section(_read_number(document, "section_constant", name), found, name)
+    """Read the TOML text of a calibration.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        Start of every message, usually the path.
+
+    Returns
+    -------
+    Calibration
+        Without `targets` and `fingerprint`, which nothing uses after the measurement.
+
+    Raises
+    ------
+    ConfigError
+        When a key is unknown, missing or out of its range, or where section_constant does not fit the others.
+    """
+    table = parse_toml(text, name)
+    table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, "channel", "target", "fingerprint"))
+    table.check_schema(CALIBRATION_SCHEMA)
+    values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
+    section = values.pop("section_constant")
+    texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
+    channels: dict[tuple[int, int], ChannelConstant] = {}
+    for row in table.tables("channel"):
+        channel = _read_channel(row)
+        key = (channel.digitizer, channel.scanner)
+        if key in channels:
+            raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} is there already")
+        channels[key] = channel
+    found = Calibration(**values, **texts, channels=tuple(channels.values()))
+    if section is not None:
+        _check_section(section, found, name)
     return found
 
 
-def _check_section(said: float, found: Calibration, name: str) -> None:
-    """Raises ConfigError where C_cal is not that of the constant and the divergence: one was changed, not the other."""
+def _check_section(section: float, found: Calibration, name: str) -> None:
+    """Raise ConfigError where C_cal does not follow from the other two: one was changed by hand."""
     expected = found.section_constant
-    if expected is None or abs(said - expected) > 1e-3 * expected:
+    if expected is None or abs(section - expected) > 1e-3 * expected:
         wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
-        raise ConfigError(f"{name}: section_constant is {said!r}, but there is {wanted}: mend these, or leave it out")
+        problem = f"section_constant is {section!r}, but there is {wanted}"
+        raise ConfigError(f"{name}: {problem}; correct these, or leave section_constant out")
 
 
-def _read_channels(rows: Any, name: str) -> tuple[dict[str, Any], ...]:
-    if not isinstance(rows, list) or not all(isinstance(row, Mapping) for row in rows):
-        raise ConfigError(f"{name}: channel must be written as [[channel]] tables")
-    channels: dict[tuple[int, int], dict[str, Any]] = {}
-    for number, row in enumerate(rows, 1):
-        where = f"{name}: [[channel]] {number}"
-        for key in row:
-            if key not in _CHANNEL:
-                raise ConfigError(f"{where}: unknown key {key!r}; {nearest(key, _CHANNEL)}")
-        index, scanner = (_read_whole(row, key, where) for key in _CHANNEL[:2])
-        if (index, scanner) in channels:
-            raise ConfigError(f"{where}: digitizer {index} with scanner channel {scanner} is there already")
-        numbers = {key: _read_number(row, key, where) for key in _CHANNEL[2:]}
-        channels[index, scanner] = {"digitizer": index, "scanner": scanner, **numbers}
-    return tuple(channels.values())
-
-
-def _read_whole(row: Mapping[str, Any], key: str, where: str) -> int:
-    value = _read_number(row, key, where)
-    if value != int(value):
-        raise ConfigError(f"{where}: {key} must be a whole number, it is {value!r}")
-    return int(value)
-
-
-def _read_number(document: Mapping[str, Any], key: str, name: str) -> float:
-    low, high, default, meaning = {**_NUMBERS, **_MORE_NUMBERS}[key]
-    value = document.get(key, default)
-    if value is None:
-        raise ConfigError(f"{name}: key {key!r} is missing: {meaning}")
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f"{name}: {key} must be a number, it is {value!r}")
-    if key in document and not low <= value <= high:
-        raise ConfigError(f"{name}: {key} must lie between {low:g} and {high:g}, it is {value!r}")
-    return float(value)
+def _read_channel(table: TomlTable) -> ChannelConstant:
+    table.check_keys(ChannelConstant.__dataclass_fields__)
+    return ChannelConstant(
+        table.integer("digitizer", 1, 255),
+        table.integer("scanner", 0, 3, 0),
+        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
+        spread=table.number("spread", 0.0, 1e6, 0.0),
+        echoes=table.integer("echoes", 0, 10**12, 0),
+    )

@@ -1,8 +1,9 @@
-"""How wide level ground's echoes are, from rays whose angle is known: what widths of slopes are held against.
+"""The width of echoes from level ground: the reference against which widths of slopes are compared.
 
-A survey takes the narrowest echoes for those of level ground seen from above. Few are: across a swath rays strike level
-ground at up to half the field of view, and a reference that is 1 % too wide turns 5 degrees into 2. Where sensor and
-divergence are known, what each ray's own angle widens is taken off first (ALGORITHMS 1.4: the nadir flat mode).
+A survey takes the narrowest echoes for those of level ground seen from above. Few are: across a swath, rays hit level
+ground at up to half the field of view. A reference that is 1 % too wide turns 5 degrees into 2. Where the sensor's
+position and the divergence are known, the broadening by each ray's angle is removed first (docs/algorithms.md 1.4).
+`angle_limits` calls it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.attribute.radiometry import is_alone, level_angle
@@ -22,15 +24,24 @@ from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_samp
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
 
-HALF_NORMAL = 0.455
-"""Median of the square of a standard normal number."""
-
 
 def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing: float) -> SystemPulse:
-    """The system with the variance of level ground's echoes, and the scatter of widths, seen from above.
+    """Measure variance and scatter of the widths of level ground seen from above.
 
-    blocks: with the sensor's positions, sampled over the strip; those of another spacing [ns] are left out. The system
-    as it is where its divergence is not known or fewer than 50 clean echoes are found.
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock
+        Sampled over the strip, with the sensor's positions; blocks of another spacing are left out.
+    system : SystemPulse
+        With the beam's divergence.
+    spacing : float
+        Of the samples that are used [ns].
+
+    Returns
+    -------
+    SystemPulse
+        With `level_variance` and `width_scatter`; unchanged where the divergence is unknown or fewer than 50 clean
+        echoes are found.
     """
     parts = [
         _measure(block, system)
@@ -42,10 +53,10 @@ def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing:
     variance, error = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     if len(variance) < ENOUGH_TO_LEARN:
         return system
-    # The survey's pulse may hold slopes, but no echo is narrower than the true one.
+    # The survey's pulse may include slopes, so the true one can be narrower, but never wider.
     level = min(_find_level(variance, error), 0.0)
     below = variance < level
-    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / HALF_NORMAL if below.any() else 1.0
+    ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
     excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
     return replace(system, level_variance=level, width_scatter=scatter)

@@ -1,32 +1,37 @@
-"""What a strip holds, and what is wrong with a strip or a chain file."""
+"""The contents of a strip for `wavebatch info`, and the problems of a strip or a chain file for `wavebatch check`.
+
+Before you change it: an error in a file is a finding here, never an exception; only `info` raises for a file that
+cannot be opened.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.no_data import without_nan
 from wavebatch.files.strip.header_check import audit_header
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan
 from wavebatch.stages.chain_file import load_chain
 
 _SAMPLED = 4096
+"""Waveforms that are read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """What `check` found in one file; `problems` and `notes` are lines without the file's name."""
+    """The result of `check` for one file; `problems` and `notes` are lines without the file's name."""
 
     file: str
     problems: tuple[str, ...]
-    """What keeps the file from being processed, or part of it from being processed rightly."""
+    """Reasons why the file, or part of it, cannot be processed correctly."""
     notes: tuple[str, ...]
-    """What is not as it should be, but does no harm here."""
+    """Deviations from the format that do no harm here."""
     summary: str = ""
 
     @property
@@ -35,39 +40,42 @@ class Findings:
         return not self.problems
 
     def to_json(self) -> dict[str, Any]:
-        """For JSON."""
-        lists = {"problems": list(self.problems), "notes": list(self.notes)}
-        return {"file": self.file, "clean": self.is_clean, "summary": self.summary, **lists}
-
-
-@dataclass(slots=True)
-class _Samples:
-    """Extremes of some waveforms of a strip."""
-
-    waveforms: int = 0
-    least: int | None = None
-    largest: int | None = None
-    at_limit: int = 0
-    lengths: set[int] = field(default_factory=set)
+        """Return the findings as plain values."""
+        return {"clean": self.is_clean, **without_nan(asdict(self))}
 
 
 def describe_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
-    """Everything `info` shows of a strip, as plain values for JSON; floats that are not finite are None.
+    """Collect everything that `wavebatch info` shows of a strip.
 
-    Raises InputError where the strip cannot be read; one that can be read but not processed says so in `problems`.
+    Parameters
+    ----------
+    path : path
+    direction : str
+        Where packet vectors point: auto, toward or away.
+    headerless : bool
+        Accept a .wdp file without its 60-byte header.
+
+    Returns
+    -------
+    dict
+        Plain values for JSON; None for floats that are not finite. `problems` lists why a strip cannot be processed.
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be read.
     """
     with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan(tolerant=True) as scan:
         facts = reader.facts
-        samples = _sample(reader, scan)
         return {
             **_describe_file(facts),
             **_describe_points(scan),
             "packets": _describe_packets(facts, scan),
-            "samples": _describe_samples(samples),
+            "samples": _describe_samples(reader, scan),
             "vectors": {
                 "direction": scan.direction,
                 "evidence": scan.direction_evidence,
-                "length_over_half_c": scan.vector_ratio if math.isfinite(scan.vector_ratio) else None,
+                "length_over_half_c": without_nan(scan.vector_ratio),
                 "form": scan.vector_form,
             },
             "warnings": [*facts.warnings, *scan.warnings],
@@ -76,15 +84,29 @@ def describe_strip(path: Path | str, *, direction: str = "auto", headerless: boo
 
 
 def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> Findings:
-    """What is wrong with a strip, or with a chain file (`.toml`). Errors become findings, they are not raised."""
+    """Check a strip, or a chain file (`.toml`); errors become findings, they are not raised.
+
+    Parameters
+    ----------
+    path : path
+    direction : str
+        Where packet vectors point: auto, toward or away.
+    headerless : bool
+        Accept a .wdp file without its 60-byte header.
+
+    Returns
+    -------
+    Findings
+    """
     path = Path(path)
     if path.suffix.lower() == ".toml":
         return _check_chain(path)
     try:
-        with StripReader(path, direction=direction, headerless=headerless) as reader:
-            scan = reader.scan(tolerant=True)
-            with scan:
-                return _check_strip(path, reader, scan)
+        with (
+            StripReader(path, direction=direction, headerless=headerless) as reader,
+            reader.scan(tolerant=True) as scan,
+        ):
+            return _check_strip(path, reader, scan)
     except InputError as error:
         return Findings(str(path), (_without_name(path, error),), ())
 
@@ -103,15 +125,12 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     facts = reader.facts
     problems = [*scan.problems, *scan.warnings, *facts.warnings]
     try:
-        _sample(reader, scan)
+        _describe_samples(reader, scan)
     except InputError as error:
         problems.append(_without_name(path, error))
     notes = [*_note_descriptors(facts, scan), *audit_header(reader, scan)]
-    return Findings(str(path), tuple(problems), tuple(notes), _summarise(scan))
-
-
-def _summarise(scan: StripScan) -> str:
-    return f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
+    summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
+    return Findings(str(path), tuple(problems), tuple(notes), summary)
 
 
 def _note_descriptors(facts: StripFacts, scan: StripScan) -> Iterator[str]:
@@ -128,26 +147,20 @@ def _without_name(path: Path, error: Exception) -> str:
     return " ".join(str(error).split()).removeprefix(f"{path}: ")
 
 
-def _sample(reader: StripReader, scan: StripScan) -> _Samples:
-    """Extremes of waveforms spread over the strip; nothing where no packet can be used."""
-    found = _Samples()
+def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
+    """Extremes of waveforms spread over the strip; of none where no packet can be used."""
+    rows = []
     for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
-        least, largest = int(block.samples.min()), int(block.samples.max())
-        found.least = least if found.least is None else min(found.least, least)
-        found.largest = largest if found.largest is None else max(found.largest, largest)
-        found.waveforms += len(block)
-        found.lengths.add(block.samples.shape[1])
-        found.at_limit += int(np.count_nonzero((block.samples == block.digitizer.max_count).any(axis=1)))
-    return found
-
-
-def _describe_samples(samples: _Samples) -> dict[str, Any]:
+        at_limit = (block.samples == block.digitizer.max_count).any(axis=1)
+        extremes = int(block.samples.min()), int(block.samples.max())
+        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), block.samples.shape[1]))
+    numbers, least, largest, limited, lengths = zip(*rows, strict=True) if rows else ((),) * 5
     return {
-        "waveforms_read": samples.waveforms,
-        "least": samples.least,
-        "largest": samples.largest,
-        "waveforms_at_limit": samples.at_limit,
-        "lengths": sorted(samples.lengths),
+        "waveforms_read": sum(numbers),
+        "least": min(least, default=None),
+        "largest": max(largest, default=None),
+        "waveforms_at_limit": sum(limited),
+        "lengths": sorted(set(lengths)),
     }
 
 
@@ -197,6 +210,6 @@ def _describe_descriptor(facts: StripFacts, index: int, points: int) -> dict[str
         "bits": digitizer.bits,
         "samples": digitizer.n_samples,
         "spacing_ns": digitizer.spacing,
-        "gain": digitizer.gain if math.isfinite(digitizer.gain) else None,
-        "offset": digitizer.offset if math.isfinite(digitizer.offset) else None,
+        "gain": without_nan(digitizer.gain),
+        "offset": without_nan(digitizer.offset),
     }

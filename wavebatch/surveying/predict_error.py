@@ -1,4 +1,8 @@
-"""How well chains will do on a strip: its own echoes simulated anew with its own pulse and noise, and found again."""
+"""The range error to expect from each chain on a strip, for `wavebatch run --tolerance`.
+
+The echoes of a sample are simulated again with the strip's pulse and noise; each chain must find them.
+Before you change it: a strip must get the same prediction every time, so the seed is fixed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.no_data import without_nan
 from wavebatch.core.units import HALF_C, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
@@ -23,24 +28,23 @@ WAVEFORMS = 2048
 """Waveforms of a trial."""
 
 SEED = 20071
-"""Of a trial's noise: a strip gets the same prediction every time."""
-
+"""Seed of a trial's noise: any fixed number does."""
 
 LEAST_SNR = 5.0
-"""Amplitude over noise from which an echo of the sample is taken for one: a bound goes as its inverse."""
+"""Least amplitude over noise of an echo of the sample: below it, noise would pass for echoes with huge bounds."""
 
 _DOUBTFUL = EchoFlag.AT_BOUND | EchoFlag.NOT_CONVERGED | EchoFlag.NEAR_EDGE
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What a chain is expected to do on a strip."""
+    """The result to expect from a chain on a strip."""
 
     name: str
     bound: float
-    """Root mean square of the Cramer-Rao bounds of the strip's echoes, each as if it were alone [m along the ray]."""
+    """Root mean square of the Cramer-Rao bounds of the strip's echoes, each as if alone [m along the ray]."""
     factor: float
-    """Root mean square error of the echoes found in the trial over that of their bounds."""
+    """Root mean square error of the echoes found in the trial, divided by that of their bounds."""
     completeness: float
     """Share of the trial's echoes that were found."""
 
@@ -50,19 +54,32 @@ class Prediction:
         return self.bound * self.factor
 
     def to_json(self) -> dict[str, object]:
-        """The numbers under names with their units; None for what is not finite."""
-        told = {"range_error_m": self.range_error, "bound_m": self.bound, "factor": self.factor}
-        told["completeness"] = self.completeness
-        numbers = {name: float(f"{value:.6g}") if np.isfinite(value) else None for name, value in told.items()}
-        return {"chain": self.name, **numbers}
+        """Return the numbers under names with units; None where not finite."""
+        values = {"range_error_m": self.range_error, "bound_m": self.bound}
+        values |= {"factor": self.factor, "completeness": self.completeness}
+        return {"chain": self.name, **without_nan({name: float(f"{value:.6g}") for name, value in values.items()})}
 
 
 def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[str, Chain]) -> list[Prediction]:
-    """Predictions for chains, from a sample of a strip and its system pulse; in the order of `chains`.
+    """Predict the errors of chains on a strip.
 
-    The sample's echoes, as the adaptive decomposer finds them, are rendered with the strip's pulse and get new noise of
-    the strip's level; what a chain finds in these waveforms is compared with them. Targets so close together that they
-    were one echo in the sample are one target here: the error is that of echoes that can be told apart.
+    Parameters
+    ----------
+    block : WaveformBlock
+        A sample of the strip.
+    system : SystemPulse
+    chains : mapping of str to Chain
+
+    Returns
+    -------
+    list of Prediction
+        In the order of `chains`.
+
+    Notes
+    -----
+    The adaptive decomposer finds the echoes of the sample. They are rendered with the strip's pulse and new noise, and
+    the echoes that a chain finds there are compared with them. Targets so close that they were one echo in the sample
+    are one target here: the error is that of echoes that can be resolved.
     """
     block = block.rows(slice(0, None, max(len(block) // WAVEFORMS, 1)))
     noise = pooled(block, system)
@@ -88,13 +105,27 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
 def simulate_again(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, rng: np.random.Generator
 ) -> WaveformBlock:
-    """Waveforms that hold `echoes` of the block, with the strip's pulse, new baselines and new noise."""
+    """Simulate waveforms that hold given echoes, with the strip's pulse, new baselines and new noise.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Gives number and length of the waveforms, and the digitizer.
+    system : SystemPulse
+    echoes : EchoTable
+        Their rows refer to `block`.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    WaveformBlock
+    """
     n, s = block.samples.shape
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
     start = [echoes.amplitude, echoes.time / block.spacing, echoes.sigma / block.spacing]
     amplitude, time, width = model_parameters(shape, limits, np.stack(start, axis=1).astype(np.float64)).T
     signal = render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
-    # Rounding to whole counts adds its own share of the noise again.
+    # Rounding to whole counts, below, adds this part of the noise again.
     white = max(system.noise_std**2 - QUANTISATION_STD**2, 0.0)
     variance = white + system.noise_gain * np.maximum(signal, 0)
     signal += np.sqrt(variance).astype(np.float32) * rng.standard_normal((n, s), dtype=np.float32)

@@ -1,4 +1,8 @@
-"""Where the sensor of a strip was: from a trajectory file, from the strip's own rays, or from the flight's height."""
+"""The sensor's positions: from a trajectory file, from the rays in the strip, or from the height of the flight.
+
+`find_sensor` is called once per strip; its SensorSource then fills the positions into each block.
+Before you change it: positions must depend on the strip and the request alone, or units would disagree.
+"""
 
 from __future__ import annotations
 
@@ -17,44 +21,45 @@ from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
 
 NODE_SECONDS = 0.5
-"""Time between two positions that are estimated from rays."""
+"""Time between two positions that are estimated from rays [s]."""
 
 WIDER = (1, 2, 4)
-"""Nodes before and after one whose rays take part in it; the next where a window says nothing."""
+"""Nodes before and after a node whose rays are used too; the next number where rays are too few or too parallel."""
 
 MOST_RAYS = 512
-"""Of a window."""
+"""Most rays used per time window."""
 
 MOST_NODES = 20_000
+"""Most positions along a path, 2.8 hours: a longer time range means that GPS times are wrong."""
 
 BEYOND = 0.25
-"""Time for which a path goes straight on where its rays end [s]: not every point of a strip is looked at."""
+"""Time for which a path goes straight on after its last ray [s]: only a sample of a strip's rays is used."""
 
 MARGIN = 30.0
-"""Of a trajectory that is kept before and after the strip [s]."""
+"""Time of a trajectory that is kept before and after the strip [s]."""
 
 LARGEST_ANGLE = np.radians(2.0)
-"""Between the packets' rays and those from a trajectory: above it the trajectory is of another strip, clock or CRS."""
+"""Largest median angle between packet vectors and rays from a trajectory; above it, strip, clock or CRS differ."""
 
 FOOT = 0.3048
-"""[m]."""
+"""International foot [m]."""
 
 HEIGHT_ERROR = 0.05
-"""Of the range, relative, where only the height of the flight is known."""
+"""Error of the range, relative, where only the height of the flight is known."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorRequest:
-    """Where positions of the sensor are to come from; picklable."""
+    """Where the sensor's positions shall come from; picklable."""
 
     trajectory: Path | None = None
-    """A file; without it the strip's own rays."""
+    """A file of positions; None: from the rays in the strip."""
     crs: str | None = None
-    """Of the strip, where it does not say so itself."""
+    """CRS of the strip, where its header has none."""
     lever_arm: tuple[float, float, float] | None = None
-    """Trajectory to scanner: forward, right, down [m]."""
+    """From the trajectory to the scanner: forward, right, down [m]."""
     height: float | None = None
-    """Above the ground, where rays say nothing [m]."""
+    """Of the flight above the ground, used where rays give no position [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,19 +70,36 @@ class SensorSource:
     """`trajectory`, `direction vectors`, `pairs of returns`, `flight height` or `none`."""
     trajectory: Trajectory | None = None
     height: float | None = None
+    """Of the flight above the ground [m], where nothing else is known."""
+    distance: float | None = None
+    """Median distance from sensor to ground [m]; None where unknown."""
     error: float = 0.0
-    """Standard deviation of the distance to the sensor [m], of a trajectory by what the vectors say; 0 if unknown."""
+    """Standard deviation of the distance [m]; of a trajectory by comparison with the packet vectors; 0 if unknown."""
+    farther: float | None = None
+    """Median of the ranges by the trajectory less those by the packet vectors [m]; None where not compared."""
+    vectors_error: float | None = None
+    """Error of the ranges by the packet vectors [m]."""
     facts: tuple[tuple[str, Any], ...] = ()
-    """What reports say beside."""
+    """More values for reports, by name."""
 
     def fill(self, block: WaveformBlock) -> WaveformBlock:
-        """The block with the sensor's positions; as it is where nobody knows them."""
+        """Return the block with the sensor's positions; the block itself where they are unknown.
+
+        Parameters
+        ----------
+        block : WaveformBlock
+
+        Returns
+        -------
+        WaveformBlock
+            With `sensor`, f8 (n, 3) [m].
+        """
         if self.trajectory is not None:
             return replace(block, sensor=self.trajectory.at(block.gps_time))
         if self.height is None:
             return block
         down = -block.direction[:, 2:]
-        # Waveforms begin above what they hit: the height is that above the lowest return of each packet.
+        # Waveforms begin above their targets, so the height counts from the lowest return of each packet.
         low = block.origin[:, 2].copy()
         if block.returns is not None:
             np.minimum.at(low, block.returns.waveform, block.returns.xyz[:, 2])
@@ -86,19 +108,37 @@ class SensorSource:
         return replace(block, sensor=np.where(down > 0, block.origin - back, np.nan))
 
     def describe(self) -> dict[str, Any]:
-        """For reports."""
-        known = self.kind != "none" and self.error > 0
-        return {"source": self.kind, "range_error_m": round(self.error, 6) if known else None, **dict(self.facts)}
+        """Return kind, errors and the other values for reports."""
+        report = {"source": self.kind, "range_error_m": round(self.error, 6) or None, **dict(self.facts)}
+        return report if self.distance is None else {**report, "distance_m": self.distance}
 
 
-NOBODY = SensorSource("none")
+UNKNOWN = SensorSource("none")
 
 
 def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) -> SensorSource:
-    """Where the sensor of a strip was. Depends on nothing but the strip and the request.
+    """Find the sensor's positions during a strip.
 
-    Raises InputError where a trajectory cannot be read, does not overlap, or contradicts the packets' vectors, and for
-    strips in degrees, feet or geocentric coordinates.
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    request : SensorRequest
+
+    Returns
+    -------
+    SensorSource
+        `UNKNOWN` where neither the request nor the strip gives positions.
+
+    Raises
+    ------
+    InputError
+        Where a trajectory cannot be read, does not overlap the strip or contradicts the packet vectors, and for strips
+        that are not in metres.
+
+    Notes
+    -----
+    docs/algorithms.md 5.1.
     """
     refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
@@ -109,23 +149,22 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
         if found is not None:
             return found
     if request.height is not None:
-        error, facts = HEIGHT_ERROR * request.height, (("distance_m", request.height),)
-        return SensorSource("flight height", height=request.height, error=error, facts=facts)
-    return NOBODY
+        error = HEIGHT_ERROR * request.height
+        return SensorSource("flight height", height=request.height, distance=request.height, error=error)
+    return UNKNOWN
 
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
-    """Raises InputError where coordinates are no metres, or nobody can be sure that they are."""
+    """Raise InputError where the coordinates are not in metres, or where the packet vectors make that doubtful."""
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vector_ratio
     remedy = "project the strip to metres, or leave out the stages that measure in metres"
-    for said in units:
-        if not said.is_metric:
-            what = f"coordinates are {said.describe()}, in which nothing has a range in metres"
-            raise InputError(f"{path}: {what}: {remedy}")
+    for unit in units:
+        if not unit.is_metric:
+            raise InputError(f"{path}: coordinates are {unit.describe()}, so ranges would not be in metres: {remedy}")
     if abs(ratio * FOOT - 1.0) < 0.05:
         raise InputError(
-            f"{path}: packet vectors are {ratio:.3f} times c/2 long, as they are in feet, though no CRS of the strip "
-            f"says that its coordinates are: {remedy}"
+            f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
+            f"that its coordinates are in feet: {remedy}"
         )
 
 
@@ -138,11 +177,14 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
     try:
         offset, clocks = solve_offset(known, start, stop)
         known = known.shifted(offset).between(start - MARGIN, stop + MARGIN)
-        angle = _disagreement(known, rays)
+        ahead = rays.point - known.at(rays.time)
+        distance = np.sqrt((ahead * ahead).sum(axis=1))
+        angle = _disagreement(ahead, distance, rays)
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
-    off, error, sure = _compare_ranges(known, rays)
+    farther, error, vectors_error = _compare_ranges(distance, rays)
+    distance = distance[np.isfinite(distance)]
     facts = {
         "file": request.trajectory.name,
         "clocks": clocks,
@@ -150,39 +192,38 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> Senso
         "share_covered": round(share, 6),
         "gaps_s": [[round(a, 3), round(b, 3)] for a, b in known.gaps(start, stop)[:20]],
         "angle_to_packet_vectors_deg": round(float(np.degrees(angle)), 4),
-        "distance_m": _median_distance(known, rays),
-        "farther_than_by_vectors_m": off,
-        "by_vectors_error_m": sure,
+        "distance_m": None,
+        "farther_than_by_vectors_m": farther,
+        "by_vectors_error_m": vectors_error,
     }
-    return SensorSource("trajectory", known, error=error, facts=tuple(facts.items()))
+    return SensorSource(
+        "trajectory",
+        known,
+        distance=round(float(np.median(distance)), 2) if len(distance) else None,
+        error=error,
+        farther=farther,
+        vectors_error=vectors_error,
+        facts=tuple(facts.items()),
+    )
 
 
-def _compare_ranges(known: Trajectory, rays: Rays) -> tuple[float | None, float, float | None]:
-    """By how much ranges from a trajectory are longer than those from the packets' vectors [m]: median, root mean
-    square, and the error of the latter; None, 0 and None where vectors do not tell."""
+def _compare_ranges(distance: np.ndarray, rays: Rays) -> tuple[float | None, float, float | None]:
+    """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
+    the error of the latter; None, 0 and None where the vectors give no position."""
     path = estimate_path(rays, "direction vectors")
     if path is None:
         return None, 0.0, None
-    lengths = [rays.point - where.at(rays.time) for where in (known, path.trajectory)]
-    longer = np.sqrt((lengths[0] ** 2).sum(axis=1)) - np.sqrt((lengths[1] ** 2).sum(axis=1))
+    longer = distance - np.sqrt(((rays.point - path.trajectory.at(rays.time)) ** 2).sum(axis=1))
     longer = longer[np.isfinite(longer)]
     if not len(longer):
         return None, 0.0, None
     return round(float(np.median(longer)), 3), float(np.sqrt(np.mean(longer**2))), round(path.error, 6)
 
 
-def _median_distance(known: Trajectory, rays: Rays) -> float | None:
-    off = rays.point - known.at(rays.time)
-    distance = np.sqrt((off * off).sum(axis=1))
-    distance = distance[np.isfinite(distance)]
-    return round(float(np.median(distance)), 2) if len(distance) else None
-
-
-def _disagreement(known: Trajectory, rays: Rays) -> float:
-    """Median angle between the packets' rays and those from the trajectory [rad]; InputError where it is too large."""
-    ahead = rays.point - known.at(rays.time)
+def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: Rays) -> float:
+    """Median angle between packet vectors and rays from the trajectory [rad]; InputError where it is too large."""
     with np.errstate(all="ignore"):
-        ahead /= np.sqrt((ahead * ahead).sum(axis=1))[:, None]
+        ahead = ahead / distance[:, None]
         unit = rays.direction / np.sqrt((rays.direction**2).sum(axis=1))[:, None]
         cosine = np.clip(np.einsum("ni,ni->n", ahead, unit), -1.0, 1.0)
     cosine = cosine[np.isfinite(cosine)]
@@ -191,14 +232,27 @@ def _disagreement(known: Trajectory, rays: Rays) -> float:
     angle = float(np.median(np.arccos(cosine)))
     if angle > LARGEST_ANGLE:
         raise InputError(
-            f"the trajectory's rays are {np.degrees(angle):.1f} degrees off the packets' vectors: it is of another "
-            "strip, in another CRS, or its clock is off by seconds (UTC is behind GPS time by 18)"
+            f"the trajectory's rays are {np.degrees(angle):.1f} degrees off the packets' vectors: it belongs to "
+            "another strip, has another CRS, or its clock is off by seconds (UTC is 18 s less than GPS time)"
         )
     return angle
 
 
 def estimate_path(rays: Rays, kind: str) -> SensorSource | None:
-    """The sensor's path from where its rays come together, in windows along the flight; None where they do not."""
+    """Estimate the sensor's path from the points where its rays meet, in time windows along the flight.
+
+    Parameters
+    ----------
+    rays : Rays
+        A sample of the strip's rays, sorted by time.
+    kind : str
+        Of the rays; becomes the kind of the source.
+
+    Returns
+    -------
+    SensorSource or None
+        None where the rays do not meet.
+    """
     if not len(rays.time) or rays.time[0] == rays.time[-1]:
         return None
     origin = rays.time[0]
@@ -219,11 +273,13 @@ def estimate_path(rays: Rays, kind: str) -> SensorSource | None:
     xyz, velocity = (np.concatenate([part[i] for part in placed]) for i in (0, 1))
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
-    return SensorSource(kind, path, error=_overall_error(found, rays), facts=_describe(found, path, rays))
+    distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
+    error, facts = _overall_error(found, rays), _describe(found, path, rays)
+    return SensorSource(kind, path, distance=distance, error=error, facts=facts)
 
 
 def _fit_window(rays: Rays, cells: np.ndarray, node: float) -> tuple[SensorFit | None, float, float]:
-    """The fit around a node from the smallest window that says something, and the time of the node's own rays."""
+    """The fit around a node from the smallest window that gives one, and first and last time of the node's rays."""
     own = np.searchsorted(cells, [node, node + 1])
     low, high = float(rays.time[own[0]]), float(rays.time[own[1] - 1])
     for reach in WIDER:
@@ -236,7 +292,7 @@ def _fit_window(rays: Rays, cells: np.ndarray, node: float) -> tuple[SensorFit |
 
 
 def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle: float) -> np.ndarray:
-    """Times at which a node's fit is used: its middle, and beyond the ends of its rays where no node is beside it."""
+    """Times at which a node's fit is used: its middle, and beyond the ends of its rays where it has no neighbour."""
     times = [middle] if low <= middle <= high else [low, high]
     if not np.any(nodes == node - 1):
         times += [low - BEYOND, low]
@@ -260,13 +316,12 @@ def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: 
 def _describe(
     found: list[tuple[SensorFit, np.ndarray, np.ndarray]], path: Trajectory, rays: Rays
 ) -> tuple[tuple[str, Any], ...]:
-    """Height, speed, heading and smoothness of a path, for whoever reads the report."""
+    """Height, speed, heading and smoothness of a path, for reports."""
     speed = np.sqrt((path.velocity**2).sum(axis=1))
     east, north, _ = np.median(path.velocity, axis=0)
     facts: dict[str, Any] = {
         "windows": len(found),
         "height_m": round(float(np.median(path.xyz[:, 2]) - np.median(rays.point[:, 2])), 2),
-        "distance_m": round(float(np.median([fit.distance for fit, _, _ in found])), 2),
         "speed_m_s": round(float(np.median(speed)), 2),
         "heading_deg": round(float(np.degrees(np.arctan2(east, north)) % 360), 1),
         "view_deg": round(float(np.degrees(np.median([fit.spread for fit, _, _ in found]))), 2),

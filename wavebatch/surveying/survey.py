@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.units import LEAST_PULSE_WIDTH, SQUARED_NORMAL_MEDIAN
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse
@@ -32,11 +34,25 @@ COUNTED = 256
 """Samples of a waveform that count where the main digitizer is chosen."""
 
 
+class Part(StrEnum):
+    """Parts of a chain that a survey decides on; the values stand in files and reports."""
+
+    PULSE = "learned pulse"
+    SKEW = "skewed pulse"
+    GROWTH = "growth of fits"
+    PRIOR = "width prior"
+    CENSORED = "censored fit"
+    WEIGHTS = "signal-dependent weights"
+    WIDTH = "echo width"
+    ANGLE = "incidence angle"
+
+
 @dataclass(frozen=True, slots=True)
 class Decision:
     """Whether the strip needs a part of the chain, and why."""
 
     part: str
+    """A Part; any text where a file of another version has it."""
     needed: bool
     reason: str
 
@@ -188,8 +204,7 @@ def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     if np.count_nonzero(below) < ENOUGH_TO_LEARN:
         return 0.0
     lack = (system.sigma_ref - echoes.sigma[below]).astype(np.float64)
-    # Medians of squares: 0.455 is that of a squared standard normal number.
-    excess = np.median(lack**2) / 0.455 - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
+    excess = np.median(lack**2) / SQUARED_NORMAL_MEDIAN - np.median(echoes.sigma_err[below].astype(np.float64) ** 2)
     return float(np.sqrt(max(excess, 0.0)))
 
 
@@ -228,25 +243,29 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
     strongest = figures["amplitude_99"]
     learned = len(system.components)
     return (
-        Decision("learned pulse", learned > 1, _explain_pulse(system, figures)),
-        Decision("skewed pulse", system.kappa != 0, _explain_skew(system, figures)),
-        Decision("growth of fits", share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
-        Decision("width prior", share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (40 %)"),
+        Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
+        Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
+        Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
+        Decision(Part.PRIOR, share > 0.4, f"{100 * share:.1f} % of the waveforms hold overlapping echoes (40 %)"),
         Decision(
-            "censored fit",
+            Part.CENSORED,
             system.saturation is not None and figures["saturated_share"] > 0,
             f"{100 * figures['saturated_share']:.2f} % of the waveforms are saturated",
         ),
         Decision(
-            "signal-dependent weights",
+            Part.WEIGHTS,
             system.noise_gain > 0,
             f"variance grows by {system.noise_gain * strongest:.2f} DN2 up to {strongest:.0f} DN, "
             f"against {system.noise_std**2:.2f} DN2 without signal",
         ),
-        Decision("echo width", width >= 0.85, f"the system pulse is {width:.2f} samples wide (0.85)"),
         Decision(
-            "incidence angle",
-            width >= 0.85 and figures["system_width_share"] < 0.95,
+            Part.WIDTH,
+            width >= LEAST_PULSE_WIDTH,
+            f"the system pulse is {width:.2f} samples wide ({LEAST_PULSE_WIDTH})",
+        ),
+        Decision(
+            Part.ANGLE,
+            width >= LEAST_PULSE_WIDTH and figures["system_width_share"] < 0.95,
             f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse",
         ),
     )

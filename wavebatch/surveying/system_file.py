@@ -1,20 +1,22 @@
-"""SYSTEM.toml: what a survey found, as a file that a later run reads instead of surveying its strip again."""
+"""SYSTEM.toml: the results of a survey as a file, so that a later run need not survey its strip again.
+
+`wavebatch survey -o` writes it; `run`, `calibrate`, `compare` and `voxelize` read it with `--system`.
+Before you change it: every number must come back to the last bit, and old files must stay readable.
+"""
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
+from wavebatch.files.text_file import write_text
+from wavebatch.files.toml_file import TomlTable, check_number, format_toml, parse_toml, read_toml_text, shorten
 from wavebatch.surveying import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
@@ -24,7 +26,7 @@ MOST_COMPONENTS = 16
 
 
 class Quantity(NamedTuple):
-    """One number of a system pulse: the field it belongs to, and the values that it may have."""
+    """One number of a system pulse: its field in SystemPulse and the values that it may have."""
 
     field: str
     low: float
@@ -54,12 +56,14 @@ COMPONENT_LIMITS = ((-10.0, 10.0), (-1e4, 1e4), (1e-3, 1e4))
 """Allowed weight, delay [ns] and sigma [ns] of a component."""
 
 _NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
-_TABLES = {"schema": str, "version": str, "strip": str, "waveforms": int}
+_HEADING = "What a survey found: `wavebatch run --system` takes it for a strip of the same sensor and settings."
+_ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
+_REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
 
 
 @dataclass(frozen=True, slots=True)
 class SavedSurvey:
-    """A survey with where it comes from."""
+    """A survey and the strip that it was made on."""
 
     survey: Survey
     strip: str = ""
@@ -67,249 +71,133 @@ class SavedSurvey:
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     """Of that strip, from `take_fingerprint`; empty when not known."""
     version: str = __version__
-    """Of the program that surveyed."""
+    """Of the program that made the survey."""
 
 
 def describe_system(system: SystemPulse) -> dict[str, Any]:
-    """The system pulse as plain numbers, lists and dictionaries under the keys of the file; exact."""
+    """Return the system pulse as plain numbers, lists and dictionaries under the keys of the file; exact."""
     own = [{_INDEX: index, **_describe_pulse(other)} for index, other in sorted(system.digitizers.items())]
     return {**_describe_pulse(system), **({_DIGITIZERS: own} if own else {})}
 
 
 def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
-    told = {key: getattr(system, quantity.field) for key, quantity in QUANTITIES.items()}
+    values = {key: getattr(system, quantity.field) for key, quantity in QUANTITIES.items()}
     return {
-        **{key: None if value is None else float(value) for key, value in told.items()},
+        **{key: None if value is None else float(value) for key, value in values.items()},
         _NOISE: {kind: float(value) for kind, value in system.noise_by_kind.items()},
         _COMPONENTS: [[float(value) for value in component] for component in system.components],
     }
 
 
 def format_survey(saved: SavedSurvey) -> str:
-    """TOML text of a survey; `parse_survey` gives the same survey again, to the last bit of every number."""
-    survey, told = saved.survey, describe_system(saved.survey.system)
-    head = {
+    """Return the TOML text of a survey; `parse_survey` gives the same survey again, each number to the last bit."""
+    survey = saved.survey
+    document = {
         "schema": SYSTEM_SCHEMA,
         "version": saved.version,
         "strip": saved.strip,
         "waveforms": int(survey.waveforms),
+        "system": describe_system(survey.system),
+        "figures": {key: float(value) for key, value in survey.figures.items() if math.isfinite(value)},
+        "decision": [{**asdict(decision), "needed": bool(decision.needed)} for decision in survey.decisions] or None,
+        "fingerprint": saved.fingerprint or None,
     }
-    lines = ["# What a survey found: `wavebatch run --system` takes it for a strip of the same sensor and settings."]
-    lines += _format_table(head)
-    lines += ["", "[system]", *_format_pulse(told, "system")]
-    for own in told.get(_DIGITIZERS, []):
-        lines += ["", "# a digitizer that records otherwise", f"[[system.{_DIGITIZERS}]]", f"{_INDEX} = {own[_INDEX]}"]
-        lines += _format_pulse(own, f"system.{_DIGITIZERS}")
-    finite = {key: float(value) for key, value in survey.figures.items() if math.isfinite(value)}
-    lines += ["", "[figures]", *_format_table(finite)]
-    for decision in survey.decisions:
-        table = {"part": decision.part, "needed": bool(decision.needed), "reason": decision.reason}
-        lines += ["", "[[decision]]", *_format_table(table)]
-    if saved.fingerprint:
-        lines += ["", "[fingerprint]", *_format_fingerprint(saved.fingerprint)]
-    return "\n".join(lines) + "\n"
-
-
-def _format_pulse(told: Mapping[str, Any], name: str) -> list[str]:
-    lines = []
-    for key, quantity in QUANTITIES.items():
-        if told[key] is not None:
-            lines.append(f"{key} = {_format(told[key])}  # {quantity.meaning}")
-    lines.append("# (weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first")
-    lines += _format_table({_COMPONENTS: told[_COMPONENTS]})
-    return [*lines, "", f"[{name}.{_NOISE}]", *_format_table(told[_NOISE])]
-
-
-def _format_table(table: Mapping[str, Any]) -> list[str]:
-    return [f"{_format_key(key)} = {_format(value)}" for key, value in table.items()]
-
-
-def _format_key(key: str) -> str:
-    bare = key.isascii() and key.replace("_", "a").replace("-", "a").isalnum()
-    return key if bare else _format(key)
-
-
-def _format(value: Any) -> str:
-    if isinstance(value, str):
-        # JSON escapes are TOML escapes too, but for DEL, which JSON leaves as it is.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return "[" + ", ".join(_format(item) for item in value) + "]"
-    return repr(value)
-
-
-def _format_fingerprint(fingerprint: Mapping[str, Any]) -> list[str]:
-    plain = {key: value for key, value in fingerprint.items() if not isinstance(value, Mapping)}
-    lines = _format_table(plain)
-    for key, value in fingerprint.items():
-        if isinstance(value, Mapping):
-            lines += ["", f"[fingerprint.{_format_key(key)}]", *_format_table(value)]
-    return lines
+    meanings = {**{key: quantity.meaning for key, quantity in QUANTITIES.items()}, _COMPONENTS: _ABOUT_COMPONENTS}
+    places = ("system", f"system.{_DIGITIZERS}")
+    comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
+    comments[places[1]] = "a digitizer that records otherwise"
+    return format_toml(document, heading=_HEADING, comments=comments)
 
 
 def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
-    """The survey as a file that appears whole or not at all; InputError where it exists or cannot be written."""
+    """Write a survey file, whole or not at all; raises InputError where it exists or cannot be written."""
     write_text(path, format_survey(saved), overwrite=overwrite)
 
 
-def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """A text file that appears whole or not at all; InputError where it exists or cannot be written.
-
-    With overwrite a device or a pipe (/dev/null, /dev/stdout) gets the text as it is.
-    """
-    data = text.encode(errors="replace")  # a strip's name can be any bytes
-    if overwrite and is_stream(path):
-        with reporting(path), open_stream(path) as stream:
-            stream.write(data)
-        return
-    draft = Draft(path, overwrite=overwrite)
-    try:
-        with reporting(path):
-            draft.file.write(data)
-        draft.publish()
-    finally:
-        draft.discard()
-
-
 def load_survey(path: Path | str) -> SavedSurvey:
-    """The survey of a file; ConfigError in one line that names file, key and the nearest known word."""
-    try:
-        text = Path(path).read_text("utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: system file cannot be read: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: system file is not UTF-8 text (byte {error.start})") from error
-    return parse_survey(text, str(path))
+    """Read a survey file; raises ConfigError, in one line, where it cannot be read or is wrong."""
+    return parse_survey(read_toml_text(path, "system file"), str(path))
 
 
 def parse_survey(text: str, name: str) -> SavedSurvey:
-    """The survey that TOML text describes; `name` stands in front of every error message.
+    """Read the TOML text of a survey.
 
-    [system] is needed whole; figures, decisions and the fingerprint may be missing.
+    Parameters
+    ----------
+    text : str
+        The table [system] must be whole; figures, decisions and fingerprint may be missing.
+    name : str
+        Start of every message, usually the path.
+
+    Returns
+    -------
+    SavedSurvey
+
+    Raises
+    ------
+    ConfigError
+        With file, table and key, and the nearest known word for an unknown key.
     """
-    try:
-        document = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{name}: not valid TOML: {error}") from error
-    tables = {**_TABLES, "system": dict, "figures": dict, "decision": list, "fingerprint": dict}
-    _check_keys(document, tables, ("schema", "system"), name)
-    for key, kind in tables.items():
-        if key in document and type(document[key]) is not kind:
-            raise ConfigError(f"{name}: {key} must be {_WORDS[kind]}, it is {_shorten(document[key])}")
-    if document["schema"] != SYSTEM_SCHEMA:
-        raise ConfigError(
-            f"{name}: schema is {_shorten(document['schema'])}, this version reads {SYSTEM_SCHEMA!r}; survey again"
-        )
-    if document.get("waveforms", 0) < 0:
-        raise ConfigError(f"{name}: waveforms must not be negative, it is {document['waveforms']}")
+    table = parse_toml(text, name)
+    known = ("schema", "version", "strip", "waveforms", "system", "figures", "decision", "fingerprint")
+    table.check_keys(known, ("schema", "system"), _REMEDY)
+    table.check_schema(SYSTEM_SCHEMA, "survey again")
     survey = Survey(
-        system=_read_system(document["system"], f"{name}: [system]"),
-        waveforms=document.get("waveforms", 0),
-        figures=_read_numbers(document.get("figures", {}), f"{name}: [figures]"),
-        decisions=tuple(
-            _read_decision(table, f"{name}: [[decision]] {number}")
-            for number, table in enumerate(document.get("decision", []), 1)
-        ),
+        system=_read_system(table.table("system")),
+        waveforms=table.integer("waveforms", 0, 10**12, 0),
+        figures=_read_numbers(table.table("figures", {})),
+        decisions=tuple(map(_read_decision, table.tables("decision"))),
     )
-    return SavedSurvey(
-        survey, document.get("strip", ""), document.get("fingerprint", {}), document.get("version", __version__)
-    )
+    texts = (table.get("strip", str, ""), table.get("fingerprint", dict, {}), table.get("version", str, __version__))
+    return SavedSurvey(survey, *texts)
 
 
-_WORDS = {
-    str: "a string",
-    int: "an integer",
-    dict: "a table",
-    list: "written as [[decision]] tables",
-    bool: "true or false",
-}
-
-
-def _check_keys(table: Mapping[str, Any], known: Mapping[str, Any], needed: tuple[str, ...], where: str) -> None:
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"{where}: unknown key {_shorten(key)}; {nearest(key, known)}")
-    for key in needed:
-        if key not in table:
-            raise ConfigError(f"{where}: key {key!r} is missing; `wavebatch survey STRIP -o FILE` writes all")
-
-
-def _read_system(table: Mapping[str, Any], where: str) -> SystemPulse:
-    """The table [system] with those of digitizers that record otherwise."""
-    rows = table.get(_DIGITIZERS, [])
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise ConfigError(f"{where}: {_DIGITIZERS} must be written as [[system.{_DIGITIZERS}]] tables")
-    main = _read_pulse({key: value for key, value in table.items() if key != _DIGITIZERS}, where)
+def _read_system(table: TomlTable) -> SystemPulse:
+    """The table [system] with those of the digitizers that record otherwise."""
     own: dict[int, SystemPulse] = {}
-    for number, row in enumerate(rows, 1):
-        place = f"{where}: {_DIGITIZERS} {number}"
-        index = row.get(_INDEX)
-        if type(index) is not int or not 1 <= index <= 255 or index in own:
-            raise ConfigError(f"{place}: {_INDEX} must be a number from 1 to 255 of its own, it is {_shorten(index)}")
-        own[index] = _read_pulse({key: value for key, value in row.items() if key != _INDEX}, place)
-    return replace(main, digitizers=own)
+    for row in table.tables(_DIGITIZERS, f"system.{_DIGITIZERS}"):
+        index = row.integer(_INDEX, 1, 255)
+        if index in own:
+            raise ConfigError(f"{row.where}: {_INDEX} {index} is there already; give each digitizer one table")
+        own[index] = _read_pulse(row, _INDEX)
+    return replace(_read_pulse(table, _DIGITIZERS), digitizers=own)
 
 
-def _read_pulse(table: Mapping[str, Any], where: str) -> SystemPulse:
-    known = (*QUANTITIES, _COMPONENTS, _NOISE)
-    needed = tuple(key for key in known if not (key in QUANTITIES and QUANTITIES[key].optional))
-    _check_keys(table, dict.fromkeys(known), needed, where)
+def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
+    """A pulse from a table that may hold one extra key."""
+    needed = (*(key for key, quantity in QUANTITIES.items() if not quantity.optional), _COMPONENTS, _NOISE)
+    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, extra), needed, _REMEDY)
     values = {
-        quantity.field: _read_number(table[key], quantity.low, quantity.high, f"{where}: {key}")
+        quantity.field: table.number(key, quantity.low, quantity.high)
         for key, quantity in QUANTITIES.items()
-        if key in table
+        if key in table.values
     }
-    if not isinstance(table[_NOISE], dict):
-        raise ConfigError(f"{where}: {_NOISE} must be a table, it is {_shorten(table[_NOISE])}")
-    kinds = _read_numbers(table[_NOISE], f"{where}: {_NOISE}", low=0.0)
-    return SystemPulse(**values, noise_by_kind=kinds, components=_read_components(table[_COMPONENTS], where))
+    return SystemPulse(
+        **values, noise_by_kind=_read_numbers(table.table(_NOISE), low=0.0), components=_read_components(table)
+    )
 
 
-def _read_components(rows: Any, where: str) -> tuple[tuple[float, float, float], ...]:
-    where = f"{where}: {_COMPONENTS}"
+def _read_components(table: TomlTable) -> tuple[tuple[float, float, float], ...]:
+    where, rows = f"{table.where}: {_COMPONENTS}", table.values[_COMPONENTS]
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise ConfigError(f"{where} must be a list of [weight, delay, sigma], it is {_shorten(rows)}")
+        raise ConfigError(f"{where} must be a list of [weight, delay, sigma], it is {shorten(rows)}")
     if len(rows) == 1 or len(rows) > MOST_COMPONENTS:
         raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(rows)}")
     components = tuple(
-        tuple(
-            _read_number(value, low, high, f"{where} row {number}")
-            for value, (low, high) in zip(row, COMPONENT_LIMITS, strict=True)
-        )
+        tuple(check_number(value, *limits, f"{where} row {number}")
+              for value, limits in zip(row, COMPONENT_LIMITS, strict=True))
         for number, row in enumerate(rows, 1)
-    )
+    )  # fmt: skip
     if components and components[0][0] < 0.01:
         raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
     return components
 
 
-def _read_numbers(table: Mapping[str, Any], where: str, low: float = -math.inf) -> dict[str, float]:
-    return {key: _read_number(value, low, math.inf, f"{where}: {key}") for key, value in table.items()}
+def _read_numbers(table: TomlTable, low: float = -math.inf) -> dict[str, float]:
+    return {key: table.number(key, low) for key in table.values}
 
 
-def _read_number(value: Any, low: float, high: float, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f"{where} must be a number, it is {_shorten(value)}")
-    if isinstance(value, int) and abs(value) > 1 << 53 or not math.isfinite(value):
-        raise ConfigError(f"{where} must be a finite number, it is {_shorten(value)}")
-    if not low <= value <= high:
-        raise ConfigError(f"{where} must lie between {low:g} and {high:g}, it is {value!r}")
-    return float(value)
-
-
-def _read_decision(table: Any, where: str) -> Decision:
-    if not isinstance(table, dict):
-        raise ConfigError(f"{where}: must be a table, it is {_shorten(table)}")
+def _read_decision(table: TomlTable) -> Decision:
     kinds = {"part": str, "needed": bool, "reason": str}
-    _check_keys(table, kinds, tuple(kinds), where)
-    for key, kind in kinds.items():
-        if type(table[key]) is not kind:
-            raise ConfigError(f"{where}: {key} must be {_WORDS[kind]}, it is {_shorten(table[key])}")
-    return Decision(**table)
-
-
-def _shorten(value: Any, limit: int = 60) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    table.check_keys(kinds, kinds, _REMEDY)
+    return Decision(**{key: table.get(key, kind) for key, kind in kinds.items()})

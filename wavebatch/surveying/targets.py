@@ -1,4 +1,8 @@
-"""Reference targets of known reflectance: their file, and the calibration constant that a strip over them gives."""
+"""Calibration on reference targets: reads a file of targets and measures the constant from a strip over them.
+
+`wavebatch calibrate` calls `load_targets` and `calibrate_strip`.
+Before you change it: the angle of each echo comes from the plane of its target, so a bent target biases the constant.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import csv
 import datetime
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,21 +26,23 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.choose_chain import read_sample, survey_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 LEAST_ECHOES = 10
-"""Echoes on a target below which it is left out."""
+"""A target with fewer echoes is left out: a median of fewer is no better than one echo."""
 
 MOST_ECHOES = 200_000
-"""Echoes that a target takes; more do not make it better."""
+"""Most echoes that a target uses: the error of its reflectance is far larger than that of so many."""
 
 SCANNERS = 4
-"""Scanner channels that points can tell apart; a channel is a digitizer times this and a scanner channel."""
+"""Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
 
 _CORNERS = 64
+"""Corners of the polygon that stands for a circle."""
 _BLOCK = 8192
+"""Waveforms that are read at a time."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,20 +52,32 @@ class Target:
     name: str
     reflectance: float
     corners: np.ndarray
-    """Of its outline, f8 (k, 2) [m]."""
+    """Corners of its outline, f8 (k, 2) [m]."""
     incidence: float | None = None
-    """Angle between ray and normal [deg]; None: from the plane of its own echoes."""
+    """Angle between ray and normal [deg]; None: taken from the plane of the target's echoes."""
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Whether points (n,) lie inside, bool (n,)."""
+        """Return whether points at x, y, f8 (n,) [m], lie inside, bool (n,)."""
         return find_inside([self.corners], x, y)
 
 
 def load_targets(path: Path | str) -> list[Target]:
-    """The targets of a GeoJSON or CSV file; ConfigError in one line.
+    """Read reference targets from a GeoJSON or CSV file.
 
-    GeoJSON: polygons with the properties reflectance and, if known, name and incidence [deg]. CSV: columns reflectance
-    and x, y, radius, or vertices as `x y x y x y ...`; name and incidence if known. Coordinates as the strip has them.
+    Parameters
+    ----------
+    path : path
+        GeoJSON: polygons with the property reflectance. CSV: the column reflectance, and x, y, radius, or vertices as
+        `x y x y x y ...`. Both may have name and incidence [deg]. Coordinates are those of the strip.
+
+    Returns
+    -------
+    list of Target
+
+    Raises
+    ------
+    ConfigError
+        In one line, where the file cannot be read, is empty or holds a wrong target.
     """
     try:
         text = Path(path).read_text("utf-8-sig")
@@ -76,7 +94,7 @@ def _read_geojson(text: str, path: Path | str) -> list[dict[str, Any]]:
     rows = []
     for properties, rings in read_features(text, path):
         if len(rings) > 1:
-            raise ConfigError(f"{path}: a target has {len(rings)} rings; give every part one of its own, without holes")
+            raise ConfigError(f"{path}: a target has {len(rings)} rings; make every part a target, without holes")
         corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
         rows.append({**properties, "vertices": corners})
     return rows
@@ -108,7 +126,7 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
 
 @dataclass(slots=True)
 class _Found:
-    """Clean echoes on one target: x, y, z, range, amplitude, sigma, unit direction, channel, one row each."""
+    """Clean echoes on one target, one row each: x, y, z, range, amplitude, sigma, unit direction (3), channel."""
 
     rows: list[np.ndarray] = field(default_factory=list)
     number: int = 0
@@ -130,31 +148,60 @@ def calibrate_strip(
     reflectance_error: float = 0.03,
     direction: str = "auto",
 ) -> Calibration:
-    """The calibration constant of a strip over targets: median of its echoes, then of the targets.
+    """Measure the calibration constant of a strip over reference targets.
 
-    Only single, clean echoes count. attenuation [dB/km]; divergence [mrad]; reflectance_error: relative, of the
-    targets.
-    Raises InputError where no target has enough echoes, or nobody knows where the sensor was.
+    It is the median over targets of the median of each target's clean echoes that are alone in their waveform.
+
+    Parameters
+    ----------
+    path : Path
+        The strip.
+    targets : sequence of Target
+    sensor : SensorRequest, optional
+        Where the sensor's positions come from; by default from the strip's packets.
+    system : SystemPulse, optional
+        The pulse; by default from a survey of the strip.
+    attenuation : float
+        Of the air, one way [dB/km].
+    divergence : float, optional
+        Full angle of the beam between the 1/e^2 points [mrad].
+    reflectance_error : float
+        Standard deviation of the targets' reflectances, relative.
+    direction : str
+        Where packet vectors point: auto, toward or away.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        Where no target has enough echoes, or the sensor's position is unknown.
+
+    Notes
+    -----
+    docs/algorithms.md 5.
     """
     with StripReader(path, direction=direction) as reader, reader.scan() as scan:
         source = find_sensor(reader, scan, sensor or SensorRequest())
         if source.kind == "none":
-            raise InputError(f"{path}: nobody knows where the sensor was: give --trajectory or --flight-height")
+            raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
         pulse = system or survey_sample(read_sample(reader, scan)).system
         found = _collect(reader, scan, targets, source, pulse)
         fingerprint = take_fingerprint(path, reader.facts.packet_file)
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
     whole = _combine([result for result, _ in results], reflectance_error)
     if whole is None:
-        told = ", ".join(f"{result['name']}: {result['echoes']} echoes" for result, _ in results)
-        raise InputError(f"{path}: no target has {LEAST_ECHOES} clean single echoes ({told}); check their coordinates")
-    channels = _calibrate_channels(results, reflectance_error)
-    # What has no constant of its own gets that of all together, which then is as uncertain as they differ.
-    apart = float(np.std([row["constant"] for row in channels])) / whole["constant"] if channels else 0.0
-    conditions = f"sensor from {source.kind}, pulse {pulse.sigma_ref:.4g} ns, {whole['echoes']} echoes"
+        counts = ", ".join(f"{result.name}: {result.echoes} echoes" for result, _ in results)
+        raise InputError(f"{path}: no target has {LEAST_ECHOES} clean single echoes ({counts}); check the coordinates")
+    channels = _calibrate_channels(targets, [part for _, part in results], reflectance_error)
+    # Channels that no target was seen by get the constant of all together: its error covers how far channels differ.
+    apart = float(np.std([row.constant for row in channels])) / whole.constant if channels else 0.0
+    conditions = f"sensor from {source.kind}, pulse {pulse.sigma_ref:.4g} ns, {whole.echoes} echoes"
     return Calibration(
-        constant=whole["constant"],
-        relative_error=float(np.hypot(whole["relative_error"], apart)),
+        constant=whole.constant,
+        relative_error=float(np.hypot(whole.relative_error, apart)),
         attenuation=attenuation,
         divergence=divergence,
         strip=Path(path).name,
@@ -169,7 +216,7 @@ def calibrate_strip(
 def _collect(
     reader: StripReader, scan: Any, targets: Sequence[Target], source: SensorSource, system: SystemPulse
 ) -> list[_Found]:
-    """Clean single echoes on every target, unit by unit; only waveforms with a return near a target are decomposed."""
+    """Clean single echoes on every target; only waveforms with a return near a target are decomposed, to save time."""
     chain, found = load_profile("balanced"), [_Found() for _ in targets]
     corners = np.concatenate([target.corners for target in targets])
     low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
@@ -199,12 +246,10 @@ def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Targe
         place.add(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
 
 
-def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[dict[str, Any], np.ndarray]:
-    """What one target gave - echoes, median of the constant, its relative spread, the angle that was used - and the
-    channel and constant of every echo, f8 (n, 2)."""
-    named = {"name": target.name, "reflectance": target.reflectance}
+def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[TargetResult, np.ndarray]:
+    """What one target gave, and the channel and the constant of each of its echoes, f8 (n, 2)."""
     if found.number < LEAST_ECHOES:
-        return {**named, "echoes": found.number}, np.empty((0, 2))
+        return TargetResult(target.name, target.reflectance, found.number), np.empty((0, 2))
     rows = np.concatenate(found.rows)
     xyz, (distance, amplitude, sigma), unit = rows[:, :3], rows[:, 3:6].T, rows[:, 6:9]
     if target.incidence is None:
@@ -212,48 +257,51 @@ def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[dict[s
     else:
         angle = np.full(len(rows), np.radians(target.incidence))
     constant = calibrate_echoes(target.reflectance, angle, distance, amplitude, sigma, attenuation)
-    measured = {**named, **_summarise(constant), "incidence_deg": float(np.degrees(np.median(angle)))}
-    return measured, np.column_stack([rows[:, 9], constant])
+    result = _summarise(target, constant)
+    return replace(result, incidence_deg=float(np.degrees(np.median(angle)))), np.column_stack([rows[:, 9], constant])
 
 
-def _summarise(constant: np.ndarray) -> dict[str, Any]:
-    """Number, median and relative robust spread of constants (n,); the number alone where they are too few."""
+def _summarise(target: Target, constant: np.ndarray) -> TargetResult:
+    """Median and relative robust spread of constants (n,); their number alone where they are too few."""
     if len(constant) < LEAST_ECHOES:
-        return {"echoes": len(constant)}
+        return TargetResult(target.name, target.reflectance, len(constant))
     middle = float(np.median(constant))
     spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
-    return {"echoes": len(constant), "constant": middle, "spread": spread}
+    return TargetResult(target.name, target.reflectance, len(constant), middle, spread)
 
 
-def _combine(results: Sequence[Mapping[str, Any]], reflectance_error: float) -> dict[str, Any] | None:
-    """Constant of several targets, its relative error, the targets' typical spread, and how many echoes they had."""
-    good = [result for result in results if "constant" in result]
+def _combine(results: Sequence[TargetResult], reflectance_error: float, channel: int = 0) -> ChannelConstant | None:
+    """The constant of several targets and its error; None where all of them have too few echoes."""
+    good = [result for result in results if result.constant is not None]
     if not good:
         return None
-    constants = np.array([result["constant"] for result in good])
+    constants = np.array([result.constant for result in good])
     constant = float(np.median(constants))
-    inner = float(np.median([result["spread"] / np.sqrt(result["echoes"]) for result in good]))
+    inner = float(np.median([result.spread / np.sqrt(result.echoes) for result in good]))
     between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
-    return {
-        "constant": constant,
-        "relative_error": float(np.sqrt(reflectance_error**2 / len(good) + inner**2 + between**2)),
-        "spread": float(np.median([result["spread"] for result in good])),
-        "echoes": sum(result["echoes"] for result in good),
-    }
+    return ChannelConstant(
+        digitizer=channel // SCANNERS,
+        scanner=channel % SCANNERS,
+        constant=constant,
+        relative_error=float(np.sqrt(reflectance_error**2 / len(good) + inner**2 + between**2)),
+        spread=float(np.median([result.spread for result in good])),
+        echoes=sum(result.echoes for result in good),
+    )
 
 
 def _calibrate_channels(
-    results: Sequence[tuple[dict[str, Any], np.ndarray]], reflectance_error: float
-) -> tuple[dict[str, Any], ...]:
-    """The same per channel, of a strip whose targets were seen by several; those with too few echoes are left out."""
-    every = np.concatenate([echoes for _, echoes in results])
-    channels = np.unique(every[:, 0]).astype(int).tolist()
+    targets: Sequence[Target], parts: Sequence[np.ndarray], reflectance_error: float
+) -> tuple[ChannelConstant, ...]:
+    """A constant per channel, where several channels saw the targets; channels with too few echoes are left out.
+
+    parts: channel and constant of each echo, f8 (n, 2), one array per target.
+    """
+    channels = np.unique(np.concatenate(parts)[:, 0]).astype(int).tolist()
     if len(channels) < 2:
         return ()
-    rows = []
+    found = []
     for channel in channels:
-        own = [_summarise(echoes[echoes[:, 0] == channel, 1]) for _, echoes in results]
-        found = _combine(own, reflectance_error)
-        if found is not None:
-            rows.append({"digitizer": channel // SCANNERS, "scanner": channel % SCANNERS, **found})
-    return tuple(rows)
+        pairs = zip(targets, parts, strict=True)
+        results = [_summarise(target, part[part[:, 0] == channel, 1]) for target, part in pairs]
+        found.append(_combine(results, reflectance_error, channel))
+    return tuple(row for row in found if row is not None)

@@ -1,30 +1,44 @@
-"""Undamped Gauss-Newton steps: as fast as Levenberg-Marquardt from good starts, lost from bad ones (ALGORITHMS 1.3)."""
+"""Undamped Gauss-Newton steps: as fast as Levenberg-Marquardt from good starts, lost from bad ones.
+
+Used by the stage decompose.gauss_newton, which follows Jutzi and Stilla (docs/algorithms.md 1.3).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.kernels.fit.least_squares import (
-    Windows,
-    add_ridge,
-    evaluate_model,
-    gram_matrix,
-    parameter_units,
-    solve_symmetric,
-)
+from wavebatch.kernels.fit.least_squares import Windows, evaluate_model
+from wavebatch.kernels.fit.normal_equations import add_ridge, gram_matrix, parameter_units, solve_symmetric
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 
 LEAST_WIDTH = 0.1
-"""Width [samples] below which a fit is lost."""
+"""Width [samples] below which a fit counts as lost: so narrow an echo lies on one sample."""
 
 
 def step_undamped(
     windows: Windows, start: np.ndarray, shape: PulseShape, *, tolerance: float, max_iterations: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (m, 3, k) after full Gauss-Newton steps without limits, and which problems converged (m,).
+    """Full Gauss-Newton steps without damping or limits.
 
-    tolerance: a problem is done when the last step promised a fall of chi2 below this. One is lost as soon as a step
-    leads to an amplitude or width that no echo has, or out of the window; its start is given back.
+    Parameters
+    ----------
+    windows : Windows
+        m problems of one length.
+    start : float64 (m, 3, k)
+        Amplitude [count], time and width [samples].
+    shape : PulseShape
+        Model of the pulse.
+    tolerance : float
+        A problem has converged when its last step promised a fall of chi2 below this.
+    max_iterations : int
+        Largest number of steps.
+
+    Returns
+    -------
+    parameters : float64 (m, 3, k)
+        The start itself for problems that are lost: a step led out of the window, or to an impossible amplitude or
+        width.
+    converged : bool (m,)
     """
     parameters, converged = start.copy(), np.zeros(len(start), bool)
     index = np.arange(len(start))

@@ -1,9 +1,7 @@
-"""Batched Levenberg-Marquardt fits of k overlapping echoes in windows of one length (ALGORITHMS.md 2.3).
+"""Batched Levenberg-Marquardt fits of k overlapping echoes in windows of one length (docs/algorithms.md 2.3).
 
-Arrays keep the problems first: windows (m, L), parameters (m, 3, k) in the order amplitude, time, width. The model
-runs in float32, the normal equations are solved in float64 in units in which every basis function has the same
-scale, so that the condition number is that of the overlap alone (H2). Every reduction runs within one problem:
-results do not depend on what else is in the batch.
+Used by `grow` and stages/decompose. Arrays keep the problems first: windows (m, L), parameters (m, 3, k) in the order
+amplitude, time, width. The model runs in float32; the batch must never change the result of a problem.
 """
 
 from __future__ import annotations
@@ -12,54 +10,50 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.kernels.fit.normal_equations import RIDGE, gram_matrix, parameter_units, solve_symmetric
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 BATCH_VALUES = 500_000
-"""Numbers in the rows of one batch: large enough for NumPy, small enough for the cache."""
+"""Numbers in the rows of one batch: large enough for NumPy's calls to cost little, small enough for the cache."""
 
 
 def batch_size(k: int, length: int) -> int:
-    """Problems per batch of k echoes in windows of the given length."""
+    """Problems per batch of k echoes in windows of `length` samples."""
     return int(np.clip(BATCH_VALUES // ((3 * k + 1) * length), 256, 16384))
 
 
 OUTSIDE = np.float32(-1e4)
 """Position of a sample that takes no part: every pulse is zero there."""
 
-RIDGE = 1e-9
-"""Added to the diagonal of the scaled normal equations: an echo outside its window must not make them singular."""
-
 DAMPING = 0.01
 """Marquardt damping of the first step, in units of the diagonal."""
 
 KEPT = 0.75
-"""Share of the promised fall of the cost from which a step was as good as its model says."""
+"""A step whose fall of the cost is at least this share of what it promised eases the damping."""
 
 EASE, RAISE = 0.1, 10.0
-"""What damping is multiplied with after such a step, and after one that is refused; otherwise it stays. Echoes that
-overlap lie in a curved valley: damping that falls after every step that is taken makes each second one too long."""
-
-STEEP = 1e3
-"""Variance inflation by overlap from which normal equations are taken in float64."""
+"""Factors of the damping after such a step, and after a step that is refused; otherwise it stays. Overlapping echoes
+lie in a curved valley: if every accepted step eased the damping, each second step would be too long.
+"""
 
 
 class Windows(NamedTuple):
     """Samples of m problems of one length L."""
 
     y: np.ndarray
-    """Signal above the baseline, 0 where x is OUTSIDE, float32 (m, L)."""
+    """Signal above the baseline, 0 where x is OUTSIDE, float32 (m, L), count."""
     x: np.ndarray
-    """Sample position relative to the problem's own origin, or OUTSIDE, float32 (m, L)."""
+    """Position of the sample in the window, or OUTSIDE, float32 (m, L), samples."""
     std: np.ndarray
-    """Noise of a sample, float64 (m,)."""
+    """Noise of one sample, float64 (m,), count."""
     clipped: np.ndarray | None = None
-    """Samples at the digitizer's limit: they only say that the signal is at least y (H6), bool (m, L)."""
+    """Clipped samples: the signal is at least y (docs/algorithms.md H6), bool (m, L); None for none."""
 
     weight: np.ndarray | None = None
-    """Noise without signal over noise at each sample (H12), float32 (m, L)."""
+    """Noise without signal over noise at each sample (docs/algorithms.md H12), float32 (m, L); None for 1."""
 
     def take(self, rows: np.ndarray) -> Windows:
-        """The problems at `rows`."""
+        """The problems at `rows` (indices or mask)."""
         return Windows(*(None if field is None else field[rows] for field in self))
 
 
@@ -67,19 +61,39 @@ class Limits(NamedTuple):
     """Box of the parameters: arrays that broadcast to (m, 3, k)."""
 
     low: np.ndarray
+    """Smallest values."""
     high: np.ndarray
+    """Largest values."""
 
 
 class WidthPrior(NamedTuple):
-    """An echo is at least as wide as the system pulse: a one-sided prior on the width of overlapping echoes (H1)."""
+    """An echo is at least as wide as the system pulse: a one-sided prior on widths of overlapping echoes.
+
+    Source: docs/algorithms.md H1. Without it, close echoes trade width against amplitude.
+    """
 
     width: float
     """Width of the system pulse [samples]."""
     spread: float
-    """Standard deviation allowed below it [samples]."""
+    """Standard deviation of the prior below that width [samples]."""
 
     def add(self, parameters: np.ndarray, std: np.ndarray, gram: np.ndarray) -> np.ndarray:
-        """Adds the prior to the products (m, 3 k + 1, 3 k + 1) of rows and residual in place; its cost (m,)."""
+        """Adds the prior to the products in place.
+
+        Parameters
+        ----------
+        parameters : float64 (m, 3, k)
+            Where the products were taken.
+        std : float64 (m,), count
+            Noise of one sample.
+        gram : float64 (m, 3 k + 1, 3 k + 1)
+            Products of rows and residual; changed.
+
+        Returns
+        -------
+        float64 (m,), count^2
+            Cost of the prior.
+        """
         k = parameters.shape[2]
         lack = np.maximum(self.width - parameters[:, 2], 0.0)
         cost = np.zeros(len(lack))
@@ -98,25 +112,38 @@ class Fit(NamedTuple):
     """Solution of m problems with k echoes each."""
 
     parameters: np.ndarray
-    """Amplitude, time, width: float64 (m, 3, k)."""
+    """Amplitude, time, width, float64 (m, 3, k)."""
     rows: np.ndarray
-    """Model rows where the last step was taken (see `evaluate_model`), float32 (m, 3 k + 1, L)."""
+    """Model rows at the last step (see `evaluate_model`), float32 (m, 3 k + 1, L)."""
     gram: np.ndarray
     """Their inner products, with the prior, float64 (m, 3 k + 1, 3 k + 1)."""
     cost: np.ndarray
-    """chi2 and prior that the last step promises (m,)."""
+    """chi2 plus prior, as the last step promises, float64 (m,)."""
     converged: np.ndarray
     """bool (m,)."""
     hopeless: np.ndarray
-    """Given up because it cannot reach what was asked for: no rows, no products, bool (m,)."""
+    """Given up because it cannot reach the cost asked for; rows and gram are 0 there, bool (m,)."""
     at_bound: np.ndarray
-    """bool (m, k): a parameter of the echo ended on its bound."""
+    """Whether a parameter of the echo ended on its bound, bool (m, k)."""
 
 
 def evaluate_model(windows: Windows, parameters: np.ndarray, shape: PulseShape) -> np.ndarray:
-    """The rows of a fit, float32 (m, 3 k + 1, L): pulses, derivatives by time, by width (k each), and the residual.
+    """Basis functions and residual of each problem.
 
-    Derivatives are in units of A/s times the row.
+    Parameters
+    ----------
+    windows : Windows
+        m problems of length L.
+    parameters : float64 (m, 3, k)
+        Amplitude, time, width.
+    shape : PulseShape
+        Model of the pulse.
+
+    Returns
+    -------
+    float32 (m, 3 k + 1, L)
+        k pulses, k derivatives by time, k by width (both in units of amplitude / width), and the residual. Rows are
+        weighted; clipped samples count only where the model lies below them.
     """
     amplitude, time, width = parameters.astype(np.float32).transpose(1, 0, 2)[..., None]
     basis = evaluate_pulse(shape, windows.x[:, None, :], time, width)
@@ -135,85 +162,10 @@ def evaluate_model(windows: Windows, parameters: np.ndarray, shape: PulseShape) 
     return rows
 
 
-def gram_matrix(rows: np.ndarray) -> np.ndarray:
-    """Inner products of the rows of each problem, float64 (m, p, p)."""
-    return (rows @ rows.transpose(0, 2, 1)).astype(np.float64)
-
-
-def parameter_units(parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """What one unit of each row's coefficient is worth: 1 for amplitude, s/A for time and width (m, 3, k)."""
-    units = np.ones(parameters.shape)
-    units[:, 1] = units[:, 2] = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
-    return units
-
-
-def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray) -> np.ndarray:
-    """One standard deviation of each parameter from the normal equations (m, 3, k).
-
-    Where echoes overlap so much that float32 products would not do, the products are taken in float64 (H2).
-    """
-    functions = gram[:, :-1, :-1]
-    variance = invert_diagonal(add_ridge(functions.copy()))
-    if parameters.shape[2] > 1:
-        inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
-        steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
-        if len(steep):
-            exact = rows[steep, :-1].astype(np.float64)
-            variance[steep] = invert_diagonal(add_ridge(exact @ exact.transpose(0, 2, 1)))
-    error = np.sqrt(np.maximum(variance, 0)).reshape(parameters.shape)
-    return error * parameter_units(parameters, std) * std[:, None, None]
-
-
-def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solutions (m, p) of symmetric systems (m, p, p); by cofactors for p = 3, where problems are many and tame."""
-    if matrix.shape[1] != 3:
-        return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
-    cofactors, determinant = _cofactors(matrix)
-    xx, xy, xz, yy, yz, zz = cofactors
-    a, b, c = right.T
-    solution = np.empty_like(right)
-    solution[:, 0] = xx * a + xy * b + xz * c
-    solution[:, 1] = xy * a + yy * b + yz * c
-    solution[:, 2] = xz * a + yz * b + zz * c
-    solution /= determinant[:, None]
-    return solution
-
-
-def invert_diagonal(matrix: np.ndarray) -> np.ndarray:
-    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p)."""
-    if matrix.shape[1] != 3:
-        return np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2).copy()
-    (xx, _, _, yy, _, zz), determinant = _cofactors(matrix)
-    return np.stack([xx, yy, zz], axis=1) / determinant[:, None]
-
-
-def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Cofactors xx, xy, xz, yy, yz, zz and determinants of symmetric matrices (m, 3, 3)."""
-    xx, xy, xz, yy, yz, zz = np.ascontiguousarray(matrix.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]])
-    cofactors = (
-        yy * zz - yz * yz,
-        xz * yz - xy * zz,
-        xy * yz - xz * yy,
-        xx * zz - xz * xz,
-        xy * xz - xx * yz,
-        xx * yy - xy * xy,
-    )
-    determinant = xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2]
-    return cofactors, np.where(np.abs(determinant) > 1e-300, determinant, 1e-300)
-
-
-def add_ridge(gram: np.ndarray) -> np.ndarray:
-    """The matrices (m, p, p) with a diagonal that no overlap can make singular; changed in place."""
-    diagonal = np.einsum("mpp->mp", gram)
-    diagonal *= 1 + RIDGE
-    diagonal += RIDGE
-    return gram
-
-
 def _steps(
     gram: np.ndarray, gradient: np.ndarray, damping: np.ndarray, frozen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Marquardt step (m, p) and the fall of the cost that it promises (m,)."""
+    """Marquardt step (m, p), and the fall of the cost that it promises (m,)."""
     matrix = gram.copy()
     if frozen.any():
         free = ~frozen
@@ -238,12 +190,31 @@ def fit_windows(
     hopeless_above: np.ndarray | None = None,
     prior: WidthPrior | None = None,
 ) -> Fit:
-    """Least-squares parameters of k echoes per problem.
+    """Least-squares parameters of k echoes per problem, by Levenberg-Marquardt.
 
-    start: (m, 3, k). tolerance: a problem is done when the Newton step promises a fall of chi2 below this,
-    that is, when it lies within sqrt(tolerance) standard deviations of the minimum. hopeless_above: chi2 (m,) that
-    a problem must be able to fall below; it is given up, not converged, when its progress cannot reach that.
-    prior: added to the cost.
+    Parameters
+    ----------
+    windows : Windows
+        m problems of length L.
+    start : float64 (m, 3, k)
+        Start parameters: amplitude [count], time and width [samples].
+    limits : Limits
+        Box of the parameters.
+    shape : PulseShape
+        Model of the pulse.
+    tolerance : float
+        A problem has converged when the next step promises a fall of chi2 below this: it is then within sqrt(tolerance)
+        standard deviations of the minimum.
+    max_iterations : int
+        Largest number of steps.
+    hopeless_above : float64 (m,), optional
+        chi2 that each problem must fall below; it is given up when its progress cannot reach that.
+    prior : WidthPrior, optional
+        Added to the cost.
+
+    Returns
+    -------
+    Fit
     """
     m, _, k = start.shape
     low, high = (np.broadcast_to(edge, start.shape) for edge in limits)
@@ -285,7 +256,7 @@ def fit_windows(
 def _store(
     fit: Fit, state: _State, place: np.ndarray, out: np.ndarray, finished: np.ndarray, promised: np.ndarray
 ) -> None:
-    """Writes what the problems that are over have reached; a converged one takes its last step unchecked."""
+    """Writes the results of problems that are over; a converged one takes its last step unchecked."""
     fit.parameters[place] = np.where(finished[:, None, None], state.trial[out], state.kept[out])
     fit.cost[place] = state.cost[out] / state.windows.std[out] ** 2 - np.where(finished, promised, 0.0)
     fit.converged[place] = finished
@@ -294,9 +265,9 @@ def _store(
 
 
 def _refresh(fit: Fit, windows: Windows, shape: PulseShape) -> None:
-    """Evaluates the few problems that stopped short again where they stand: their last trial may have been refused.
+    """Evaluates problems that stopped early once more: their last trial may have been refused.
 
-    Those given up are nobody's business any more: nothing is in their rows.
+    Rows of problems that were given up are set to 0.
     """
     fit.rows[fit.hopeless] = 0
     fit.gram[fit.hopeless] = 0
@@ -307,7 +278,7 @@ def _refresh(fit: Fit, windows: Windows, shape: PulseShape) -> None:
 
 
 class _State:
-    """The problems still running: last accepted point with its equations, the trial point, the damping."""
+    """The problems still running: last accepted point with its equations, trial point, damping."""
 
     __slots__ = (
         "accepted", "cost", "damping", "gram", "high", "kept", "low", "prior", "promised", "rows", "trial", "windows"
@@ -326,7 +297,7 @@ class _State:
         self.gram = self.rows = np.empty((m, 0, 0))
 
     def take(self, places: np.ndarray) -> _State:
-        """The same state for some of the problems."""
+        """The state of the problems at `places`."""
         part = object.__new__(_State)
         part.prior, part.rows = self.prior, self.rows
         part.windows = self.windows.take(places)
@@ -335,7 +306,7 @@ class _State:
         return part
 
     def advance(self, shape: PulseShape) -> np.ndarray:
-        """Evaluate the trial, accept or refuse it, set the next trial; the promised fall of the cost (m,)."""
+        """Evaluates the trial, accepts or refuses it, sets the next one; the promised fall of the cost (m,)."""
         std = self.windows.std
         self.rows = evaluate_model(self.windows, self.trial, shape)
         gram = gram_matrix(self.rows)

@@ -1,4 +1,8 @@
-"""The pulse models of a fit: unit pulses and their derivatives for many echoes at once (ALGORITHMS.md 0, R1)."""
+"""Pulse models of a fit: unit pulses and their derivatives for many echoes at once, and tables of their peak and width.
+
+Used by every fit, by `render` and by stages/pulse_tables. Everything is in samples. A model must be finite for
+any position and width, because fits try many (docs/algorithms.md 0, R1).
+"""
 
 from __future__ import annotations
 
@@ -8,54 +12,67 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels.signal.runs import lobe_edges
 
 NO_SKEW = 1e-6
-"""Below this |kappa| a pulse is treated as symmetric."""
+"""Below this |kappa| a pulse counts as symmetric: the skewed formula divides by kappa."""
 
 
 class PulseTable(NamedTuple):
-    """A pulse of any shape as a table, height 1 and peak at 0, linear between its rows; 0 at both ends.
+    """A pulse of any shape as a table: height 1, peak at 0, linear between its rows, 0 at both ends.
 
     The abscissa is in units in which the full width at half maximum is that of a Gaussian of standard deviation 1.
     """
 
     first: float
+    """Abscissa of the first row."""
     step: float
+    """Distance of two rows."""
     value: np.ndarray
-    """float32 (r,)."""
+    """Height, float32 (r,)."""
     slope: np.ndarray
-    """Derivative of the pulse, float32 (r,)."""
+    """Derivative of the height, float32 (r,)."""
 
 
 class PulseShape(NamedTuple):
-    """Shape of the system pulse in samples: a Gaussian, a skewed pulse, or a learned sum of Gaussians.
-
-    kappa: skew of the log-normal pulse in its stable form; 0 for the others.
-    components: (weight, delay, extra variance) of the learned pulse's further Gaussians relative to the first:
-        weight per unit of the first one's area, delay behind it, variance minus the first one's.
-    power: exponent p of the generalized Gaussian exp(-|z|^p / 2); 2 for the others.
-    table: pulse of any shape, stretched in time by the width; None for the others.
-    """
+    """Model of the system pulse: a Gaussian (plain, skewed, generalized), a learned sum of Gaussians, or a table."""
 
     kappa: float = 0.0
+    """Skew of the log-normal pulse in its stable form; 0 for the others."""
     components: tuple[tuple[float, float, float], ...] = ()
+    """Further Gaussians of a learned pulse, relative to the first: weight per unit of its area, delay after it
+    [samples], variance minus its variance [samples^2].
+    """
     power: float = 2.0
+    """Exponent p of the generalized Gaussian exp(-|z|^p / 2); 2 for the others."""
     table: PulseTable | None = None
-
-    @property
-    def is_gaussian(self) -> bool:
-        """True when the plain Gaussian is the whole model."""
-        return abs(self.kappa) < NO_SKEW and not self.components and self.power == 2.0 and self.table is None
+    """Pulse of any shape, stretched in time by the width; None for the others."""
 
 
 GAUSSIAN = PulseShape()
+"""The plain Gaussian."""
 
 
 def evaluate_pulse(shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Unit pulse and its derivatives times s by time and by width, each of the shape that x and t broadcast to.
+    """Unit pulse, and its derivatives by time and by width times the width.
 
-    x: sample positions; t, s: centre and width of echoes; float32 throughout in a fit, float64 where asked.
-    With amplitude A the Jacobian columns are pulse, A/s times the second, A/s times the third.
+    Parameters
+    ----------
+    shape : PulseShape
+        Model of the pulse.
+    x : float, samples
+        Sample positions.
+    t, s : float, samples
+        Centre and width of echoes; x, t and s broadcast. float32 in a fit, float64 elsewhere.
+
+    Returns
+    -------
+    pulse, by_time, by_width : float
+        Of the broadcast shape. With amplitude A the Jacobian is pulse, A/s by_time, A/s by_width.
+
+    References
+    ----------
+    docs/algorithms.md 0 (Gaussian, skewed) and R1 (learned).
     """
     z = x - t
     z *= 1 / s
@@ -71,7 +88,7 @@ def evaluate_pulse(shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarra
 
 
 def evaluate_unit(z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The unit Gaussian e = exp(-z^2/2), e z and e z^2."""
+    """The unit Gaussian e = exp(-z^2/2), e z and e z^2, each of the shape of z."""
     return _evaluate_gaussian(z.copy())
 
 
@@ -85,7 +102,7 @@ def _evaluate_gaussian(z: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _evaluate_skewed(kappa: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
-    """f = exp(-L^2/2), L = log1p(kappa z)/kappa, 0 where kappa z <= -1 (section 0)."""
+    """f = exp(-L^2/2), L = log1p(kappa z)/kappa, 0 where kappa z <= -1 (docs/algorithms.md 0)."""
     inside = np.float32(kappa) * z
     gone = inside <= np.float32(-0.999999)
     inside[gone] = 0
@@ -110,6 +127,7 @@ def _evaluate_power(power: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _evaluate_table(table: PulseTable, z: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The table by linear interpolation."""
     place = (z - z.dtype.type(table.first)) * z.dtype.type(1 / table.step)
     np.clip(place, 0, len(table.value) - 1.001, out=place)
     row = place.astype(np.int32)
@@ -121,7 +139,7 @@ def _evaluate_table(table: PulseTable, z: np.ndarray) -> tuple[np.ndarray, ...]:
 def _evaluate_components(
     shape: PulseShape, x: np.ndarray, t: np.ndarray, s: np.ndarray, z: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Sum of Gaussians that a Gaussian target widens together; amplitude is that of the first one (R1)."""
+    """Sum of Gaussians that a target widens together; amplitude of the first one (docs/algorithms.md R1)."""
     pulse, by_time, by_width = _evaluate_gaussian(z)
     variance = s * s
     for weight, delay, extra in shape.components:
@@ -140,27 +158,42 @@ def _evaluate_components(
 
 
 STEADY = 0.1
-"""Step of the peak's delay from one of 200 widths to the next, in the least width, from which it is a jump."""
+"""Step of the peak's delay between two of 200 widths, in the smallest width, above which the peak has jumped."""
 
 LEAST_RISE = 1e-3
-"""Share by which half widths grow over the allowed widths, where they would not."""
+"""Share by which half widths are made to grow over the allowed widths where they would not."""
 
 
 class PulseTail(NamedTuple):
-    """What a learned pulse does beside its main part, per unit of amplitude, by lag on a grid of TAIL_STEP."""
+    """After-pulses of a learned pulse, per unit of amplitude, by lag on a grid of TAIL_STEP."""
 
     first: float
     """Lag of the first value [samples]."""
     value: np.ndarray
+    """The tail, float64 (r,)."""
 
 
 TAIL_STEP = 0.25
+"""Step of the lags [samples]."""
 CORE = 2.5
-"""Widths of the main part within which its neighbours are one echo with it."""
+"""Within this many widths of the main part a tail is one echo with it."""
 
 
 def pulse_tail(shape: PulseShape, width: float) -> PulseTail | None:
-    """After-pulses and ringing of a learned pulse of the given width; None for a pulse without further components."""
+    """After-pulses and ringing of a learned pulse.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        Model of the pulse.
+    width : float, samples
+        Width of the main part.
+
+    Returns
+    -------
+    PulseTail or None
+        None for a pulse without further components.
+    """
     if not shape.components:
         return None
     reach = max(abs(delay) + 4 * np.sqrt(max(width**2 + extra, 0.0)) for _, delay, extra in shape.components)
@@ -172,14 +205,26 @@ def pulse_tail(shape: PulseShape, width: float) -> PulseTail | None:
 
 
 def tail_at(tail: PulseTail, lag: np.ndarray) -> np.ndarray:
-    """The tail at given lags, 0 beyond its ends."""
+    """The tail at given lags [samples], of their shape; 0 beyond its ends."""
     place = np.rint((lag - tail.first) / TAIL_STEP).astype(np.int64)
     inside = (place >= 0) & (place < len(tail.value))
     return np.where(inside, tail.value[np.clip(place, 0, len(tail.value) - 1)], 0.0)
 
 
 def tail_reach(tail: PulseTail, ratio: np.ndarray) -> np.ndarray:
-    """Samples behind an echo over which its tail exceeds the noise; ratio: amplitude over noise (m,)."""
+    """How far the tail of an echo exceeds the noise.
+
+    Parameters
+    ----------
+    tail : PulseTail
+        Tail of the system pulse.
+    ratio : float (m,)
+        Amplitude over noise of each echo.
+
+    Returns
+    -------
+    int64 (m,), samples
+    """
     after = np.abs(tail.value[int(round(-tail.first / TAIL_STEP)) :])
     highest = np.maximum.accumulate(after[::-1])[::-1]
     number = len(highest) - np.searchsorted(highest[::-1], 1.0 / np.maximum(ratio, 1e-9), side="right")
@@ -187,19 +232,32 @@ def tail_reach(tail: PulseTail, ratio: np.ndarray) -> np.ndarray:
 
 
 class PulseMeasures(NamedTuple):
-    """Peak and full width at half maximum of a pulse by its fitted width: tables over the allowed widths."""
+    """Peak and full width at half maximum of a pulse by its fitted width: tables, float64 (200,)."""
 
     width: np.ndarray
+    """Fitted width [samples], ascending."""
     peak: np.ndarray
     """Height of the peak over the amplitude of the main part."""
     delay: np.ndarray
-    """Peak after the centre of the main part [samples]; of flat tops the middle of the main lobe."""
+    """Peak after the centre of the main part [samples]; for flat tops the middle of the main lobe."""
     half_width: np.ndarray
-    """Full width at half maximum of the main lobe [samples], rising."""
+    """Full width at half maximum of the main lobe [samples], ascending."""
 
 
 def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
-    """Peak, its delay and full width at half maximum for widths from low to high."""
+    """Peak, its delay and full width at half maximum of a pulse, over a range of widths.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        Model of the pulse.
+    low, high : float, samples
+        Smallest and largest width.
+
+    Returns
+    -------
+    PulseMeasures
+    """
     widths = np.linspace(low, high, 200)
     step = low / 100
     reach = max([6 * high, *(abs(delay) + high for _, delay, _ in shape.components)])
@@ -212,9 +270,10 @@ def measure_pulse(shape: PulseShape, low: float, high: float) -> PulseMeasures:
 
 
 def _make_rising(half_width: np.ndarray) -> np.ndarray:
-    """Half widths that grow with every width, as the way back to widths needs.
+    """Half widths that grow with every width, because they are inverted to find widths.
 
-    Some flat-topped sums have dips, which deepen where they are narrow: the pulse becomes lower, its half width larger.
+    Some flat-topped sums have dips, which are deeper where the sum is narrow: the pulse is lower there, its half width
+    larger.
     """
     if np.all(np.diff(half_width) > 0):
         return half_width
@@ -223,27 +282,29 @@ def _make_rising(half_width: np.ndarray) -> np.ndarray:
 
 
 def _measure_one(pulse: np.ndarray, x: np.ndarray) -> tuple[float, float, float, float]:
-    """Height and place of the peak, full width at half maximum of its lobe, and the middle of that."""
+    """Height and place of the peak, full width at half maximum of its lobe, and the middle of the lobe."""
     top = int(np.argmax(pulse))
-    below = pulse < 0.5 * pulse[top]
-    right = top + int(np.argmax(below[top:]))
-    left = top - int(np.argmax(below[top::-1]))
-
-    def cross(a: int, b: int) -> float:
-        return x[a] + (x[b] - x[a]) * (0.5 * pulse[top] - pulse[a]) / (pulse[b] - pulse[a])
-
-    begin, end = cross(left + 1, left), cross(right - 1, right)
+    begin, end = lobe_edges(x, pulse, 0.5 * pulse[top])
     return float(pulse[top]), float(x[top]), end - begin, 0.5 * (begin + end)
 
 
 TABLE_ROWS = 64
-"""Rows of a tabulated pulse per unit of width."""
+"""Rows of a tabulated pulse per unit of width: linear interpolation of a Gaussian is then exact to 3e-5 of its peak."""
 
 
 def tabulate_pulse(x: np.ndarray, value: np.ndarray) -> PulseTable:
-    """A pulse given at evenly spaced x as a table: a cubic spline through its samples, 0 beyond them.
+    """A table of a pulse: a cubic spline through its samples, 0 beyond them.
 
-    Height, place of the peak and width are taken out of it.
+    Parameters
+    ----------
+    x : float (r,)
+        Evenly spaced positions, in any unit.
+    value : float (r,)
+        The pulse, of any height, place and width; these are taken out.
+
+    Returns
+    -------
+    PulseTable
     """
     step = x[1] - x[0]
     x = np.concatenate([x[0] - step * np.arange(3, 0, -1), x, x[-1] + step * np.arange(1, 4)])

@@ -1,4 +1,7 @@
-"""Waveforms from echoes: the sum of the fitted pulses, sample by sample."""
+"""Waveforms from echoes: the sum of the fitted pulses at every sample.
+
+Used by stages that need residuals and by the survey.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,33 @@ import numpy as np
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 ROWS = 8192
-"""Echoes painted at a time."""
+"""Echoes rendered at a time, so that memory stays small."""
 
 
 def render_echoes(
-    shape: PulseShape,
-    n: int,
-    s: int,
-    waveform: np.ndarray,
-    time: np.ndarray,
-    amplitude: np.ndarray,
-    width: np.ndarray,
+    shape: PulseShape, n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
 ) -> np.ndarray:
-    """Signal (n, s), float32, of echoes sorted by waveform; times and widths in samples (m,)."""
+    """The sum of all pulses of each waveform.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        Model of the pulse.
+    n, s : int
+        Number of waveforms, and of samples of each.
+    waveform : int (m,)
+        Row of each echo, ascending.
+    time, amplitude, width : float (m,), samples, count, samples
+        Parameters of each echo.
+
+    Returns
+    -------
+    float32 (n, s), count
+        Signal without baseline.
+    """
     signal = np.zeros((n, s), np.float32)
     x = np.arange(s, dtype=np.float32)
-    # Parts end with a waveform: so the order in which its echoes are added does not depend on the others.
+    # Parts end with a waveform, so that the order in which its echoes are added does not depend on the others.
     borders = np.append(np.unique(np.searchsorted(waveform, waveform[::ROWS])), len(waveform))
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         part = slice(begin, end)

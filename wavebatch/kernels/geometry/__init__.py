@@ -1,1 +1,1 @@
-"""Planes, normals, rays, lines and grids."""
+"""Planes, normals, rays, scan lines, tiles and voxels: geometry of points and pulses."""

@@ -1,36 +1,54 @@
-"""Which points belong to one pulse, which return is nearest to an echo, and numbers along the ray."""
+"""Which points belong to one pulse, which return is nearest to an echo, and return numbers along the ray.
+
+Used where clouds are written and compared. Nothing here may depend on other pulses than that of the point.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 LONGEST_PULSE = 64
-"""Points of equal gps time from which on the time is taken for a constant, not for that of one pulse."""
+"""From this many points of equal GPS time on, the time is a constant and not that of one pulse."""
 
 
 def find_pulses(gps_time: np.ndarray) -> np.ndarray:
-    """First point of the pulse that each point belongs to, i8 (n,).
+    """First point of the pulse that each point belongs to.
 
-    A pulse is a run of points of equal time. Where the time is 0, or the same for LONGEST_PULSE points or more, it says
-    nothing and each point stands for itself.
+    A pulse is a run of points of equal time. Where the time is 0, or the same for LONGEST_PULSE points or more, each
+    point is a pulse.
+
+    Parameters
+    ----------
+    gps_time : float64 (n,), s
+        In the order of the file.
+
+    Returns
+    -------
+    int64 (n,)
     """
     n = len(gps_time)
-    index = np.arange(n)
-    if not n:
-        return index
-    start = np.flatnonzero(np.append(True, gps_time[1:] != gps_time[:-1]))
+    start = np.flatnonzero(np.append(True, gps_time[1:] != gps_time[:-1])[:n])
     length = np.diff(np.append(start, n))
     alone = np.repeat((length >= LONGEST_PULSE) | (gps_time[start] == 0), length)
-    return np.where(alone, index, np.repeat(start, length))
+    return np.where(alone, np.arange(n), np.repeat(start, length))
 
 
 def find_nearest(
     echo_waveform: np.ndarray, echo_time: np.ndarray, return_waveform: np.ndarray, return_time: np.ndarray
 ) -> np.ndarray:
-    """Row of the return of the same waveform that is nearest in time to each echo, -1 without one, i8 (m,).
+    """The return of the same waveform that is nearest in time to each echo.
 
-    Of two equally near ones the earlier. Times are compared as they are, so that the answer depends on nothing but the
-    waveform's own echoes and returns.
+    Parameters
+    ----------
+    echo_waveform, echo_time : int (m,), float (m,)
+        Waveform of each echo, and its time.
+    return_waveform, return_time : int (k,), float (k,)
+        The same of each return; time in the same unit.
+
+    Returns
+    -------
+    int64 (m,)
+        Row of the return, -1 without one; of two equally near ones the earlier.
     """
     if not len(return_waveform) or not len(echo_waveform):
         return np.full(len(echo_waveform), -1, np.int64)
@@ -52,7 +70,7 @@ def find_nearest(
 def _find_nearest_of_many(
     echo_waveform: np.ndarray, echo_time: np.ndarray, return_waveform: np.ndarray, return_time: np.ndarray
 ) -> np.ndarray:
-    """As find_nearest, with any number of returns in each waveform."""
+    """As `find_nearest`, with any number of returns in each waveform."""
     k, m = len(return_waveform), len(echo_waveform)
     first = np.lexsort((return_time, return_waveform))
     waveform, time = return_waveform[first], return_time[first]
@@ -74,19 +92,28 @@ def _find_nearest_of_many(
 def number_returns(
     pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return number and number of returns (m,) by the order along the ray of the pulse, and where they mean something.
+    """Return numbers by the order along the ray of the pulse.
 
-    pulse: equal for the points of a pulse (m,). xyz: where the points lie [m] (m, 3).
-    direction: away from the sensor (m, 3), zeros for points whose ray is not known; a pulse of only such points has no
-    order.
+    Parameters
+    ----------
+    pulse : int (m,)
+        Equal for the points of a pulse.
+    xyz : float64 (m, 3), m
+        Positions.
+    direction : float (m, 3)
+        Away from the sensor; zeros for points whose ray is not known.
+
+    Returns
+    -------
+    number, count : int64 (m,)
+        Return number and number of returns.
+    ordered : bool (m,)
+        False for pulses of which no point has a ray: their numbers mean nothing.
     """
     m = len(pulse)
-    if not m:
-        none = np.empty(0, np.int64)
-        return none, none, np.empty(0, bool)
     has_ray = np.any(direction != 0, axis=1)
     grouped = np.lexsort((~has_ray, pulse))
-    is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])
+    is_first = np.append(True, pulse[grouped][1:] != pulse[grouped][:-1])[:m]
     group = np.empty(m, np.int64)
     group[grouped] = np.cumsum(is_first) - 1
     head = grouped[is_first][group]

@@ -1,5 +1,7 @@
-"""Straight lines in a slice of intensities: weighted Hough transform, refined by weighted total least squares
-(ALGORITHMS.md 1.3)."""
+"""Straight lines in a slice of intensities: weighted Hough transform, refined by weighted total least squares.
+
+Used by the slices tool (Jutzi and Stilla, docs/algorithms.md 1.3). A pixel belongs to one line at most.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 
 THETA_STEP = 0.5
-"""Step of the accumulator [deg]; that of rho is one pixel."""
+"""Step of the accumulator [deg]; the step of rho is one pixel."""
 BAND = 3.0
 """Half width of the band around a line whose pixels are the line's, in sigma of the pulse."""
 CROWD = 1.4
-"""Largest spread of a line's pixels about it, in sigma: a pulse's is 1, that of noise within the band 1.73."""
+"""Largest spread of a line's pixels about it, in sigma: that of a pulse is 1, that of noise in the band 1.73."""
 ROUNDS = 5
+"""Rounds of refinement of a line."""
 _FAILURES = 5
+"""Largest sums in a row that belong to no segment before the search ends."""
 _CHUNK = 65_536
+"""Votes that are computed at a time."""
 _REACH = 16_384
-"""Steps of rho to each side at most: slices that reach further have coarser steps, so that memory is bounded."""
+"""Largest number of steps of rho on each side: larger slices have coarser steps, so that memory is bounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,19 +30,21 @@ class HoughLine:
     """A segment of the line x cos(theta) + y sin(theta) = rho, in pixels."""
 
     theta: float
-    """[deg], in [-90, 90)."""
+    """Direction of the normal [deg], in [-90, 90)."""
     rho: float
+    """Distance of the line from the origin [pixels]."""
     start: tuple[float, float]
-    """End of the segment with the smaller x (of a vertical one, the smaller y)."""
+    """End of the segment with the smaller x (of a vertical one, the smaller y) [pixels]."""
     end: tuple[float, float]
+    """The other end [pixels]."""
     weight: float
     """Sum of the intensities of its pixels."""
     rows: np.ndarray
-    """Its pixels: indices into what was given, i8 (k,), ascending."""
+    """Its pixels, as indices into the input, int64 (k,), ascending."""
 
     @property
     def length(self) -> float:
-        """Distance of the ends [pixels]."""
+        """Distance between the ends [pixels]."""
         return float(np.hypot(self.end[0] - self.start[0], self.end[1] - self.start[1]))
 
 
@@ -51,12 +58,30 @@ def find_lines(
     shortest: float = 20.0,
     most: int = 20,
 ) -> list[HoughLine]:
-    """Segments among pixels at x, y (n,) [pixels] with intensities `weight` (n,) > 0, the strongest first.
+    """Line segments among pixels, the strongest first.
 
-    sigma: standard deviation of the pulse [pixels]. A line is the largest sum in the accumulator of intensities,
-    refined by weighted total least squares of the pixels within BAND sigma; a segment is its longest run without a gap
-    of more than `gap`, at least `shortest` long, whose pixels crowd about it. Its pixels are taken off, and so on until
-    `most` are found or the largest sums belong to no segment. Coordinates may be fractions of pixels.
+    A line is the largest sum in the accumulator of intensities, refined by weighted total least squares of the pixels
+    within BAND sigma. A segment is its longest run without a larger gap. Its pixels are removed, and the search goes
+    on.
+
+    Parameters
+    ----------
+    x, y : float (n,), pixels
+        Positions; they may be fractions.
+    weight : float (n,)
+        Intensities, positive.
+    sigma : float, pixels
+        Standard deviation of the pulse.
+    gap : float, pixels
+        Largest gap within a segment.
+    shortest : float, pixels
+        Smallest length of a segment.
+    most : int
+        Largest number of segments.
+
+    Returns
+    -------
+    list of HoughLine
     """
     if len(x) < 2:
         return []
@@ -85,7 +110,7 @@ def find_lines(
 
 
 class _Accumulator:
-    """Sums of intensities over theta and rho; votes are split linearly between the two nearest rho."""
+    """Sums of intensities over theta and rho; each vote is split linearly between the two nearest rho."""
 
     def __init__(self, points: np.ndarray) -> None:
         reach = float(np.hypot(*np.abs(points).max(axis=0)))
@@ -98,7 +123,7 @@ class _Accumulator:
         self._whole = 0.0
 
     def vote(self, rows: np.ndarray, weight: np.ndarray) -> None:
-        """Adds the intensities (negative ones take votes back) of pixels `rows`."""
+        """Adds the intensities of pixels `rows`; negative ones take votes back."""
         self._whole += float(weight.sum())
         cells = self._sums.reshape(-1)
         step = max(_CHUNK // max(len(rows), 1), 1)
@@ -144,14 +169,14 @@ def _settle(
     gap: float,
     shortest: float,
 ) -> tuple[_Run | None, np.ndarray]:
-    """The segment near the line `start`, or None, and the pixels to take off."""
+    """The segment near the line `start`, or None, and the pixels to remove."""
     angle, rho = start
     normal = np.array([np.cos(angle), np.sin(angle)])
-    middle, along = rho * normal, np.array([-normal[1], normal[0]])
+    middle, along = rho * normal, _across(normal)
     first = tried = rows[np.abs((points[rows] - middle) @ normal) <= band]
     ends = (0.0, 0.0)
     for _ in range(ROUNDS):
-        inside = rows[np.abs((points[rows] - middle) @ np.array([-along[1], along[0]])) <= band]
+        inside = rows[np.abs((points[rows] - middle) @ _across(along)) <= band]
         inside, ends = _longest_run(inside, (points[inside] - middle) @ along, gap)
         if len(inside) < 2:
             return None, first
@@ -166,9 +191,14 @@ def _settle(
     return _Run(middle, along, ends, tried), tried
 
 
+def _across(along: np.ndarray) -> np.ndarray:
+    """A direction turned left by 90 degrees."""
+    return np.array([-along[1], along[0]])
+
+
 def _measure_spread(apart: np.ndarray, weight: np.ndarray, along: np.ndarray) -> float:
-    """Spread of pixels about their line: the median of its quarters', so that one bright spot does not count."""
-    place, off = apart @ along, apart @ np.array([-along[1], along[0]])
+    """Spread of pixels about their line: the median of its four quarters, so that one bright spot does not decide."""
+    place, off = apart @ along, apart @ _across(along)
     low, high = place.min(), place.max()
     part = np.minimum(4 * (place - low) / max(high - low, 1e-12), 3).astype(np.int64)
     sums = np.bincount(part, weight, 4)
@@ -187,7 +217,7 @@ def _fit(points: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _longest_run(rows: np.ndarray, place: np.ndarray, gap: float) -> tuple[np.ndarray, tuple[float, float]]:
-    """The rows, ascending, of the longest run of places without a larger gap, and the places of its ends."""
+    """Rows, ascending, of the longest run of places without a larger gap, and the places of its ends."""
     if not len(rows):
         return rows, (0.0, 0.0)
     order = np.argsort(place, kind="stable")
@@ -201,16 +231,9 @@ def _longest_run(rows: np.ndarray, place: np.ndarray, gap: float) -> tuple[np.nd
 
 def _describe(run: _Run, centre: np.ndarray, weight: np.ndarray) -> HoughLine:
     middle = run.middle + centre
-    normal = np.array([-run.along[1], run.along[0]])
+    normal = _across(run.along)
     theta = np.degrees(np.arctan2(normal[1], normal[0]))
     if not -90 <= theta < 90:
         normal, theta = -normal, (theta + 270) % 180 - 90
-    ends = [middle + place * run.along for place in run.ends]
-    return HoughLine(
-        float(theta),
-        float(middle @ normal),
-        (float(ends[0][0]), float(ends[0][1])),
-        (float(ends[1][0]), float(ends[1][1])),
-        float(weight[run.rows].sum()),
-        run.rows,
-    )
+    start, end = (tuple((middle + place * run.along).tolist()) for place in run.ends)
+    return HoughLine(float(theta), float(middle @ normal), start, end, float(weight[run.rows].sum()), run.rows)

@@ -1,4 +1,7 @@
-"""Pairing of echoes with returns: one to one, nearest in time, for a whole block at once."""
+"""Pairs of echoes and returns: one to one, nearest in time, for a whole block at once.
+
+Used where echoes are placed on returns, and by the score.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,24 @@ def match_returns(
     return_time: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """Row of the return that each echo is matched with, -1 where there is none, i8 (m,).
+    """The return that each echo is matched with.
 
-    Pairs are mutual nearest neighbours of one waveform, not further apart than tolerance [ns]; taken pairs are put
-    aside and the rest is paired again until no pair is left. Both sides must be sorted by waveform.
+    Pairs are mutual nearest neighbours within one waveform. Taken pairs are removed and the rest is paired again, until
+    no pair is left.
+
+    Parameters
+    ----------
+    echo_waveform, echo_time : int (m,), float (m,), ns
+        Echoes, sorted by waveform.
+    return_waveform, return_time : int (k,), float (k,), ns
+        Returns, sorted by waveform.
+    tolerance : float, ns
+        Largest distance of a pair.
+
+    Returns
+    -------
+    int64 (m,)
+        Row of the return, -1 without one.
     """
     matched = np.full(len(echo_waveform), -1, np.int64)
     if not len(echo_waveform) or not len(return_waveform):
@@ -40,7 +57,7 @@ def match_returns(
 
 
 def _nearest(keys: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Index of the nearest of sorted `others` for each key; of two equally near, the first."""
+    """Index of the nearest of sorted `others` for each key; of two equally near ones the first."""
     right = np.clip(np.searchsorted(others, keys), 0, len(others) - 1)
     left = np.maximum(right - 1, 0)
     return np.where(keys - others[left] <= others[right] - keys, left, right)

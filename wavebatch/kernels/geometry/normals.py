@@ -1,4 +1,8 @@
-"""Angles between rays and the surface that the points around say there is, for many points at once."""
+"""Angles between rays and the surface through the points around, for many points at once.
+
+Used by the second pass of the stage attribute.incidence_angle_normals. The result of a point must not depend on the
+tile it is computed in: neighbours are thinned, sorted and summed in an order that tiles do not change.
+"""
 
 from __future__ import annotations
 
@@ -11,44 +15,61 @@ from wavebatch.kernels.geometry.planes import fit_planes, is_flat, measure_angle
 from wavebatch.kernels.physics.incidence import STEEPEST
 
 PAIRS = 500_000
-"""Neighbours that are worked on at a time, about: 100 bytes each."""
+"""Pairs of neighbours that are handled at a time, about 100 bytes each."""
 
 FINENESS = 4.0
-"""Radius of a neighbourhood by the side of the cells in which dense points are thinned out."""
+"""Radius of a neighbourhood divided by the side of the cells in which dense points are thinned."""
 
 MOST_PER_CELL = 4
-"""Points of a cell that count as neighbours: a surface has at most 200, however dense the points are."""
+"""Points of a cell that count as neighbours: a surface has at most 200, even if points are dense."""
 
 LEAST_KEPT = 0.6
-"""Least share of the neighbours that lies in the plane."""
+"""Smallest share of the neighbours that must lie in the plane."""
 
 _LARGEST_CHUNK = 4096
+"""Points that are handled at a time at most."""
 
 
 class Gap(IntEnum):
-    """Why a point has no angle, or that it has one."""
+    """Why a point has no angle; KNOWN if it has one."""
 
     NO_RAY = 0
-    """No waveform, no echo, or a direction that is none."""
+    """No waveform, no echo, or a direction of length 0."""
     KNOWN = 1
+    """It has an angle."""
     FEW_NEIGHBOURS = 2
+    """Fewer than min_points neighbours."""
     NO_PLANE = 3
+    """The neighbours form no plane that the point lies in."""
     TOO_STEEP = 4
+    """The ray nearly lies in the plane."""
     UNCERTAIN = 5
+    """The angle is less certain than max_error."""
 
 
 def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
-    """Which points count as neighbours within `radius` [m] of others, bool (n,): at most MOST_PER_CELL in each cell.
+    """Which points count as neighbours of others: at most MOST_PER_CELL in each cell.
 
-    xyz: (n, 3) [m]; row: their places in the file, i8 (n,), which decide as if by lot. A cell whose points are all
-    there keeps the same ones, whatever else is there; cells that hold few keep all.
+    Parameters
+    ----------
+    xyz : float64 (n, 3), m
+        Positions.
+    row : int64 (n,)
+        Places in the file; a hash of them decides which points of a full cell stay, so that the choice is the same in
+        every tile that holds the whole cell.
+    radius : float, m
+        Of the neighbourhoods.
+
+    Returns
+    -------
+    bool (n,)
     """
     side = radius / FINENESS
     cell = [np.floor(xyz[:, axis] / side) for axis in range(3)]
     lot = row.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     order = np.lexsort((lot, *cell))
-    new = np.ones(len(order), bool)
-    new[1:] = False
+    new = np.zeros(len(order), bool)
+    new[:1] = True
     for values in cell:
         new[1:] |= values[order[1:]] != values[order[:-1]]
     start = np.flatnonzero(new)
@@ -59,17 +80,32 @@ def thin_out(xyz: np.ndarray, row: np.ndarray, radius: float) -> np.ndarray:
 
 
 class Surroundings:
-    """Points (m, 3) [m], finite, that others are neighbours of; their order decides in which order sums run."""
+    """Points (m, 3) [m], finite, that may be neighbours of others. Sums run in the order of these points."""
 
     def __init__(self, xyz: np.ndarray) -> None:
         self._xyz = np.ascontiguousarray(xyz, np.float64)
         self._tree = scipy.spatial.cKDTree(self._xyz, balanced_tree=False, compact_nodes=False)
 
     def find(self, points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs (point, neighbour) at most `radius` apart, sorted: numbers of points (k,), and offsets [m] (k, 3)."""
+        """Pairs (point, neighbour) that are at most `radius` apart.
+
+        Parameters
+        ----------
+        points : float64 (n, 3), m
+            Points to look around.
+        radius : float, m
+            Largest distance.
+
+        Returns
+        -------
+        point : int64 (k,)
+            Number of the point; pairs are sorted by point, then neighbour.
+        offset : float64 (k, 3), m
+            From the point to the neighbour.
+        """
         if not len(points) or not len(self._xyz):
             return np.empty(0, np.int64), np.empty((0, 3))
-        # The tree rounds distances as its own boxes make it; the exact test below is the same in every tree.
+        # Rounded distances differ from tree to tree; the exact test below is the same in every tree.
         tree = scipy.spatial.cKDTree(points)
         near = tree.sparse_distance_matrix(self._tree, radius * (1 + 1e-6), output_type="ndarray")
         key = np.sort(near["i"] * np.int64(len(self._xyz)) + near["j"])
@@ -81,21 +117,35 @@ class Surroundings:
 
 
 def measure_normals(
-    points: np.ndarray,
-    ray: np.ndarray,
-    around: Surroundings,
-    *,
-    radius: float,
-    min_points: int,
-    max_error: float,
+    points: np.ndarray, ray: np.ndarray, around: Surroundings, *, radius: float, min_points: int, max_error: float
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Angle between ray and surface normal, and its standard deviation, f4 (n,) [deg]; and what became of each point.
+    """Angle between ray and surface normal at each point.
 
-    points: f8 (n, 3) [m]; ray: directions of any length, (n, 3). The surface is the robust plane through the neighbours
-    within `radius` [m]. NaN where the second result, a Gap u1 (n,), is not KNOWN: fewer than min_points neighbours; no
-    plane (less than 60 % of them in it, thicker than a fifth of its width, or the point itself not in it); a plane that
-    the ray all but lies in (plants struck by one sweep of the scanner are such a plane, and no surface); or the angle
-    more uncertain than max_error [deg].
+    The surface is the robust plane through the neighbours.
+
+    Parameters
+    ----------
+    points : float64 (n, 3), m
+        Positions.
+    ray : float (n, 3)
+        Directions, of any length.
+    around : Surroundings
+        Points that count as neighbours.
+    radius : float, m
+        Of the neighbourhood.
+    min_points : int
+        Smallest number of neighbours.
+    max_error : float, deg
+        Angles that are less certain are not given.
+
+    Returns
+    -------
+    (angle, error) : float32 (n,), deg
+        Angle and its standard deviation; NaN where `gap` is not KNOWN.
+    gap : uint8 (n,)
+        Codes of Gap. NO_PLANE: less than 60 % of the neighbours in the plane, thicker than a fifth of its width, or the
+        point itself not in it. TOO_STEEP: the ray nearly lies in the plane; plants seen by one sweep of the scanner
+        form such a plane, which is no surface.
     """
     angle, error = np.full((2, len(points)), np.nan, np.float32)
     gap = np.full(len(points), Gap.NO_RAY, np.uint8)
@@ -113,13 +163,13 @@ def measure_normals(
 
 
 def _by_place(points: np.ndarray, wanted: np.ndarray, side: float) -> np.ndarray:
-    """The wanted points cell by cell: those that are looked up together should lie together."""
+    """The wanted points cell by cell: points that are searched together should lie together."""
     rows = np.flatnonzero(wanted)
     return rows[np.lexsort(tuple(np.floor(points[rows, axis] / side) for axis in (2, 1, 0)))]
 
 
 def _normalise(ray: np.ndarray) -> np.ndarray:
-    """Unit vectors, NaN where there is no direction."""
+    """Unit vectors, NaN where the length is 0."""
     x, y, z = np.ascontiguousarray(ray.T, np.float64)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         length = np.sqrt(x * x + y * y + z * z)
@@ -129,7 +179,7 @@ def _normalise(ray: np.ndarray) -> np.ndarray:
 def _judge(
     offset: np.ndarray, point: np.ndarray, unit: np.ndarray, min_points: int, max_error: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angles and errors [rad] of some points from their neighbours, NaN where the Gap is not KNOWN."""
+    """Angles and errors [rad] of points from their neighbours, NaN where the Gap is not KNOWN."""
     n = len(unit)
     count = np.bincount(point, minlength=n)
     planes = fit_planes(offset, point, n)

@@ -1,7 +1,7 @@
 """Robust planes through many sets of points at once, and the angle at which rays meet them.
 
-A set is a run of rows that have the same `group`. Sums run over a set's rows in their order and over nothing else, so
-that a plane does not depend on which other sets are fitted with it.
+Used by `normals` and by the calibration targets. A set is a run of rows with the same `group`. Sums run over the rows
+of a set in their order and over nothing else, so that a plane does not depend on the other sets.
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ OUTLYING = 4.0
 """Points further from the plane than this many robust standard deviations do not count."""
 
 LEAST_SPREAD = 1e-3
-"""Points lie no nearer to a plane than this [m], median or standard deviation: coordinates are rounded."""
+"""Smallest median distance or standard deviation about a plane [m], because coordinates are rounded."""
 
 FLAT = 0.04
-"""Largest variance across a plane by the lesser one within it: beyond this, points are no surface."""
+"""Largest variance across a plane divided by the smaller variance within it; above, points are no surface."""
 
 SMOOTH = 0.0025
-"""The same ratio for sets that may be more than one surface, and are looked at more closely."""
+"""Above this ratio a set may be more than one surface and is looked at more closely."""
 
 TIGHT = 1.5
-"""While a set is not smooth, points further off than this many medians are left out: two surfaces (a ridge), or one and
-its plants, pull a plane through all their points so far off that none of these is an outlier."""
+"""While a set is not smooth, points further off than this many medians are left out: two surfaces (a ridge), or a
+surface with plants, pull a plane through all their points so far that none of these is an outlier.
+"""
 
 FOLDED = 1.515
-"""Standard deviations of two tilts within which 68.3 % of all angles lie whose true value is 0."""
+"""Standard deviations of two tilts within which 68.3 % of the angles lie whose true value is 0."""
 
 _TIGHT_ROUNDS = 3
+"""Rounds in which sets that are not smooth use only the nearer points."""
 _ROUNDS = 8
+"""Largest number of rounds."""
 _PRODUCTS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -40,33 +43,50 @@ class Planes(NamedTuple):
     """A plane per set of points."""
 
     axes: np.ndarray
-    """Unit vectors as columns: normal, shorter and longer direction within the plane, f8 (n, 3, 3)."""
+    """Unit vectors as columns: normal, shorter and longer direction within the plane, float64 (n, 3, 3)."""
     spreads: np.ndarray
-    """Variance of the points that count along these axes [m2], ascending, f8 (n, 3)."""
+    """Variance of the points that count along these axes, ascending, float64 (n, 3), m2."""
     centre: np.ndarray
-    """Mean of the points that count [m], f8 (n, 3)."""
+    """Mean of the points that count, float64 (n, 3), m."""
     kept: np.ndarray
-    """Points that count, i8 (n,)."""
+    """Points that count, int64 (n,)."""
     limit: np.ndarray
-    """Distance from the plane beyond which points do not count [m], f8 (n,)."""
+    """Distance from the plane beyond which points do not count, float64 (n,), m."""
 
     @property
     def normal(self) -> np.ndarray:
-        """Unit normals, either way up, f8 (n, 3)."""
+        """Unit normals, pointing up or down, float64 (n, 3)."""
         return self.axes[:, :, 0]
 
     def offset(self) -> np.ndarray:
-        """Distance between plane and the origin of each set's coordinates [m], f8 (n,)."""
+        """Distance between the plane and the origin of each set's coordinates, float64 (n,), m."""
         return np.abs(_dot(self.centre, self.normal))
 
 
 def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
-    """Planes through n sets of points by least squares; what lies four robust standard deviations off is left out.
+    """Planes through n sets of points by least squares, without outliers.
 
-    xyz: f8 (k, 3) [m], relative to somewhere in their set. group: number of the set, ascending, i8 (k,).
-    Points are left out, and the plane fitted anew, until nothing changes or eight times; in the first three rounds of
-    sets that are not smooth only the nearer points count (see TIGHT). A set without three points that are not in line
-    has any plane: its spreads say so. Source: trimmed least squares with concentration steps (Rousseeuw).
+    Points off by more than four robust standard deviations are left out, and the plane is fitted again, until nothing
+    changes or eight times. In the first three rounds of sets that are not smooth only the nearer points count (see
+    TIGHT).
+
+    Parameters
+    ----------
+    xyz : float64 (k, 3), m
+        Relative to a place in their set.
+    group : int64 (k,)
+        Number of the set, ascending.
+    n : int
+        Number of sets.
+
+    Returns
+    -------
+    Planes
+        A set without three points that are not in line has an arbitrary plane, as its spreads show.
+
+    References
+    ----------
+    Rousseeuw and Van Driessen (1999): trimmed least squares with concentration steps.
     """
     count = np.bincount(group, minlength=n)
     x = np.ascontiguousarray(xyz.T)
@@ -90,7 +110,7 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
         near = off <= limit[at]
         changed = np.bincount(local, near != kept[rows], minlength=len(active)) > 0
         kept[rows] = near
-        # What is left out is little: taking it off costs less than adding up all the rest.
+        # Few points are left out: to subtract them costs less than to add up all the others.
         out = np.flatnonzero(changed[local] & ~near)
         left_out = _sum_moments(x[:, rows[out]], local[out], len(active))
         active, moved = active[changed | tight], active[changed]
@@ -102,22 +122,37 @@ def fit_planes(xyz: np.ndarray, group: np.ndarray, n: int) -> Planes:
 
 
 def is_flat(spreads: np.ndarray) -> np.ndarray:
-    """Whether points with these variances along their axes (n, 3) lie in a plane, bool (n,)."""
+    """Whether points with variances `spreads` along their axes (n, 3) lie in a plane, bool (n,)."""
     return spreads[:, 0] <= FLAT * spreads[:, 1]
 
 
 def fit_normal(xyz: np.ndarray) -> np.ndarray:
-    """Unit normal of the robust plane through points (k, 3), k > 0."""
+    """Unit normal, float64 (3,), of the robust plane through points (k, 3), k > 0."""
     return fit_planes(xyz - xyz.mean(axis=0), np.zeros(len(xyz), np.int64), 1).normal[0]
 
 
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angle between rays and planes' normals, 0 to pi/2 [rad], and its standard deviation, f8 (n,).
+    """Angle between rays and the normals of planes.
 
-    ray: unit vectors, f8 (n, 3). The error follows from how uncertain the plane's two tilts are: points scatter about
-    it by s, so that a tilt along an axis with spread l has s / sqrt(k l). It is infinite where the points are in line.
-    Three points have no scatter to judge by; the least one is assumed. Angles that may be 0 have an error that reaches
-    there: an angle is never negative, so that 0 is found as 1.25 standard deviations of a tilt.
+    Parameters
+    ----------
+    planes : Planes
+        n planes.
+    ray : float64 (n, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    angle : float64 (n,), rad
+        0 to pi/2.
+    error : float64 (n,), rad
+        Standard deviation; infinite where the points are in line.
+
+    Notes
+    -----
+    Points scatter about a plane by s, so that a tilt along an axis with spread l has the error s / sqrt(k l). Three
+    points have no scatter to judge by; LEAST_SPREAD is assumed. An angle is never negative: a true 0 is found as 1.25
+    standard deviations of a tilt, so that errors of angles near 0 reach down to 0.
     """
     facing, short, long = (_dot(ray, planes.axes[:, :, axis]) for axis in range(3))
     sine = np.hypot(short, long)
@@ -127,7 +162,7 @@ def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndar
     scatter = np.maximum(flat, 0.0) * kept / np.maximum(kept - 3.0, 1.0) + LEAST_SPREAD**2
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         tilts = [scatter / (kept * np.maximum(spread, 0.0)) for spread in (low, high)]
-        # A ray along the normal sees both tilts alike, one far off it only the tilt in its own direction.
+        # Both tilts matter for a ray along the normal; for a ray far off it only the tilt towards the ray does.
         blur = np.minimum(0.5 * (tilts[0] + tilts[1]), 1.0)
         weights = [part * part + blur for part in (short, long)]
         variance = (weights[0] * tilts[0] + weights[1] * tilts[1]) / (weights[0] + weights[1])
@@ -140,14 +175,14 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _sum_moments(x: np.ndarray, group: np.ndarray, n: int) -> list[np.ndarray]:
-    """Number, sums (three) and sums of products (six) of each set, f8 (n,) each."""
+    """Number, sums (three) and sums of products (six) of each set, float64 (n,) each."""
     sums = [np.bincount(group, minlength=n).astype(np.float64)]
     sums += [np.bincount(group, x[axis], minlength=n) for axis in range(3)]
     return sums + [np.bincount(group, x[a] * x[b], minlength=n) for a, b in _PRODUCTS]
 
 
 def _solve(moments: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centre, spreads and axes of sets by their moments."""
+    """Centre, spreads and axes of sets from their moments."""
     number = np.maximum(moments[0], 1.0)
     centre = np.stack([total / number for total in moments[1:4]], axis=1)
     covariance = np.empty((len(number), 3, 3))
@@ -163,7 +198,7 @@ def _spread_lost(count: np.ndarray) -> np.ndarray:
 
 
 def _rows_of(sets: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the points of some sets (ascending), and to which of these each belongs."""
+    """Rows of the points of some sets (ascending), and to which of these sets each belongs."""
     start = np.cumsum(count) - count
     number = count[sets]
     local = np.repeat(np.arange(len(sets)), number)

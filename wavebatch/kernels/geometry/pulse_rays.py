@@ -1,31 +1,62 @@
-"""Rays of discrete returns: which points are one pulse, and where it came from."""
+"""Rays of discrete returns: which points are one pulse, and where it came from.
+
+Used by the simulator, which makes waveforms from returns of files without waveforms.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.core.units import MAD_TO_STD
+
 OWN = 0.5
-"""Pulses whose first and last return lie at least this far apart [m] know their own direction."""
+"""Pulses whose first and last return are at least this far apart [m] give their direction themselves."""
 _SURE = 2.0
+"""Distance of first and last return [m] from which a direction is good enough to fit those of other pulses."""
 _ENOUGH = 20
+"""Smallest number of such pulses in a flight line."""
 _CLIP = 4.0
+"""Residuals above this many robust standard deviations are outliers."""
 
 
 def group_pulses(time: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """First point of every pulse, i8 (k,): points (n,) of equal time in a row whose return numbers rise."""
-    if not len(time):
-        return np.empty(0, np.int64)
+    """First point of every pulse: a pulse is a row of points of equal time whose return numbers rise.
+
+    Parameters
+    ----------
+    time, number : float (n,), int (n,)
+        GPS time and return number, in the order of the file.
+
+    Returns
+    -------
+    int64 (k,)
+    """
     new = (time[1:] != time[:-1]) | (number[1:] <= number[:-1])
-    return np.concatenate([[0], np.flatnonzero(new) + 1])
+    return np.flatnonzero(np.append(True, new)[: len(time)])
 
 
 def fit_rays(xyz: np.ndarray, starts: np.ndarray, angle: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """Unit vectors (k, 3) away from the sensor of the pulses that begin at points `starts` (k,).
+    """Direction of each pulse, away from the sensor.
 
-    xyz (n, 3) [m] in order of range within a pulse; angle (n,): scan angle [deg]; source (n,): flight line. From the
-    first to the last return where they lie OWN apart; else horizontal parts per metre down that are linear in the
-    tangent of the scan angle, fitted to the pulses of the same flight line that know better; straight down where fewer
-    than 20 do.
+    From the first to the last return where these are OWN apart. For other pulses a direction that is linear in the
+    tangent of the scan angle, fitted to the pulses of the same flight line with known directions; straight down where
+    fewer than 20 are.
+
+    Parameters
+    ----------
+    xyz : float64 (n, 3), m
+        In order of range within a pulse.
+    starts : int64 (k,)
+        First point of each pulse.
+    angle : float (n,), deg
+        Scan angle.
+    source : int (n,)
+        Flight line.
+
+    Returns
+    -------
+    float64 (k, 3)
+        Unit vectors.
     """
     last = np.append(starts[1:], len(xyz)) - 1
     span = xyz[last] - xyz[starts]
@@ -51,5 +82,5 @@ def _fit_slopes(tangent: np.ndarray, slopes: np.ndarray, wanted: np.ndarray) -> 
         terms = np.stack([np.ones(len(tangent)), tangent], axis=1)
         factors = np.linalg.lstsq(terms[use], slopes[use], rcond=None)[0]
         off = np.linalg.norm(slopes - terms @ factors, axis=1)
-        use = off <= _CLIP * max(1.4826 * float(np.median(off)), 1e-6)
+        use = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-6)
     return factors[0] + wanted[:, None] * factors[1]

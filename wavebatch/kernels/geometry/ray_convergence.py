@@ -1,7 +1,8 @@
-"""Where the sensor was, from where its rays come together: points and directions of a short window (ALGORITHMS.md 5.1).
+"""Position of the sensor from its rays: where the lines through points of a short time window meet.
 
-The position is a polynomial of time, P = c0 + c1 tau + c2 tau^2, tau = (t - centre) / half. Without a model of motion
-the error is metres; with noisy directions the linear solution is pulled to the ground, the angular one is not.
+Used by the survey for strips without a trajectory (docs/algorithms.md 5.1). The position is a polynomial of time,
+P = c0 + c1 tau + c2 tau^2, tau = (t - centre) / half: without motion the error is metres. With noisy directions the
+linear solution is pulled towards the ground; the angular one is not, so the linear one is only its start.
 """
 
 from __future__ import annotations
@@ -13,77 +14,104 @@ import numpy as np
 from wavebatch.core.units import MAD_TO_STD
 
 LARGEST_CONDITION = 1e5
-"""Of a single position from all directions: above it they are too much alike to say where they meet."""
+"""Largest condition number of a single position from all directions: above, they are too parallel to meet anywhere."""
 
 LARGEST_ERROR = 0.01
-"""Of the distance, relative, that a window may be expected to have."""
+"""Largest expected error of a window, as a share of the distance."""
 
 LEAST_SPREAD = np.radians(2.0)
-"""Angle that the directions of a window must cover at least."""
+"""Smallest angle that the directions of a window must cover [rad]."""
 
 LEAST_PULSES = 20
-"""Of a window; fewer agree with too much."""
+"""Smallest number of pulses in a window: with fewer almost any position fits."""
 
 SPEED, ACCELERATION = 80.0, 1.0
-"""What a sensor may do that a model of too low an order does not know [m/s, m/s2]."""
+"""Speed and acceleration that a model of too low an order does not follow [m/s, m/s2]: those of a survey aircraft."""
 
 _CLIP = 4.0 * MAD_TO_STD
+"""Residuals above this many medians are outliers: four robust standard deviations."""
 _ROUNDS = 3
+"""Rounds of the linear solution, each with new weights."""
 _STEPS = 6
+"""Largest number of Gauss-Newton steps."""
 
 
 class SensorFit(NamedTuple):
-    """The sensor's path in a window."""
+    """The path of the sensor in a window."""
 
     centre: float
     """Time at which tau is 0 [s]."""
     half: float
     """Half of the window [s]."""
     coefficients: np.ndarray
-    """c0, c1, c2 [m], f8 (order + 1, 3)."""
+    """c0, c1, c2, float64 (order + 1, 3), m."""
     covariance: np.ndarray
-    """Of the coefficients as one vector [m2], f8 (3 order + 3, 3 order + 3)."""
+    """Covariance of the coefficients as one vector, float64 (3 order + 3, 3 order + 3), m2."""
     condition: float
-    """Of the normal equations of a sensor at rest: what the directions alone can tell."""
+    """Condition number of the normal equations of a sensor at rest: what the directions alone can tell."""
     distance: float
     """Median distance to the points [m]."""
     spread: float
     """Angle that the directions cover [rad]."""
     residual: float
     """Root mean square of the angular residuals per component, at weight 1 [rad]."""
-    flipped: float
-    """Share of the directions that pointed to the sensor; they were turned."""
     pulses: int
+    """Pulses used."""
 
     @property
     def is_sound(self) -> bool:
-        """Whether the directions can say where they meet."""
+        """Whether the directions differ enough to meet in one place."""
         good = np.isfinite(self.coefficients).all() and np.isfinite(self.covariance).all()
         return bool(good and self.condition < LARGEST_CONDITION and self.spread > LEAST_SPREAD)
 
 
 def sensor_at(fit: SensorFit, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position [m] and velocity [m/s] of the sensor at times [s] (n,), each (n, 3)."""
+    """Position and velocity of the sensor.
+
+    Parameters
+    ----------
+    fit : SensorFit
+        A sound fit.
+    time : float (n,), s
+        Times within the window.
+
+    Returns
+    -------
+    position, velocity : float64 (n, 3), m and m/s
+    """
     tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
     order = len(fit.coefficients) - 1
     slope = np.stack([k * tau ** max(k - 1, 0) / fit.half for k in range(order + 1)], axis=1)
-    return _powers(tau, order) @ fit.coefficients, slope @ fit.coefficients
+    return np.vander(tau, order + 1, increasing=True) @ fit.coefficients, slope @ fit.coefficients
 
 
 def range_error(fit: SensorFit, time: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Standard deviation of the distance to the sensor at times [s] (n,) along unit directions (n, 3) [m].
+    """Standard deviation of the distance to the sensor.
 
-    It holds what the fit says of itself, and what a sensor may do that the order of its model cannot follow.
+    It includes the errors of the fit, and the motion that the order of its model cannot follow.
+
+    Parameters
+    ----------
+    fit : SensorFit
+        A sound fit.
+    time : float (n,), s
+        Times within the window.
+    direction : float64 (n, 3)
+        Unit vectors along the rays.
+
+    Returns
+    -------
+    float64 (n,), m
     """
     order = len(fit.coefficients) - 1
     tau = (np.asarray(time, np.float64) - fit.centre) / fit.half
-    along = (_powers(tau, order)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
+    along = (np.vander(tau, order + 1, increasing=True)[:, :, None] * direction[:, None, :]).reshape(len(tau), -1)
     variance = np.einsum("ni,ij,nj->n", along, fit.covariance, along)
     return np.sqrt(np.maximum(variance, 0.0) + _unknown_motion(fit) ** 2)
 
 
 def _unknown_motion(fit: SensorFit) -> float:
-    """What a sensor may stray from a path of the fit's order within its window [m], as weak directions enlarge it."""
+    """How far a sensor may be off a path of the fit's order within its window [m], as weak directions enlarge it."""
     stray = (SPEED * fit.half / 3**0.5, ACCELERATION * fit.half**2 / 6, 0.0)[len(fit.coefficients) - 1]
     return float(stray * np.sqrt(fit.condition))
 
@@ -91,30 +119,42 @@ def _unknown_motion(fit: SensorFit) -> float:
 def fit_sensor(
     time: np.ndarray, point: np.ndarray, direction: np.ndarray, weight: np.ndarray | None = None, order: int = 2
 ) -> SensorFit:
-    """The sensor's path from pulses of one window: where the lines through their points meet.
+    """The path of the sensor from the pulses of one window: where the lines through their points meet.
 
-    time [s] (n,); point: a return of each pulse [m] (n, 3); direction: along the ray, either way (n, 3); weight:
-    inverse variance of the directions (n,), 1 without. A fit that is not sound (`is_sound`) says nothing.
+    Parameters
+    ----------
+    time : float (n,), s
+        Time of each pulse.
+    point : float64 (n, 3), m
+        A return of each pulse.
+    direction : float (n, 3)
+        Along the ray, towards or away from the sensor.
+    weight : float (n,), optional
+        Inverse variance of the directions; 1 if not given.
+    order : int
+        Order of the polynomial, 0 to 2.
+
+    Returns
+    -------
+    SensorFit
+        Its values mean nothing where it is not sound (`is_sound`).
     """
     lengths = np.sqrt(np.einsum("ni,ni->n", direction, direction))
     used = np.flatnonzero(np.isfinite(lengths) & (lengths > 0) & np.isfinite(point).all(axis=1) & np.isfinite(time))
     unit = direction[used] / lengths[used, None]
     weight = np.ones(len(used)) if weight is None else np.asarray(weight, np.float64)[used]
-    time, origin = np.asarray(time, np.float64)[used], np.zeros(3)
-    centre, half = 0.0, 1.0
-    if len(used):
-        centre = 0.5 * float(time.min() + time.max())
-        half = max(0.5 * float(time.max() - time.min()), 1e-9)
-        origin = np.median(point[used], axis=0)
-    ground = point[used] - origin
-    powers = _powers((time - centre) / half, order)
+    time = np.asarray(time, np.float64)[used]
     if len(used) < LEAST_PULSES:
-        return _nothing(centre, half, order, len(used))
+        return _nothing(order, len(used))
+    centre = 0.5 * float(time.min() + time.max())
+    half = max(0.5 * float(time.max() - time.min()), 1e-9)
+    origin = np.median(point[used], axis=0)
+    ground = point[used] - origin
+    powers = np.vander((time - centre) / half, order + 1, increasing=True)
     with np.errstate(all="ignore"):
         start = _solve_lines(powers, ground, unit, weight)
         ahead = ground - powers @ start
-        reverse = np.einsum("ni,ni->n", unit, ahead) < 0
-        unit = np.where(reverse[:, None], -unit, unit)
+        unit = np.where((np.einsum("ni,ni->n", unit, ahead) < 0)[:, None], -unit, unit)
         found, normal, residual = _solve_angles(powers, ground, unit, weight, start)
         ahead = ground - powers @ found
         distance = float(np.median(np.sqrt(np.einsum("ni,ni->n", ahead, ahead))))
@@ -122,14 +162,24 @@ def fit_sensor(
     covariance = np.full(normal.shape, np.nan)
     if _condition(normal) < 1e14:
         covariance = residual**2 * np.linalg.inv(normal)
-    condition, share = _condition(normal[:3, :3]), float(reverse.mean())
-    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, share, len(used))
+    condition = _condition(normal[:3, :3])
+    return SensorFit(centre, half, found, covariance, condition, distance, _extent(unit), residual, len(used))
 
 
 def fit_best(
     time: np.ndarray, point: np.ndarray, direction: np.ndarray, weight: np.ndarray | None = None
 ) -> SensorFit | None:
-    """The fit of the order with the least expected error of the range; None where none is sound."""
+    """The fit of the order with the smallest expected error of the range; None where none is sound.
+
+    Parameters
+    ----------
+    time, point, direction, weight
+        As for `fit_sensor`.
+
+    Returns
+    -------
+    SensorFit or None
+    """
     best, least = None, np.inf
     for order in (2, 1, 0):
         fit = fit_sensor(time, point, direction, weight, order)
@@ -143,23 +193,11 @@ def fit_best(
     return best if best is not None and least < LARGEST_ERROR * best.distance else None
 
 
-def pairs_of_returns(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Point, direction and weight of pulses with two returns (n, 3): the farther they are apart, the better.
-
-    The point is the middle, whose errors do not go with those of the direction.
-    """
-    apart = last - first
-    return 0.5 * (first + last), apart, np.einsum("ni,ni->n", apart, apart)
-
-
-def _powers(tau: np.ndarray, order: int) -> np.ndarray:
-    return np.stack([tau**k for k in range(order + 1)], axis=1)
-
-
-def _nothing(centre: float, half: float, order: int, pulses: int) -> SensorFit:
+def _nothing(order: int, pulses: int) -> SensorFit:
+    """A fit that is not sound."""
     size = 3 * (order + 1)
     empty = np.full((order + 1, 3), np.nan), np.full((size, size), np.nan)
-    return SensorFit(centre, half, *empty, np.inf, np.nan, 0.0, np.nan, 0.0, pulses)
+    return SensorFit(0.0, 1.0, *empty, np.inf, np.nan, 0.0, np.nan, pulses)
 
 
 def _condition(normal: np.ndarray) -> float:
@@ -190,13 +228,13 @@ def _solve(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _keep(error: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weights without what lies beyond four robust standard deviations."""
+    """Weights, 0 for what lies beyond four robust standard deviations."""
     limit = _CLIP * max(float(np.median(error)), 1e-12)
     return np.where(error <= limit, weight, 0.0)
 
 
 def _solve_lines(powers: np.ndarray, ground: np.ndarray, unit: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Coefficients that minimise the distances of the position from the lines, weighted by 1/R^2, outliers left out."""
+    """Coefficients that minimise the distances of the position from the lines, weighted by 1/R^2, without outliers."""
     across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
     w = weight
     found = np.zeros((powers.shape[1], 3))

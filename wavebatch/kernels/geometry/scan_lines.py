@@ -1,22 +1,37 @@
-"""Scan lines from the angles of consecutive pulses: a line ends where the mirror turns, jumps back or pauses."""
+"""Scan lines from the angles of consecutive pulses: a line ends where the mirror turns, jumps back or pauses.
+
+Used by the slices tool. Oscillating and rotating mirrors look different: the first turn, the second jump.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 LAG = 16
-"""Pulses over which the mirror's direction is judged: turns closer together than that are noise."""
+"""Pulses over which the direction of the mirror is judged: turns closer together than that are noise."""
 _JUMP = 20.0
+"""Steps of the angle above this many usual ones ..."""
 _JUMP_SHARE = 0.25
+"""... and above this share of its range are jumps."""
 _PAUSE = 20.0
+"""Times between pulses above this many usual ones are pauses."""
 
 
 def find_sweeps(angle: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """First pulse of every scan line, i8 (k,), 0 included; empty for no pulses.
+    """First pulse of every scan line.
 
-    angle (n,): across the flight, in any unit; time (n,): of the pulses. A new line begins behind a jump of the angle
-    (a quarter of its range, 20 usual steps), behind a pause (20 usual intervals, or a time that runs backwards), and
-    at the pulse where the angle turns.
+    Parameters
+    ----------
+    angle : float (n,)
+        Across the flight direction, in any unit.
+    time : float (n,), s
+        Of the pulses.
+
+    Returns
+    -------
+    int64 (k,)
+        0 included; empty for no pulses. A line begins after a jump of the angle (a quarter of its range and 20 usual
+        steps), after a pause (20 usual intervals, or a time that runs backwards), and where the angle turns.
     """
     n = len(angle)
     if n < 2:
@@ -47,7 +62,7 @@ def _find_turns(angle: np.ndarray) -> np.ndarray:
 
 
 def _drop_short(edges: np.ndarray) -> np.ndarray:
-    """Edges without those of runs shorter than LAG: the shortest run first is joined with its two neighbours."""
+    """Edges without those of runs shorter than LAG: the shortest run is joined with its two neighbours first."""
     while len(edges) > 2:
         lengths = np.diff(edges)
         shortest = int(np.argmin(lengths))

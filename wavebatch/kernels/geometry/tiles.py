@@ -1,4 +1,7 @@
-"""Space cut into boxes with about as many points each, so that neighbourhoods can be worked on box by box."""
+"""Space cut into boxes with about as many points each, so that neighbourhoods can be handled box by box.
+
+Used by batch/neighbour_pass. Every point lies in exactly one tile; a buffer adds the points around.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +14,37 @@ class Tiles(NamedTuple):
     """A tree of cuts across x, y or z; its leaves are the tiles, which together fill space."""
 
     axis: np.ndarray
-    """Axis that a node cuts, -1 for leaves, i8 (nodes,)."""
+    """Axis that a node cuts, -1 for leaves, int64 (nodes,)."""
     at: np.ndarray
-    """Where: the second child has what is not below, f8 (nodes,) [m]."""
+    """Place of the cut: the second child has what is not below, float64 (nodes,), m."""
     child: np.ndarray
-    """First child of a node, the second one follows; the tile's number for leaves, i8 (nodes,)."""
+    """First child of a node, the second one follows; for leaves the number of the tile, int64 (nodes,)."""
     low: np.ndarray
-    """Lower corners of the tiles, f8 (tiles, 3)."""
+    """Lower corners of the tiles, float64 (tiles, 3), m."""
     high: np.ndarray
-    """Upper corners, which the tiles do not hold themselves, f8 (tiles, 3)."""
+    """Upper corners, which do not belong to the tiles, float64 (tiles, 3), m."""
 
     def __len__(self) -> int:
+        """Number of tiles."""
         return len(self.low)
 
 
 def cut_tiles(sample: np.ndarray, most: int, least_side: float) -> Tiles:
-    """Tiles that hold at most `most` points of the sample (k, 3), or are at most `least_side` [m] wide."""
+    """Tiles with at most a number of points, or of a smallest size.
+
+    Parameters
+    ----------
+    sample : float64 (k, 3), m
+        A sample of the points.
+    most : int
+        Largest number of points of the sample in a tile ...
+    least_side : float, m
+        ... unless they are at most this wide.
+
+    Returns
+    -------
+    Tiles
+    """
     axis, at, child, low, high = [-1], [0.0], [0], [], []
     waiting = [(0, sample, np.full(3, -np.inf), np.full(3, np.inf))]
     while waiting:
@@ -52,9 +70,22 @@ def cut_tiles(sample: np.ndarray, most: int, least_side: float) -> Tiles:
 
 
 def sort_into_tiles(tiles: Tiles, xyz: np.ndarray, buffer: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tiles that points (n, 3) lie in or within `buffer` [m] of: rows and tiles, a pair for each.
+    """Tiles that points lie in, or near.
 
-    Rows ascend within a tile. A corner's buffer is a box, so that some points further off are listed too.
+    Parameters
+    ----------
+    tiles : Tiles
+        All tiles.
+    xyz : float64 (n, 3), m
+        Points.
+    buffer : float, m
+        Distance up to which a point is near a tile; at corners it is a box, so that some points further off are listed
+        too.
+
+    Returns
+    -------
+    rows, numbers : int64 (k,)
+        A pair of point and tile for each; rows ascend within a tile.
     """
     rows, numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     waiting = [(0, np.arange(len(xyz)))]
@@ -73,7 +104,21 @@ def sort_into_tiles(tiles: Tiles, xyz: np.ndarray, buffer: float) -> tuple[np.nd
 
 
 def is_inside(tiles: Tiles, number: int, xyz: np.ndarray) -> np.ndarray:
-    """Whether points (n, 3) lie in a tile, bool (n,): every point lies in exactly one."""
+    """Whether points lie in one tile; every point lies in exactly one.
+
+    Parameters
+    ----------
+    tiles : Tiles
+        All tiles.
+    number : int
+        Number of the tile.
+    xyz : float64 (n, 3), m
+        Points.
+
+    Returns
+    -------
+    bool (n,)
+    """
     inside = np.ones(len(xyz), bool)
     for axis in range(3):
         inside &= (xyz[:, axis] >= tiles.low[number, axis]) & (xyz[:, axis] < tiles.high[number, axis])

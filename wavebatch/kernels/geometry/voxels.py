@@ -1,7 +1,7 @@
-"""Rays through a grid of voxels: which voxels they cross, when, and what of a profile along them lies in each.
+"""Rays through a grid of voxels: which voxels they cross, when, and which part of a profile lies in each.
 
-A voxel is named by its index (x, y, z) from the one that holds the origin of the coordinates. Every ray is treated on
-its own, bit for bit.
+Used by the voxel tool. A voxel is named by its index (x, y, z), counted from the voxel that holds the origin of the
+coordinates. Rays do not influence each other, bit for bit.
 """
 
 from __future__ import annotations
@@ -17,33 +17,43 @@ MOST_STEPS = 1 << 18
 """Voxels that a ray may cross per axis."""
 
 TOUCH = 1e-6
-"""Time [ns] below which a voxel counts as touched by an edge only: what lies in it goes to the one before."""
+"""Time [ns] below which a ray only touches a voxel at an edge: its part goes to the voxel before."""
 
 AT_A_TIME = 1 << 16
-"""Crossings that are sorted together."""
+"""Crossings that are sorted together, which bounds memory."""
 
 
 class Crossings(NamedTuple):
     """Voxels that rays cross, sorted by ray, then time."""
 
     ray: np.ndarray
-    """i8 (m,)."""
+    """Number of the ray, int64 (m,)."""
     enter: np.ndarray
-    """Time at which the ray enters the voxel, f8 (m,) [ns]."""
+    """Time at which the ray enters the voxel, float64 (m,), ns."""
     inside: np.ndarray
-    """Time for which it is inside, f8 (m,) [ns]."""
+    """Time for which it is inside, float64 (m,), ns."""
     index: np.ndarray
-    """i8 (m, 3)."""
+    """The voxel, int64 (m, 3)."""
 
 
 def fits_keys(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> np.ndarray:
-    """Rays (n,) that stay where keys reach, and cross no more than MOST_STEPS voxels per axis; see `cross_voxels`."""
+    """Rays that stay where keys reach and cross at most MOST_STEPS voxels per axis.
+
+    Parameters
+    ----------
+    start, step, begin, end, size
+        As for `cross_voxels`; NaN is allowed.
+
+    Returns
+    -------
+    bool (n,)
+    """
     good = np.ones(len(start), bool)
     with np.errstate(over="ignore", invalid="ignore"):
         a, b = (np.floor((start + step * time[:, None]) / size) for time in (begin, end))
         for axis, bits in enumerate(KEY_BITS):
             limit = float(1 << (bits - 1)) - 1  # one voxel of margin
-            # Comparisons with what is no number are false.
+            # Comparisons with NaN are false, so that such rays are not good.
             good &= (np.abs(a[:, axis]) < limit) & (np.abs(b[:, axis]) < limit)
             good &= np.abs(b[:, axis] - a[:, axis]) <= MOST_STEPS
     return good
@@ -52,8 +62,20 @@ def fits_keys(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.nd
 def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> Crossings:
     """The voxels that each ray crosses between two times.
 
-    start (n, 3): position at time 0 [m]; step (n, 3) [m/ns]; begin, end (n,) [ns]; size of the voxels [m]. Rays must
-    meet `fits_keys`. Voxels are half open: a point on a face belongs to the voxel above it.
+    Parameters
+    ----------
+    start : float64 (n, 3), m
+        Position at time 0.
+    step : float64 (n, 3), m/ns
+        Direction.
+    begin, end : float64 (n,), ns
+        First and last time. Rays must pass `fits_keys`.
+    size : float, m
+        Side of the voxels; they are half open: a point on a face belongs to the voxel above it.
+
+    Returns
+    -------
+    Crossings
     """
     first, speed = start / size, step / size
     low = np.floor(first + speed * begin[:, None]).astype(np.int64)
@@ -83,7 +105,17 @@ def cross_voxels(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np
 
 
 def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.ndarray, size: float) -> list[slice]:
-    """Slices of the rays that `cross_voxels` can take at a time in bounded memory."""
+    """Slices of the rays that `cross_voxels` can handle at a time in bounded memory.
+
+    Parameters
+    ----------
+    start, step, begin, end, size
+        As for `cross_voxels`.
+
+    Returns
+    -------
+    list of slice
+    """
     number = 3 + (np.abs(step) * ((end - begin)[:, None] / size)).sum(axis=1)
     slices, at = [], 0
     most = np.maximum.accumulate(number)
@@ -98,7 +130,7 @@ def split_rays(start: np.ndarray, step: np.ndarray, begin: np.ndarray, end: np.n
 
 
 def pack_index(index: np.ndarray) -> np.ndarray:
-    """Keys u8 (m,) of voxels (m, 3), in the order of x, then y, then z."""
+    """Keys, uint64 (m,), of voxels int64 (m, 3), in the order of x, then y, then z."""
     key = np.zeros(len(index), np.uint64)
     for axis, bits in enumerate(KEY_BITS):
         key <<= np.uint64(bits)
@@ -107,7 +139,7 @@ def pack_index(index: np.ndarray) -> np.ndarray:
 
 
 def unpack_index(key: np.ndarray) -> np.ndarray:
-    """Voxels i8 (m, 3) of keys (m,)."""
+    """Voxels, int64 (m, 3), of keys uint64 (m,)."""
     index = np.empty((len(key), 3), np.int64)
     rest = key.copy()
     for axis in (2, 1, 0):
@@ -118,16 +150,29 @@ def unpack_index(key: np.ndarray) -> np.ndarray:
 
 
 def accumulate_profile(profile: np.ndarray) -> np.ndarray:
-    """Sum of profiles (n, s) up to the end of each sample, f8 (n, s + 1), one sample after the other."""
+    """Sum of profiles (n, s) up to the end of each sample, float64 (n, s + 1), added in order of the samples."""
     total = np.zeros((profile.shape[0], profile.shape[1] + 1))
     np.cumsum(profile, axis=1, out=total[:, 1:])
     return total
 
 
 def total_until(total: np.ndarray, ray: np.ndarray, time: np.ndarray, spacing: float) -> np.ndarray:
-    """What of the profile of each ray lies before a time [ns], f8 (m,); total: from `accumulate_profile`.
+    """The part of each ray's profile before a time.
 
-    Every sample is spread evenly over its own step, from half a spacing before it to half a spacing behind it.
+    Parameters
+    ----------
+    total : float64 (n, s + 1)
+        From `accumulate_profile`.
+    ray : int64 (m,)
+        Number of the ray.
+    time : float64 (m,), ns
+        After sample 0.
+    spacing : float, ns
+        Time between two samples; each sample is spread evenly from half a spacing before it to half a spacing after it.
+
+    Returns
+    -------
+    float64 (m,)
     """
     s = total.shape[1] - 1
     place = np.clip(time / spacing + 0.5, 0.0, s)
@@ -139,9 +184,21 @@ def total_until(total: np.ndarray, ray: np.ndarray, time: np.ndarray, spacing: f
 
 
 def differences_along(values: np.ndarray, ray: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """What each crossing (m,) adds; values (m,) are sums at the entry of a voxel, last (n,) those of whole rays.
+    """The part of each crossing, from sums at the entry of each voxel.
 
-    values must start at 0 for every ray; then the differences of a ray add up to its `last` exactly.
+    Parameters
+    ----------
+    values : float64 (m,)
+        Sums at the entry of each voxel, 0 at the first voxel of every ray.
+    ray : int64 (m,)
+        Number of the ray, ascending.
+    last : float64 (n,)
+        Sums of whole rays.
+
+    Returns
+    -------
+    float64 (m,)
+        The differences of a ray add up to its `last` exactly.
     """
     after = np.empty_like(values)
     after[:-1] = values[1:]

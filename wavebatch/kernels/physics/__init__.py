@@ -1,1 +1,1 @@
-"""Radiometry, incidence angles and the lidar equation."""
+"""Incidence angle, radiometry and the lidar equation: physics of single echoes."""

@@ -1,7 +1,8 @@
-"""From how much an echo is wider than the system pulse to the angle of the surface it came from (ALGORITHMS 1.4).
+"""Incidence angle of a surface from how much broader an echo is than the system pulse.
 
-A plane under a Gaussian beam spreads the pulse by a Gaussian of standard deviation w tan(alpha) / c, w = R beta / 2.
-All that depends on range and beam is in that product, so that one table of measured width by spread serves every echo.
+Used by the stage attribute.incidence_angle and by the survey. A plane under a Gaussian beam adds a Gaussian of standard
+deviation w tan(alpha) / c, w = R beta / 2: range and beam enter only by this product, so that one table of measured
+width by spread serves every echo (docs/algorithms.md 1.4).
 """
 
 from __future__ import annotations
@@ -12,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.kernels.signal.runs import lobe_edges
 
 STEEPEST = np.radians(80.0)
-"""Angles beyond it are not known (H14)."""
-
-FWHM_PER_TAU = 3.3946780749849567
-"""Full width at half maximum of t^2 exp(-t), in tau; of the printed t exp(-t) the paper has 3.5."""
+"""Angles above this are not known (docs/algorithms.md H14)."""
 
 PAPER_TAU = 3.5
+"""Full width at half maximum of the pulse t exp(-t), in tau, as the paper prints it (docs/algorithms.md 1.4)."""
 
 RADIUS = np.array([
     (-3.0, 0.543), (-2.0, 0.463), (-1.5, 0.446), (-1.0, 0.620), (-0.5, 0.872), (-1e-3, 1.136), (0.0, 0.853),
@@ -29,65 +29,124 @@ RADIUS = np.array([
 ]).T  # fmt: skip
 """Radius around sqrt(max(u, 0)) that holds sqrt(mu) for 68.3 % of the draws u of a normal law around mu, any mu >= 0.
 
-First row: u where it is negative, else sqrt(u); second row: the radius. Solved numerically for equal coverage. That it
-jumps down near 0.7 is no accident: a true 0 must lie within it for the lower 68.3 % of u and outside for all others.
+First row: u where it is negative, else sqrt(u); second row: the radius. Solved numerically for equal coverage. It must
+fall near 0.7: a true 0 lies within the radius for the lower 68.3 % of u and outside for all others.
 """
 
 _LONGEST = 30.0
-"""Spread of the last entry of a table [tau]; beyond it variances add up exactly enough."""
+"""Spread of the last entry of a table [tau]; beyond it variances simply add."""
 
 _PHASES = (0.0, 0.25, 0.5, 0.75)
 """Places of the first sample, in samples, over which a table is averaged."""
 
 
 def spread_of_angle(angle: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
-    """Standard deviation [ns] of the spread by a plane at `angle` [rad]; distance [m]; divergence full, 1/e^2 [rad]."""
+    """Spread of the pulse by a plane.
+
+    Parameters
+    ----------
+    angle : float, rad
+        Between ray and surface normal.
+    distance : float, m
+        Sensor to echo.
+    divergence : float, rad
+        Full angle between the 1/e^2 points.
+
+    Returns
+    -------
+    float64, ns
+        Standard deviation.
+    """
     return 0.5 * divergence / C * np.asarray(distance, np.float64) * np.tan(angle)
 
 
 def angle_of_spread(spread: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
-    """Angle [rad] of the plane that spreads the pulse by `spread` [ns]; the inverse of `spread_of_angle`."""
+    """Angle of the plane that spreads the pulse; the inverse of `spread_of_angle`.
+
+    Parameters
+    ----------
+    spread : float, ns
+        Standard deviation of the spread.
+    distance : float, m
+        Sensor to echo.
+    divergence : float, rad
+        Full angle between the 1/e^2 points.
+
+    Returns
+    -------
+    float64, rad
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.arctan(np.asarray(spread, np.float64) * (2.0 * C / divergence) / distance)
 
 
 class WidthTable(NamedTuple):
-    """Width that is measured by spread of the pulse, both ascending, as standard deviations [ns]."""
+    """Measured width by spread of the pulse, both ascending, as standard deviations."""
 
     spread: np.ndarray
+    """float64 (r,), ns."""
     width: np.ndarray
+    """float64 (r,), ns."""
     cut: bool
-    """Whether widths stopped growing, so that the table had to end there (H15)."""
+    """True if widths stopped growing, so that the table ends there (docs/algorithms.md H15)."""
 
 
 def build_table(spread: np.ndarray, width: np.ndarray) -> WidthTable:
-    """The part of a table up to the last width that is larger than all before it (H15)."""
+    """A table from spreads and widths (r,) [ns], up to the last width that is larger than all before it."""
     falls = np.flatnonzero(~(np.diff(width) > 0))
     end = falls[0] + 1 if len(falls) else len(width)
     return WidthTable(spread[:end], width[:end], end < len(width))
 
 
 def spread_variance(table: WidthTable, width: np.ndarray) -> np.ndarray:
-    """Variance of the spread [ns2] from measured widths [ns]; negative for those below the system's.
+    """Variance of the spread from measured widths.
 
-    Between entries, and beyond the last one, what the pulse itself adds to the variance is interpolated. NaN beyond
-    the end of a table that was cut.
+    Parameters
+    ----------
+    table : WidthTable
+        Widths by spread.
+    width : float (m,), ns
+        Measured widths.
+
+    Returns
+    -------
+    float64 (m,), ns2
+        Negative for widths below that of the system; NaN beyond the end of a table that was cut.
+
+    Notes
+    -----
+    Interpolated is what the pulse itself adds to the variance; beyond the last entry it stays constant.
     """
     width = np.asarray(width, np.float64)
-    own = table.width**2 - table.spread**2
-    variance = width * width - np.interp(width, table.width, own)
+    of_pulse = table.width**2 - table.spread**2
+    variance = width * width - np.interp(width, table.width, of_pulse)
     return np.where(width > table.width[-1], np.nan, variance) if table.cut else variance
 
 
 def angles_of_variance(
     variance: np.ndarray, variance_err: np.ndarray, distance: np.ndarray, divergence: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Angles and their standard deviations [rad] from the variance that the surface adds to the pulse [ns2].
+    """Angles from the variance that a surface adds to the pulse.
 
-    A variance that is not positive has angle 0. For steep planes the error is sigma_s s c^2 / (w^2 tan sec^2), what is
-    left of the variance's error after the square root. Near 0 that root is anything but straight and half of the
-    variances are below 0; there the error is a radius from RADIUS, such that 68.3 % of the angles lie within it
-    whatever the true angle is. NaN beyond 80 degrees, and where anything is not known.
+    Parameters
+    ----------
+    variance, variance_err : float (m,), ns2
+        Added variance and its standard deviation.
+    distance : float (m,), m
+        Sensor to echo.
+    divergence : float, rad
+        Full angle between the 1/e^2 points.
+
+    Returns
+    -------
+    angle, error : float64 (m,), rad
+        0 where the variance is not positive; NaN above 80 degrees and where an input is not known.
+
+    Notes
+    -----
+    For steep planes the error is sigma_s s c^2 / (w^2 tan sec^2), by propagation through the square root. Near 0 the
+    root is not linear and half of the variances are negative: there the error is a radius from RADIUS, such that 68.3 %
+    of the angles lie within it for any true angle. Source: docs/algorithms.md 1.4.
     """
     known = np.isfinite(variance) & np.isfinite(variance_err) & (variance_err > 0) & (np.asarray(distance) > 0)
     variance, variance_err = np.where(known, variance, np.nan), np.where(known, variance_err, np.nan)
@@ -110,9 +169,18 @@ def _radius(variance: np.ndarray, variance_err: np.ndarray, spread: np.ndarray) 
 
 @lru_cache(maxsize=16)
 def pulse_table(sigma_ref: float, spacing: float) -> WidthTable:
-    """Widths of Gaussians fitted to t^2 exp(-t) pulses, sampled every `spacing` [ns], by their spread.
+    """Widths of Gaussians fitted to pulses t^2 exp(-t), by their spread.
 
-    The pulse's length is such that its own fit has the width `sigma_ref` [ns], which the file says of flat ground.
+    Parameters
+    ----------
+    sigma_ref : float, ns
+        Width of the echo of flat ground; the length of the pulse is chosen so that its fit has this width.
+    spacing : float, ns
+        Time between two samples.
+
+    Returns
+    -------
+    WidthTable
     """
     tau = sigma_ref / 1.435
     spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)]
@@ -125,9 +193,10 @@ def pulse_table(sigma_ref: float, spacing: float) -> WidthTable:
 
 @lru_cache(maxsize=16)
 def paper_table(sigma_ref: float) -> WidthTable:
-    """A quarter of the widths at e^-2 by spread, as Rhomberg-Kauert et al. 2024 print them; for comparisons only.
+    """A quarter of the widths at e^-2 by spread, as printed by Rhomberg-Kauert et al. (2024); for comparisons only.
 
-    Pulse t exp(-t / tau) with tau = T1 / 3.5, the later half of a Gaussian, one-way times, x0 = w.
+    Pulse t exp(-t / tau) with tau = T1 / 3.5, the later half of a Gaussian, one-way times, x0 = w (docs/algorithms.md
+    1.4).
     """
     tau = FWHM_PER_SIGMA * sigma_ref / PAPER_TAU
     spread = np.r_[0.0, np.geomspace(0.05, _LONGEST, 80)] * tau
@@ -138,7 +207,25 @@ def paper_table(sigma_ref: float) -> WidthTable:
 def spread_pulse(
     exponent: int, spread: np.ndarray, tau: float, *, causal: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times [ns] (s,) and the pulse t^exponent exp(-t) spread by Gaussians of given standard deviations (k, s)."""
+    """The pulse t^exponent exp(-t), spread by Gaussians.
+
+    Parameters
+    ----------
+    exponent : int
+        Power of the rise.
+    spread : float (k,), ns
+        Standard deviations of the Gaussians.
+    tau : float, ns
+        Time constant of the pulse.
+    causal : bool
+        Use the later half of the Gaussians only.
+
+    Returns
+    -------
+    time : float64 (s,), ns
+    curves : float64 (k, s)
+        Of height 1.
+    """
     step = tau / 40.0
     reach = int(2 ** np.ceil(np.log2((12.0 * spread.max(initial=0.0) + 40.0 * tau) / step)))
     time = (np.arange(reach) - reach // 2) * step
@@ -155,15 +242,23 @@ def spread_pulse(
 
 
 def direct_width(time: np.ndarray, curve: np.ndarray, level: float) -> float:
-    """Width of a curve of height 1 at `level`, between the first and the last crossing beside its peak."""
-    top = int(np.argmax(curve))
-    right = top + int(np.argmax(curve[top:] < level))
-    left = top - int(np.argmax(curve[top::-1] < level))
+    """Width of a curve at a level, between the crossings nearest to its peak.
 
-    def cross(a: int, b: int) -> float:
-        return time[a] + (time[b] - time[a]) * (level - curve[a]) / (curve[b] - curve[a])
+    Parameters
+    ----------
+    time : float64 (s,), ns
+        Abscissa.
+    curve : float64 (s,)
+        Of height 1.
+    level : float
+        Between 0 and 1.
 
-    return float(cross(right - 1, right) - cross(left + 1, left))
+    Returns
+    -------
+    float, ns
+    """
+    begin, end = lobe_edges(time, curve, level)
+    return float(end - begin)
 
 
 def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:
@@ -180,7 +275,7 @@ def _fit_widths(spread: np.ndarray, tau: float, spacing: float) -> np.ndarray:
 
 
 def _fit_gaussian(time: np.ndarray, value: np.ndarray, centre: float, sigma: float) -> float:
-    """Width of the least-squares Gaussian, by Gauss-Newton from a near start."""
+    """Width of the least-squares Gaussian, by Gauss-Newton from a close start."""
     amplitude = 1.0
     for _ in range(12):
         z = (time - centre) / sigma

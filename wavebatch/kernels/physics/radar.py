@@ -1,4 +1,7 @@
-"""The lidar equation: power that comes back from what the pulse meets (ALGORITHMS.md 1.5, equation 3)."""
+"""The lidar equation: the power that a pulse returns (docs/algorithms.md 1.5, equation 3).
+
+Used by the simulator.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import numpy as np
 
 
 def pass_atmosphere(distance: np.ndarray, attenuation: float) -> np.ndarray:
-    """Share of the light that gets through `distance` [m], one way; attenuation in dB per km."""
+    """Share of the light left after `distance` [m], one way; attenuation [dB/km]."""
     return 10.0 ** (-distance * attenuation / 10_000.0)
 
 
@@ -20,10 +23,28 @@ def receive_power(
     efficiency: float,
     attenuation: float,
 ) -> np.ndarray:
-    """P = P_t D^2 Q T^2 sigma / (4 pi beta^2 R^4), in the unit of `transmitted`.
+    """Received power P = P_t D^2 Q T^2 sigma / (4 pi beta^2 R^4).
 
-    cross_section [m2]; distance R from the sensor [m]; aperture D [m]; divergence beta: the full angle [rad];
-    efficiency Q of the optics; attenuation of the air [dB/km], of which T is what is left after one way.
+    Parameters
+    ----------
+    cross_section : float (m,), m2
+        sigma.
+    distance : float (m,), m
+        R, from the sensor.
+    transmitted : float
+        P_t, in any unit.
+    aperture : float, m
+        Diameter D of the receiver.
+    divergence : float, rad
+        Full angle beta of the beam.
+    efficiency : float
+        Q of the optics, 0 to 1.
+    attenuation : float, dB/km
+        Of the air; T is the share left after one way.
+
+    Returns
+    -------
+    float64 (m,), unit of `transmitted`
     """
     transmission = pass_atmosphere(distance, attenuation)
     whole = transmitted * aperture**2 * efficiency * transmission**2 * cross_section
@@ -31,5 +52,19 @@ def receive_power(
 
 
 def spread_cross_section(reflectance: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
-    """Cross section [m2] of a diffuse surface of the reflectance that fills the footprint: 4 rho pi R^2 beta^2 / 4."""
+    """Cross section of a diffuse surface that fills the footprint: 4 rho pi R^2 beta^2 / 4.
+
+    Parameters
+    ----------
+    reflectance : float
+        rho.
+    distance : float (m,), m
+        R, from the sensor.
+    divergence : float, rad
+        Full angle beta of the beam.
+
+    Returns
+    -------
+    float64 (m,), m2
+    """
     return 4.0 * reflectance * np.pi * (distance * divergence) ** 2 / 4.0

@@ -1,6 +1,7 @@
-"""From amplitude and width to backscatter: calibration, cross section, reflectance and their errors (ALGORITHMS.md 5).
+"""From amplitude and width to backscatter: calibration, cross section, reflectance and their errors.
 
-Everything in float64: the range enters with its fourth power (H13). Whatever is not known is NaN, and stays NaN.
+Used by the stages attribute.cross_section and others and by the calibration (docs/algorithms.md 5). Everything is
+float64, because the range enters with its fourth power (docs/algorithms.md H13). Unknown inputs are NaN and give NaN.
 """
 
 from __future__ import annotations
@@ -10,16 +11,26 @@ import math
 import numpy as np
 
 ENERGY_CORRELATION = -1.0 / math.sqrt(3.0)
-"""Of the errors of amplitude and sigma of an isolated Gaussian echo (2.1)."""
+"""Correlation of the errors of amplitude and sigma of an isolated Gaussian echo (docs/algorithms.md 2.1)."""
 
 STEEPEST = math.radians(85.0)
-"""Angle of incidence from which on nothing is said about reflectance."""
+"""Angle of incidence above which no reflectance is given: an error of 0.5 degrees changes it by 10 % there."""
 
 
 def transmit(distance: np.ndarray, attenuation: float) -> np.ndarray:
-    """Share of the light that the atmosphere leaves on its way to a target at `distance` [m] and back.
+    """Share of the light that the atmosphere leaves on the way to a target and back.
 
-    attenuation: one way [dB/km]. Source: ALGORITHMS.md 5, eta_atm = 10^(-2 R a / 10000).
+    Parameters
+    ----------
+    distance : float (m,), m
+        Sensor to target.
+    attenuation : float, dB/km
+        One way.
+
+    Returns
+    -------
+    float64 (m,)
+        eta_atm = 10^(-2 R a / 10000) (docs/algorithms.md 5).
     """
     return 10.0 ** (-2.0e-4 * attenuation * np.asarray(distance, np.float64))
 
@@ -32,10 +43,29 @@ def calibrate_echoes(
     sigma: np.ndarray,
     attenuation: float,
 ) -> np.ndarray:
-    """Calibration constant C' of each echo of a Lambertian reference of known reflectance [1/(m2 count ns)].
+    """Calibration constant C' from each echo of a Lambertian reference of known reflectance.
 
-    incidence [rad]; distance [m]; amplitude [count]; sigma [ns]; attenuation [dB/km]. C_cal is C' pi divergence^2 / 4.
-    Source: Wagner et al. 2010; ALGORITHMS.md 5.
+    Parameters
+    ----------
+    reflectance : float
+        Of the reference.
+    incidence : float, rad
+        Angle of incidence.
+    distance : float (m,), m
+        Sensor to echo.
+    amplitude, sigma : float (m,), count, ns
+        Of the echo.
+    attenuation : float, dB/km
+        Of the air, one way.
+
+    Returns
+    -------
+    float64 (m,), 1/(m2 count ns)
+        C_cal is C' pi divergence^2 / 4.
+
+    References
+    ----------
+    Wagner et al. (2010); docs/algorithms.md 5.
     """
     distance = known_distance(distance)
     light = distance * distance * np.asarray(amplitude, np.float64) * np.asarray(sigma, np.float64)
@@ -45,9 +75,19 @@ def calibrate_echoes(
 def backscatter(
     constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
 ) -> np.ndarray:
-    """Backscatter coefficient gamma of each echo: cross section per illuminated area, 4 rho cos(alpha) if Lambertian.
+    """Backscatter coefficient gamma: cross section per illuminated area, 4 rho cos(alpha) for a Lambertian target.
 
-    constant: C' of `calibrate_echoes`; the rest as there. NaN where the distance is not positive.
+    Parameters
+    ----------
+    constant : float, 1/(m2 count ns)
+        C' of `calibrate_echoes`.
+    distance, amplitude, sigma, attenuation
+        As for `calibrate_echoes`.
+
+    Returns
+    -------
+    float64 (m,)
+        NaN where the distance is not positive.
     """
     distance = known_distance(distance)
     light = distance * distance * np.asarray(amplitude, np.float64) * np.asarray(sigma, np.float64)
@@ -55,16 +95,40 @@ def backscatter(
 
 
 def cross_section(gamma: np.ndarray, distance: np.ndarray, divergence: float) -> np.ndarray:
-    """Backscatter cross section [m2]: gamma times the area that the beam illuminates.
+    """Backscatter cross section: gamma times the area that the beam illuminates.
 
-    distance [m]; divergence: full angle between the 1/e^2 points [rad].
+    Parameters
+    ----------
+    gamma : float (m,)
+        From `backscatter`.
+    distance : float (m,), m
+        Sensor to echo.
+    divergence : float, rad
+        Full angle between the 1/e^2 points.
+
+    Returns
+    -------
+    float64 (m,), m2
     """
     distance = known_distance(distance)
     return np.asarray(gamma, np.float64) * (0.25 * math.pi * divergence * divergence) * (distance * distance)
 
 
 def diffuse_reflectance(gamma: np.ndarray, incidence: np.ndarray) -> np.ndarray:
-    """Reflectance of a Lambertian target that fills the beam, struck at `incidence` [rad]; NaN beyond 85 degrees."""
+    """Reflectance of a Lambertian target that fills the beam.
+
+    Parameters
+    ----------
+    gamma : float (m,)
+        From `backscatter`.
+    incidence : float (m,), rad
+        Angle of incidence.
+
+    Returns
+    -------
+    float64 (m,)
+        NaN above 85 degrees.
+    """
     facing = np.cos(incidence)
     return np.asarray(gamma, np.float64) / (4.0 * np.where(facing > math.cos(STEEPEST), facing, np.nan))
 
@@ -72,7 +136,17 @@ def diffuse_reflectance(gamma: np.ndarray, incidence: np.ndarray) -> np.ndarray:
 def energy_error(
     amplitude: np.ndarray, sigma: np.ndarray, amplitude_err: np.ndarray, sigma_err: np.ndarray
 ) -> np.ndarray:
-    """Relative standard deviation of amplitude times sigma, whose errors are correlated by -1/sqrt(3)."""
+    """Relative standard deviation of amplitude times sigma, whose errors have the correlation -1/sqrt(3).
+
+    Parameters
+    ----------
+    amplitude, sigma, amplitude_err, sigma_err : float (m,)
+        Values and their standard deviations.
+
+    Returns
+    -------
+    float64 (m,)
+    """
     a = np.asarray(amplitude_err, np.float64) / _positive(amplitude)
     s = np.asarray(sigma_err, np.float64) / _positive(sigma)
     return np.sqrt(a * a + s * s + 2.0 * ENERGY_CORRELATION * a * s)
@@ -87,9 +161,24 @@ def backscatter_error(
     *,
     power: int = 2,
 ) -> np.ndarray:
-    """Relative standard deviation of gamma (power 2) or of the cross section (power 4).
+    """Relative standard deviation of gamma, or of the cross section.
 
-    energy_err: from `energy_error`; distance and its error [m]; constant_err: of C', relative; attenuation [dB/km].
+    Parameters
+    ----------
+    energy_err : float (m,)
+        From `energy_error`.
+    distance, distance_err : float (m,), m
+        Sensor to echo, and its standard deviation.
+    constant_err : float
+        Relative standard deviation of C'.
+    attenuation : float, dB/km
+        Of the air, one way.
+    power : int
+        Power of the distance: 2 for gamma, 4 for the cross section.
+
+    Returns
+    -------
+    float64 (m,)
     """
     slope = power / known_distance(distance) + 2.0e-4 * attenuation * math.log(10.0)
     ranging = slope * np.asarray(distance_err, np.float64)
@@ -97,12 +186,24 @@ def backscatter_error(
 
 
 def reflectance_error(relative: np.ndarray, incidence: np.ndarray, incidence_err: np.ndarray) -> np.ndarray:
-    """Relative standard deviation of the reflectance from that of gamma and the error of the angle [rad]."""
+    """Relative standard deviation of the reflectance.
+
+    Parameters
+    ----------
+    relative : float (m,)
+        That of gamma.
+    incidence, incidence_err : float (m,), rad
+        Angle of incidence and its standard deviation.
+
+    Returns
+    -------
+    float64 (m,)
+    """
     return np.hypot(relative, np.tan(incidence) * incidence_err)
 
 
 def known_distance(distance: np.ndarray) -> np.ndarray:
-    """The distance in float64, NaN where it is not a positive number."""
+    """The distance in float64; NaN where it is not a positive number."""
     distance = np.asarray(distance, np.float64)
     return np.where(np.isfinite(distance) & (distance > 0), distance, np.nan)
 

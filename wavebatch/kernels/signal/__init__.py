@@ -1,1 +1,1 @@
-"""Filters and estimates on waveforms: arrays in, arrays out."""
+"""Filters and estimates on waveforms: arrays (samples, n) in, arrays out."""

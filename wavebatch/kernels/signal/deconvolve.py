@@ -1,8 +1,8 @@
-"""Deconvolution of many waveforms with one pulse: Wiener, Richardson-Lucy, Gold (ALGORITHMS 2.5).
+"""Deconvolution of many waveforms with one pulse: Wiener, Richardson-Lucy, Gold (docs/algorithms.md 2.5).
 
-Arrays are (samples, n). A pulse is given by its taps (k,), k odd, of any height, and works around its middle tap. The
-result o is such that the waveform is the sum of o[i] times the pulse put at i: the sum of o around an echo is its
-amplitude in units of the pulse's height. Columns are independent of each other, bit for bit.
+Used by the stages of detect/wavelet.py and by the voxel tool. Arrays are (s, n); a pulse is given by its taps (k,),
+k odd, of any height, centred on its middle tap. The sum of the result around an echo is its amplitude in units of the
+pulse's height. Columns do not influence each other, bit for bit.
 """
 
 from __future__ import annotations
@@ -13,11 +13,24 @@ from wavebatch.kernels.signal.filters import filter_symmetric
 from wavebatch.kernels.signal.signal import sum_samples
 
 FLOOR = np.float32(1e-6)
-"""Least value of a model that data are divided by, in units of its background."""
+"""Smallest value of a model that data are divided by, in units of its background."""
 
 
 def convolve_pulse(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Signal (s, n) with every sample replaced by the pulse of its height; zero outside."""
+    """Each sample replaced by the pulse of its height, summed; zero outside.
+
+    Parameters
+    ----------
+    signal : float32 or float64 (s, n), count
+        Waveforms.
+    taps : float (k,)
+        Pulse, k odd.
+
+    Returns
+    -------
+    float (s, n)
+        Of the dtype of the signal.
+    """
     half = len(taps) // 2
     if np.array_equal(taps, taps[::-1]):
         return filter_symmetric(signal, taps[half:])
@@ -38,9 +51,20 @@ def correlate_pulse(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
 
 
 def wiener_taps(taps: np.ndarray, noise_to_signal: float, reach: int) -> np.ndarray:
-    """The Wiener filter of a pulse as taps (2 reach + 1,) for `convolve_pulse`.
+    """The Wiener filter of a pulse, as taps for `convolve_pulse`.
 
-    noise_to_signal: power of the noise over that of the wanted signal, per sample; reach: beyond which it is cut off.
+    Parameters
+    ----------
+    taps : float (k,)
+        Pulse.
+    noise_to_signal : float
+        Power of the noise over that of the wanted signal, per sample.
+    reach : int, samples
+        Where the filter is cut off on both sides.
+
+    Returns
+    -------
+    float64 (2 reach + 1,)
     """
     length = 8 * (reach + len(taps))
     pulse = np.zeros(length)
@@ -51,7 +75,21 @@ def wiener_taps(taps: np.ndarray, noise_to_signal: float, reach: int) -> np.ndar
 
 
 def deconvolve_wiener(signal: np.ndarray, taps: np.ndarray, noise_to_signal: float) -> np.ndarray:
-    """Signal (s, n) deconvolved by the linear filter of least mean square error; may be negative."""
+    """Signal deconvolved by the linear filter of least mean square error; it may be negative.
+
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    taps : float (k,)
+        Pulse.
+    noise_to_signal : float
+        Power of the noise over that of the wanted signal, per sample.
+
+    Returns
+    -------
+    float (s, n)
+    """
     reach = 4 * len(taps)
     inverse = wiener_taps(taps, noise_to_signal, reach)
     if np.array_equal(taps, taps[::-1]):
@@ -62,10 +100,28 @@ def deconvolve_wiener(signal: np.ndarray, taps: np.ndarray, noise_to_signal: flo
 def deconvolve_richardson_lucy(
     signal: np.ndarray, taps: np.ndarray, background: np.ndarray, iterations: int, *, accelerate: bool = True
 ) -> np.ndarray:
-    """Signal (s, n) deconvolved by the expectation maximisation of Poisson counts, never negative.
+    """Signal deconvolved by expectation maximisation for Poisson counts; never negative.
 
-    background: added to signal and model (n,), so that noise about 0 is not taken for signal; positive. accelerate:
-    extrapolate each step from the two before it (Biggs and Andrews 1997), worth about five times the iterations.
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    taps : float (k,)
+        Pulse.
+    background : float (n,), count
+        Added to signal and model, so that noise about 0 is not taken for signal; positive.
+    iterations : int
+        Number of steps.
+    accelerate : bool
+        Extrapolate each step from the two before it; worth about five times the iterations.
+
+    Returns
+    -------
+    float (s, n)
+
+    References
+    ----------
+    Biggs and Andrews (1997), Applied Optics 36(8), for the acceleration.
     """
     data = np.maximum(signal + background, 0)
     weight = 1 / correlate_pulse(np.ones((len(signal), 1), signal.dtype), taps)
@@ -87,7 +143,7 @@ def deconvolve_richardson_lucy(
 
 
 def _share(change: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """How far each column goes on in the direction of its last step, 0 to 1 (n,)."""
+    """How far each column continues in the direction of its last step, 0 to 1 (n,)."""
     along, length = sum_samples(change * before), sum_samples(before * before)
     return np.clip(along / np.where(length > 0, length, 1), 0, 1)
 
@@ -95,9 +151,24 @@ def _share(change: np.ndarray, before: np.ndarray) -> np.ndarray:
 def deconvolve_gold(
     signal: np.ndarray, taps: np.ndarray, iterations: int, *, rounds: int = 1, boost: float = 1.0
 ) -> np.ndarray:
-    """Signal (s, n) deconvolved by Gold's ratios, never negative; negative samples count as 0.
+    """Signal deconvolved by Gold's ratios; never negative. Negative samples count as 0.
 
-    rounds: how often the iterations are run; between them the result is raised to the power `boost`.
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    taps : float (k,)
+        Pulse.
+    iterations : int
+        Number of steps of a round.
+    rounds : int
+        Number of rounds.
+    boost : float
+        Power to which the result is raised between rounds.
+
+    Returns
+    -------
+    float (s, n)
     """
     data = np.maximum(signal, 0)
     target = np.maximum(correlate_pulse(data, taps), 0)

@@ -1,4 +1,7 @@
-"""Filters of detectors along the samples of (s, n) arrays, with the noise they let through."""
+"""Filters of the detectors, along the samples of arrays (s, n), and the noise that they let through.
+
+Used by stages/detect. A filter is given by half of its taps: the centre first.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ import numpy as np
 
 
 def gaussian_taps(width: float, reach: float = 3.0) -> np.ndarray:
-    """Half of a symmetric Gaussian filter: taps 0, 1, ... up to `reach` widths [samples], peak 1."""
+    """Half of a Gaussian filter of height 1: taps 0, 1, ... up to `reach` widths [samples], float64."""
     return np.exp(-0.5 * (np.arange(int(np.ceil(reach * width)) + 1) / width) ** 2)
 
 
 def curvature_taps(width: float, reach: float = 4.0) -> np.ndarray:
-    """Half of the negative second derivative of a Gaussian, with zero sum; taps 0, 1, ... [samples]."""
+    """Half of the negative second derivative of a Gaussian, made to sum to zero: taps 0, 1, ... [samples], float64."""
     x = np.arange(int(np.ceil(reach * width)) + 1) / width
     taps = (1 - x * x) * np.exp(-0.5 * x * x)
     total = taps[0] + 2 * taps[1:].sum()
@@ -20,7 +23,8 @@ def curvature_taps(width: float, reach: float = 4.0) -> np.ndarray:
 
 
 def slope_taps(width: float, reach: float = 4.0) -> np.ndarray:
-    """Half of an antisymmetric filter, the derivative of a Gaussian: taps 0, 1, ... [samples], the first one 0.
+    """Half of an antisymmetric filter, the derivative of a Gaussian: taps 0, 1, ... [samples], the first one 0,
+    float64.
 
     It gives the slope per sample of a straight line.
     """
@@ -30,17 +34,27 @@ def slope_taps(width: float, reach: float = 4.0) -> np.ndarray:
 
 
 def filter_energy(taps: np.ndarray) -> float:
-    """Sum of the squares of a symmetric filter given by its half: the gain of white noise variance."""
+    """Sum of the squares of a symmetric filter given by its half: the gain of the variance of white noise."""
     return float(taps[0] ** 2 + 2 * np.sum(taps[1:] ** 2))
 
 
 def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Signal (s, n) correlated along the samples with a symmetric filter given by its half; zero outside."""
+    """Signal correlated with a symmetric filter.
+
+    Parameters
+    ----------
+    signal : float32 (s, n)
+        Waveforms; zero outside.
+    taps : float (k,)
+        Half of the filter.
+
+    Returns
+    -------
+    float32 (s, n)
+    """
     s = len(signal)
     total = np.float32(taps[0]) * signal
-    for i, tap in enumerate(taps[1:], start=1):
-        if i >= s:
-            break
+    for i, tap in enumerate(taps[1:s], start=1):
         part = np.float32(tap) * signal
         total[i:] += part[:-i]
         total[:-i] += part[i:]
@@ -48,7 +62,19 @@ def filter_symmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
 
 
 def filter_antisymmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Signal (s, n) correlated along the samples with taps 0, 1, ... ahead and their negatives behind; zero outside."""
+    """Signal correlated with an antisymmetric filter.
+
+    Parameters
+    ----------
+    signal : float32 (s, n)
+        Waveforms; zero outside.
+    taps : float (k,)
+        Taps 0, 1, ... towards later samples; earlier samples have the negative ones.
+
+    Returns
+    -------
+    float32 (s, n)
+    """
     s = len(signal)
     total = np.zeros_like(signal)
     for i, tap in enumerate(taps[1:s], start=1):
@@ -59,9 +85,19 @@ def filter_antisymmetric(signal: np.ndarray, taps: np.ndarray) -> np.ndarray:
 
 
 def refine_peaks(filtered: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time and height of peaks of filtered (s, n) by a parabola through the logarithms of three samples.
+    """Time and height of peaks between samples, by a parabola through the logarithms of three samples.
 
-    Where a neighbour is not positive, or the peak lies on the first or last sample, the sample itself.
+    Parameters
+    ----------
+    filtered : float (s, n)
+        Filtered waveforms.
+    waveform, sample : int64 (m,)
+        Place of each peak.
+
+    Returns
+    -------
+    time, height : float64 (m,), samples and units of `filtered`
+        The sample itself where a neighbour is not positive, and at the first and the last sample.
     """
     s, n = filtered.shape
     flat = filtered.reshape(-1)

@@ -1,4 +1,7 @@
-"""Profiles along rays: what of a deconvolved waveform is signal, and where it lies against known returns."""
+"""Profiles along rays: which part of a deconvolved waveform is signal, and how it lies against known returns.
+
+Used by the voxel tool.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,23 @@ from wavebatch.kernels.signal.deconvolve import convolve_pulse
 from wavebatch.kernels.signal.signal import sum_samples
 
 ROUND = 8
-"""Windows are as long as a multiple of this, so that many waveforms share a length."""
+"""Lengths of windows are multiples of this, so that many waveforms share one length."""
 
 
 def window_signal(support: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """First sample and length (n,) of the part of each waveform that holds support (s, n), `margin` on both sides.
+    """The part of each waveform that holds its signal.
 
-    Lengths are multiples of ROUND, or s; 0 where a waveform has no support.
+    Parameters
+    ----------
+    support : bool (s, n)
+        Samples with signal.
+    margin : int, samples
+        Added on both sides.
+
+    Returns
+    -------
+    first, length : int64 (n,)
+        Lengths are multiples of ROUND, or s; 0 where a waveform has no signal.
     """
     s = len(support)
     any_ = support.any(axis=0)
@@ -25,9 +38,24 @@ def window_signal(support: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndar
 
 
 def fit_height(profile: np.ndarray, signal: np.ndarray, taps: np.ndarray, support: np.ndarray) -> np.ndarray:
-    """Profiles (n, s) times the number that gives their sum of pulses the energy of the signal (s, n) on its support.
+    """Profiles scaled so that their sum of pulses has the energy of the signal.
 
-    What the deconvolution and the choice of its samples add to or take from the energy is made good.
+    It corrects the energy that deconvolution, and the choice of its samples, add or remove.
+
+    Parameters
+    ----------
+    profile : float64 (n, s)
+        Deconvolved waveforms.
+    signal : float32 (s, n), count
+        Waveforms without baseline.
+    taps : float (k,)
+        Pulse.
+    support : bool (n, s)
+        Samples over which energies are compared.
+
+    Returns
+    -------
+    float64 (n, s)
     """
     model = convolve_pulse(np.ascontiguousarray(profile.T, np.float32), taps)
     mask = np.ascontiguousarray(support.T)
@@ -39,11 +67,26 @@ def fit_height(profile: np.ndarray, signal: np.ndarray, taps: np.ndarray, suppor
 def keep_signal(
     profile: np.ndarray, support: np.ndarray, least: np.ndarray, floor: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The part of deconvolved waveforms (n, s) that is signal, float64, never negative; and which have any, bool (n,).
+    """The part of deconvolved waveforms that is signal.
 
-    support (n, s): samples of the waveform above its noise. least (n,): a run of supported samples whose sum is smaller
-    is noise. floor (n,): smaller samples of a run count as zero, and the others are scaled so that the run's sum, with
-    its negative samples, stays what it was.
+    Parameters
+    ----------
+    profile : float (n, s)
+        Deconvolved waveforms.
+    support : bool (n, s)
+        Samples of the waveform above its noise.
+    least : float (n,)
+        A run of supported samples with a smaller sum is noise.
+    floor : float (n,)
+        Smaller samples of a run become zero, and the others are scaled so that the sum of the run, with its negative
+        samples, does not change.
+
+    Returns
+    -------
+    signal : float64 (n, s)
+        Never negative.
+    seen : bool (n,)
+        Which waveforms have signal.
     """
     n, s = profile.shape
     place = np.flatnonzero(support)
@@ -53,7 +96,7 @@ def keep_signal(
     run = np.cumsum(starts) - 1
     number, owner = int(starts.sum()), row[starts]
     high = np.where(value > floor[row], value, 0.0)
-    # Sums sample after sample: the same whatever else is in the block.
+    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
     whole, kept = (np.bincount(run, part, minlength=number) for part in (value, high))
     good = (whole >= least[owner]) & (kept > 0)
     scale = np.where(good, whole / np.where(kept > 0, kept, 1.0), 0.0)
@@ -67,10 +110,27 @@ def keep_signal(
 def measure_offsets(
     profile: np.ndarray, row: np.ndarray, sample: np.ndarray, reach: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How far profiles (n, s) lie behind their known returns [samples], and where that is known, bool (n,).
+    """How far profiles lie after their known returns.
 
-    row, sample: waveform and place of every return (m,), sorted by row. Per waveform the mean, weighted by the signal,
-    of the centres of gravity within `reach` samples of each return; looked for again where the first look found them.
+    Per waveform the mean, weighted by the signal, of the centres of gravity near each return; searched again around the
+    places found first.
+
+    Parameters
+    ----------
+    profile : float64 (n, s)
+        Signal.
+    row : int (m,)
+        Waveform of each return, ascending.
+    sample : float (m,), samples
+        Place of each return.
+    reach : int, samples
+        How far around a return to look.
+
+    Returns
+    -------
+    offset : float64 (n,), samples
+    known : bool (n,)
+        False where there is no signal near the returns; the offset is 0 there.
     """
     n, s = profile.shape
     offset, known = np.zeros(n), np.zeros(n, bool)

@@ -1,4 +1,8 @@
-"""Runs of samples and flanks of peaks: the highest sample, sums, and where a flank crosses a level."""
+"""Runs of samples and flanks of peaks: highest samples, moments, and where a flank crosses a level.
+
+Used by stages/detect; `lobe_edges` also by the pulse models. Runs come from `find_runs` in kernels/fit/cluster: starts
+and ends (one after the last) as waveform * s + sample.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +10,27 @@ import numpy as np
 
 
 def list_samples(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Run and position (waveform * s + sample) of every sample in runs as `find_runs` gives them."""
+    """Run and position (waveform * s + sample) of every sample in runs, int64."""
     length = ends - starts
     run = np.repeat(np.arange(len(starts)), length)
-    behind = np.cumsum(length) - length
-    return run, np.arange(len(run)) - (behind - starts)[run]
+    before = np.cumsum(length) - length
+    return run, np.arange(len(run)) - (before - starts)[run]
 
 
 def highest_samples(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Sample (k,) at which the signal (s, n) is highest in each run of `find_runs`, the first of several."""
+    """Sample at which the signal is highest in each run; the first of several.
+
+    Parameters
+    ----------
+    signal : float (s, n)
+        Waveforms.
+    starts, ends : int64 (k,)
+        Runs.
+
+    Returns
+    -------
+    int64 (k,)
+    """
     s, n = signal.shape
     if not len(starts):
         return np.empty(0, np.int64)
@@ -27,9 +43,19 @@ def highest_samples(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) ->
 
 
 def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of gravity and standard deviation [samples] of the positive signal (s, n) in each run, float64 (k,).
+    """Centre of gravity and standard deviation of the positive signal in each run.
 
-    A run without a positive sample has its middle and 0.
+    Parameters
+    ----------
+    signal : float (s, n)
+        Waveforms.
+    starts, ends : int64 (k,)
+        Runs.
+
+    Returns
+    -------
+    centre, spread : float64 (k,), samples
+        The middle of the run and 0 where no sample is positive.
     """
     s, n = signal.shape
     run, place = list_samples(starts, ends)
@@ -37,17 +63,55 @@ def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tup
     weight = np.maximum(signal.reshape(-1)[sample * n + place // s], 0).astype(np.float64)
     middle = 0.5 * (starts + ends - 1) - starts // s * s
     lag = sample - middle[run]
-    # Sums sample after sample: the same whatever else is in the block.
+    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
     total, first, second = (np.bincount(run, weight * lag**p, minlength=len(starts)) for p in range(3))
     total = np.where(total > 0, total, 1.0)
     mean = first / total
     return middle + mean, np.sqrt(np.maximum(second / total - mean**2, 0.0))
 
 
-def walk_down(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, level: np.ndarray, step: int) -> np.ndarray:
-    """Position (m,) at which the signal (s, n) falls to the level (m,) when one walks from a peak by steps of +-1.
+def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, float]:
+    """Where the main lobe of one curve crosses a level, on the left and on the right of its peak.
 
-    Linear between samples. A walk that meets a rise or an end of the waveform before stops at the last sample there.
+    Parameters
+    ----------
+    x, curve : float (r,)
+        The curve; linear between its samples.
+    level : float
+        Below the peak, and above the curve somewhere on both sides.
+
+    Returns
+    -------
+    left, right : float, unit of x
+    """
+    top = int(np.argmax(curve))
+    right = top + int(np.argmax(curve[top:] < level))
+    left = top - int(np.argmax(curve[top::-1] < level))
+
+    def cross(a: int, b: int) -> float:
+        return x[a] + (x[b] - x[a]) * (level - curve[a]) / (curve[b] - curve[a])
+
+    return cross(left + 1, left), cross(right - 1, right)
+
+
+def walk_down(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, level: np.ndarray, step: int) -> np.ndarray:
+    """Place at which the signal falls to a level when one walks from a peak in one direction.
+
+    Parameters
+    ----------
+    signal : float (s, n)
+        Waveforms; linear between samples.
+    waveform, sample : int64 (m,)
+        Place of each peak.
+    level : float (m,)
+        Level to reach.
+    step : int
+        +1 or -1.
+
+    Returns
+    -------
+    float64 (m,), samples
+        A walk that meets a rise or an end of the waveform first stops at its last sample.
     """
     s, n = signal.shape
     flat = signal.reshape(-1)

@@ -1,4 +1,8 @@
-"""Baseline, smoothing and local maxima over thousands of waveforms: arrays (samples, n), waveforms last."""
+"""Smoothing, local maxima and quiet samples of thousands of waveforms.
+
+Used by nearly every stage and by the survey. Arrays are (s, n), waveforms along the last, contiguous axis: this layout
+is what makes NumPy fast here.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,24 @@ SMOOTH_GAIN = np.sqrt(6.0) / 4.0
 
 
 LEAST_PADDING, LEAST_RECORDED, LEAST_LEVEL = 8, 16, 3
-"""Zeros at the end of a waveform that are padding: so many, behind so many samples that are all at least so high."""
+"""Zeros at the end of a waveform are padding if there are at least LEAST_PADDING of them, after at least LEAST_RECORDED
+samples that are all at least LEAST_LEVEL.
+"""
 
 
 def recorded_lengths(samples: np.ndarray) -> np.ndarray:
-    """Samples of each waveform before the zeros that fill it up to the length of its packet, i8 (n,).
+    """Length of each waveform without the zeros that fill its packet.
 
-    samples: raw counts (n, s). Zeros belong to a recording whose level reaches down to them: they are padding only
-    where nothing before them comes near.
+    Trailing zeros are padding only where no real sample is near zero.
+
+    Parameters
+    ----------
+    samples : uint (n, s), count
+        Raw counts.
+
+    Returns
+    -------
+    int64 (n,), samples
     """
     n, s = samples.shape
     length = np.full(n, s, np.int64)
@@ -53,10 +67,20 @@ def smooth_121(signal: np.ndarray) -> np.ndarray:
 
 
 def find_peaks(signal: np.ndarray, threshold: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Local maxima of signal (s, n) above threshold (scalar or (n,)): waveform and sample, sorted by both.
+    """Local maxima above a threshold.
 
-    A plateau counts once, at its first sample; the first and the last sample count when they stand above
-    their one neighbour. A constant waveform has no peak.
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms.
+    threshold : float or float (n,), count
+        Peaks must be higher.
+
+    Returns
+    -------
+    waveform, sample : int64 (m,)
+        Sorted by both. A plateau counts once, at its first sample; the first and the last sample count when they are
+        higher than their one neighbour. A constant waveform has no peak.
     """
     s, n = signal.shape
     if s < 2:
@@ -79,7 +103,7 @@ def find_peaks(signal: np.ndarray, threshold: np.ndarray | float) -> tuple[np.nd
 
 
 def _is_top(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """False (m,) where the plateau that begins at a sample is a step of a rising flank: the signal rises behind it."""
+    """False (m,) where the plateau that begins at a sample is a step of a rising flank."""
     top = np.ones(len(sample), bool)
     flat = np.arange(len(sample))
     ahead = sample.copy()
@@ -93,7 +117,7 @@ def _is_top(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray) -> np.
 
 
 def widen(mask: np.ndarray, reach: int) -> np.ndarray:
-    """Boolean (s, n) in which every true sample also marks the `reach` samples on both sides of it."""
+    """Mask, bool (s, n), in which each true sample also marks the `reach` samples on both sides."""
     wide = mask.copy()
     done = 0
     while done < reach:
@@ -107,20 +131,52 @@ def widen(mask: np.ndarray, reach: int) -> np.ndarray:
 
 
 def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int) -> np.ndarray:
-    """Boolean (s, n): samples further than `reach` from every smoothed sample that leaves +-limit."""
+    """Samples far from any signal.
+
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    limit : float or float (n,), count
+        A smoothed sample beyond +-limit is signal.
+    reach : int, samples
+        Samples this near to signal are not quiet.
+
+    Returns
+    -------
+    bool (s, n)
+    """
     smoothed = smooth_121(signal)
     return ~widen(np.abs(smoothed) > limit, reach)
 
 
 def quiet_mean(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n,) of the quiet samples of signal (s, n), 0 where there are none, and their number (n,)."""
+    """Mean of the quiet samples of each waveform.
+
+    Parameters
+    ----------
+    signal : float32 (s, n), count
+        Waveforms.
+    quiet : bool (s, n)
+        Samples that count.
+
+    Returns
+    -------
+    mean : float32 (n,), count
+        0 where no sample is quiet.
+    number : int32 (n,)
+        Quiet samples.
+    """
     number = quiet.sum(axis=0, dtype=np.int32)
     total = sum_samples(np.where(quiet, signal, np.float32(0)))
     return total / np.maximum(number, 1).astype(np.float32), number
 
 
 def sum_samples(values: np.ndarray) -> np.ndarray:
-    """Sums (n,) over the samples of (s, n), in the same order whatever n: NumPy adds a single column pairwise."""
+    """Sums (n,) over the samples of values (s, n), added in the same order for any n.
+
+    NumPy adds a single column pairwise, others one by one: the result would depend on the block.
+    """
     if values.shape[1] != 1:
         return values.sum(axis=0)
     return np.repeat(values, 2, axis=1).sum(axis=0)[:1]

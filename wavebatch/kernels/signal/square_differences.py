@@ -1,4 +1,7 @@
-"""Average square difference of waveforms and a reference pulse, and its significant minima (ALGORITHMS 1.1)."""
+"""Average square difference (ASDF) of waveforms and a reference pulse, and its significant minima.
+
+Used by the stage detect.asdf (Wagner et al., docs/algorithms.md 1.1).
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,25 @@ from typing import NamedTuple
 import numpy as np
 
 COLUMNS_AT_A_TIME = 512
-"""Waveforms whose arrays stay in the cache together."""
+"""Waveforms per part, so that the arrays of a part stay in the cache together."""
 
 
 class Minima(NamedTuple):
     """Local minima of functions (n, rows), sorted by waveform, then row."""
 
     waveform: np.ndarray
+    """int64 (m,)."""
     row: np.ndarray
+    """int64 (m,)."""
     value: np.ndarray
+    """Value of the function, float (m,)."""
     left: np.ndarray
-    """Highest value between the minimum and the one before it, or the beginning."""
+    """Highest value between the minimum and the one before it, or the beginning, float (m,)."""
     right: np.ndarray
-    """Highest value between the minimum and the next one, or the end."""
+    """Highest value between the minimum and the next one, or the end, float (m,)."""
 
     def take(self, rows: np.ndarray) -> Minima:
-        """The minima at `rows`; their barriers are kept as they are."""
+        """The minima at `rows`; barriers stay as they are."""
         return Minima(*(field[rows] for field in self))
 
 
@@ -35,7 +41,19 @@ def pad_samples(signal: np.ndarray, number: int) -> np.ndarray:
 
 
 def slide_taps(padded: np.ndarray, taps: np.ndarray) -> np.ndarray:
-    """Sums of taps (k,) times rows t .. t + k - 1 of padded (s, n), for every t: (s - k + 1, n)."""
+    """Sums of taps times rows t .. t + k - 1, for every t.
+
+    Parameters
+    ----------
+    padded : float (s, n)
+        Waveforms.
+    taps : float (k,)
+        Weights.
+
+    Returns
+    -------
+    float (s - k + 1, n)
+    """
     k = len(taps)
     rows = len(padded) - k + 1
     taps = taps.astype(padded.dtype)
@@ -61,10 +79,25 @@ def slide_energy(padded: np.ndarray, k: int) -> np.ndarray:
 
 
 def square_differences(signal: np.ndarray, taps: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """ASDF of signal (s, n) and a reference of unit height (k,), and their correlation: (s + k - 1, n) each.
+    """ASDF of waveforms and a reference, and their correlation.
 
-    Row t belongs to the lag t - (k - 1) of the reference's first sample. The reference is multiplied by height (n,):
-    R = E1 + (energy of the window) - 2 C, the fast form; where the height is not positive, R is 0.
+    Parameters
+    ----------
+    signal : float (s, n), count
+        Waveforms without baseline.
+    taps : float (k,)
+        Reference of unit height.
+    height : float (n,), count
+        Height of the reference in each waveform; ASDF is 0 where it is not positive.
+
+    Returns
+    -------
+    difference, correlation : float (s + k - 1, n)
+        Row t belongs to the lag t - (k - 1) of the reference's first sample.
+
+    Notes
+    -----
+    R = E1 + (energy of the window) - 2 C, the fast form (docs/algorithms.md 1.1).
     """
     k = len(taps)
     padded = pad_samples(signal, k - 1)
@@ -78,9 +111,18 @@ def square_differences(signal: np.ndarray, taps: np.ndarray, height: np.ndarray)
 
 
 def find_minima(values: np.ndarray, wanted: np.ndarray | None = None) -> Minima:
-    """Minima of contiguous values (n, rows): below the value before, not above the one behind; never at the ends.
+    """Minima of functions: below the value before, not above the one after; never at the ends.
 
-    wanted: rows at which minima count at all, bool (n, rows); others neither count nor separate.
+    Parameters
+    ----------
+    values : float (n, rows)
+        Contiguous.
+    wanted : bool (n, rows), optional
+        Where minima count; others neither count nor separate.
+
+    Returns
+    -------
+    Minima
     """
     n, rows = values.shape
     low = np.zeros((n, rows), bool)
@@ -103,10 +145,22 @@ def find_minima(values: np.ndarray, wanted: np.ndarray | None = None) -> Minima:
 
 
 def keep_prominent(minima: Minima, least: np.ndarray) -> np.ndarray:
-    """Rows of the minima that are left when the least prominent one is removed as long as it lies below `least` (n,).
+    """Minima that are left when the least prominent one is removed as long as its prominence is too small.
 
-    Prominence: the lower barrier to the two neighbours that are still there, or to the ends. All minima that are less
-    prominent than both of their neighbours go at once, which comes to the same: removals only raise prominences.
+    The prominence is the lower barrier to the two neighbours that are left, or to the ends. All minima that are less
+    prominent than both neighbours are removed at once, with the same result: removals only raise prominences.
+
+    Parameters
+    ----------
+    minima : Minima
+        Changed: barriers are updated in place.
+    least : float (n,)
+        Smallest prominence in each waveform.
+
+    Returns
+    -------
+    int64
+        Rows of the minima that are left, ascending.
     """
     rows, kept = np.arange(len(minima.row)), []
     limit = least[minima.waveform]

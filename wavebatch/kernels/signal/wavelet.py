@@ -1,4 +1,7 @@
-"""The B3-spline wavelet transform with holes along the samples of (s, n) arrays (ALGORITHMS 1.2)."""
+"""The B3-spline wavelet transform with holes, along the samples of arrays (s, n).
+
+Used by the stage detect.wavelet (Wang et al., docs/algorithms.md 1.2).
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ def smooth_b3(signal: np.ndarray, step: int) -> np.ndarray:
 
 
 def b3_detail(signal: np.ndarray, level: int) -> np.ndarray:
-    """Detail of signal (s, n) at a level from 1 on: what the last of `level` smoothings takes away."""
+    """Detail of signal (s, n) at a level, 1 or more: what the last of `level` smoothings removes."""
     for step in range(level - 1):
         signal = smooth_b3(signal, 1 << step)
     return signal - smooth_b3(signal, 1 << (level - 1))

@@ -8,6 +8,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
@@ -19,9 +20,6 @@ from wavebatch.kernels.physics.incidence import (
 from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
 from wavebatch.stages.chain import stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
-
-LEAST_WIDTH = 0.85
-"""Width of the system pulse [samples] below which fitted widths depend on where the samples lie (1.4)."""
 
 NARROW_ERRORS = 3.0
 """Errors by which the variance must be negative for an echo to be flagged as narrower than the system pulse."""
@@ -74,7 +72,7 @@ def incidence_angle(
     alone: only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
     """
     beam = divergence or system.divergence
-    short = system.sigma_ref < LEAST_WIDTH * block.spacing
+    short = system.sigma_ref < LEAST_PULSE_WIDTH * block.spacing
     variance, variance_err = added_variance(block, system, echoes, mode, reference_error)
     distance = sensor_distance(block, echoes)
     angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)

@@ -10,7 +10,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.cluster import estimate_starts, start_errors
+from wavebatch.kernels.fit.closed_form import estimate_starts, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.signal import smooth_121

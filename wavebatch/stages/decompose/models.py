@@ -14,7 +14,8 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters, cut_windows
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model, gram_matrix, parameter_errors
+from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model
+from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import stage
 from wavebatch.stages.decompose.fit import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings

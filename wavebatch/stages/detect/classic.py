@@ -10,7 +10,8 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import estimate_starts, find_runs
+from wavebatch.kernels.fit.closed_form import estimate_starts
+from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_antisymmetric,

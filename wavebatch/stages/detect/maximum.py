@@ -6,7 +6,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import estimate_starts
+from wavebatch.kernels.fit.closed_form import estimate_starts
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,

@@ -1,4 +1,8 @@
-"""How well chains find what was simulated: groups that are simulated and surveyed apart, and the figures of all."""
+"""How well chains find the simulated echoes: groups of waveforms with their truth, and the figures over all groups.
+
+`command` and `stability` make groups and add what a chain found to a Tally. Each group has its own seed and survey,
+because the survey of a strip is a source of error too.
+"""
 
 from __future__ import annotations
 
@@ -17,37 +21,43 @@ from wavebatch.tools.bench.truth import describe_truth, find_bounds
 from wavebatch.tools.simulate import Scene, simulate_blocks
 
 CLEAR = 10.0
-"""Signal to noise from which an echo's error is compared with its bound."""
+"""Signal to noise from which the error of an echo is compared with its bound."""
 
 GROSS = 10.0
-"""An error of more bounds than this is a gross one: counted, but left out of error/bound."""
+"""Errors above this many bounds are gross: they are counted, but left out of error/bound."""
 
 GROUPS = 8
-"""Groups of a scene; each is surveyed anew, as the strips of a project are."""
+"""Groups of a scene; each has its own survey, like the strips of a project."""
 
 CM_PER_NS = 100 * HALF_C
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Waveforms of one seed, what is true of them, and what a survey says."""
+    """Waveforms of one seed, their truth, and their survey."""
 
     number: int
     block: WaveformBlock
     truth: EchoTable
-    """As found echoes would be described."""
+    """In the terms of found echoes, see `describe_truth`."""
     isolated: np.ndarray
-    """bool (m,)."""
+    """Echoes without a close neighbour, bool (m,)."""
     bounds: np.ndarray
     """Cramer-Rao bounds of time, amplitude and sigma, (m, 3)."""
     survey: Survey
     clear: np.ndarray
-    """Strong enough for its error to be compared with its bound, bool (m,)."""
+    """Echoes strong enough to compare their error with the bound, bool (m,)."""
 
     @property
     def system(self) -> SystemPulse:
-        """What the survey says of the sensor."""
+        """The system pulse of the survey."""
         return self.survey.system
+
+    def cut(self, n: int) -> Group:
+        """The first n waveforms."""
+        m = int(np.searchsorted(self.truth.waveform, n))
+        columns = {name: getattr(self, name)[:m] for name in ("isolated", "bounds", "clear")}
+        return replace(self, block=self.block.rows(slice(0, n)), truth=self.truth.take(np.arange(m)), **columns)
 
 
 def derive_seed(*numbers: int) -> int:
@@ -58,7 +68,7 @@ def derive_seed(*numbers: int) -> int:
 def make_groups(
     scene: Scene, waveforms: int, seed: int, progress: Callable[[str], None] = lambda text: None
 ) -> list[Group]:
-    """`waveforms` waveforms of the scene in groups with a seed and a survey of their own."""
+    """`waveforms` waveforms of the scene in GROUPS groups, each with its own seed and survey."""
     size = max(waveforms // GROUPS, 1)
     groups = []
     for place in range(GROUPS):
@@ -69,15 +79,9 @@ def make_groups(
 
 
 def make_group(
-    scene: Scene,
-    number: int,
-    block: WaveformBlock,
-    truth: EchoTable,
-    survey: Survey,
-    *,
-    clear: float = CLEAR,
+    scene: Scene, number: int, block: WaveformBlock, truth: EchoTable, survey: Survey, *, clear: float = CLEAR
 ) -> Group:
-    """The group of a simulated block with what its survey says; clear: signal to noise from which echoes are clear."""
+    """The group of a simulated block and its survey; clear: signal to noise from which echoes are compared."""
     recording = scene.recording
     return Group(
         number=number,
@@ -91,7 +95,7 @@ def make_group(
 
 
 def describe_found(found: EchoTable) -> EchoTable:
-    """The echoes with the full width at half maximum over 2.354820 as their sigma, where their chain tells it."""
+    """The echoes with sigma replaced by echo_width over 2.354820, where the chain computes echo_width."""
     if "echo_width" not in found.attributes:
         return found
     factor = np.float32(1 / FWHM_PER_SIGMA)
@@ -104,14 +108,14 @@ def describe_found(found: EchoTable) -> EchoTable:
 
 @dataclass(slots=True)
 class Tally:
-    """Collects what was found in groups; `figures` says what it amounts to."""
+    """Collects the echoes found in groups; `figures` summarises them."""
 
     _waveforms: list[dict[str, np.ndarray]] = field(default_factory=list)
     _echoes: list[dict[str, np.ndarray]] = field(default_factory=list)
     _offset: int = 0
 
     def add(self, group: Group, found: EchoTable) -> None:
-        """Take in the echoes found in the waveforms of a group."""
+        """Adds the echoes found in the waveforms of a group."""
         n, truth = len(group.block), group.truth
         match = match_echoes(found, truth)
         matched = np.zeros(len(truth), bool)
@@ -138,12 +142,12 @@ class Tally:
         self._offset += n
 
     def figures(self) -> dict[str, Figure]:
-        """Every figure by name; shares are of 1, lengths in cm of range, the others have no unit."""
+        """Every figure by name: shares as fractions, lengths in cm of range, the others without unit."""
         return {**self._shares(), **self._errors()}
 
     @property
     def waveforms(self) -> int:
-        """Waveforms taken in."""
+        """Number of waveforms added."""
         return self._offset
 
     def _shares(self) -> dict[str, Figure]:

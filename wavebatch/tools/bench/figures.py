@@ -1,7 +1,12 @@
-"""Figures of a benchmark: a value and how much it moves when the benchmark is run again with another seed."""
+"""Figures of a benchmark: values with an error, and the choice of chains by them.
+
+`accuracy` makes the figures, `command` and `plot` compare them. The error of a figure is that of the difference of two
+runs with other seeds, because that is what a reader compares.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,26 +17,26 @@ from wavebatch.core.no_data import without_nan
 NOTHING = float("nan")
 
 SURVEY_SCATTER = 0.05
-"""Relative scatter of an rms error between strips that differ in their survey alone, as measured on 16 strips with a
-learned pulse: a few groups may happen not to show it."""
+"""Relative scatter of an rms error between strips that differ only in their survey, measured on 16 strips with a
+learned pulse. At least this much is assumed, because a few groups can miss it by chance."""
 
 OUTLIER = 10.0
-"""How much worse than the root mean square the worst echo of another run may be."""
+"""Error of the worst echo of another run, in units of the root mean square."""
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
     """A value and its error: the standard error of the difference between two runs that differ in their seed.
 
-    That is 1.41 times the standard error of the value itself, which is the larger of two estimates: from the scatter
-    of single waveforms, and from the scatter of the groups that were simulated and surveyed apart.
+    That is 1.41 times the standard error of the value, which is the larger of two estimates: from the scatter of single
+    waveforms, and from the scatter of the groups, which are simulated and surveyed separately.
     """
 
     value: float = NOTHING
     error: float = NOTHING
 
     def to_json(self) -> dict[str, Any]:
-        """Value and error; None for what there was nothing to tell from."""
+        """Value and error; None where there were no data."""
         return without_nan({"value": self.value, "error": self.error})
 
     def scale(self, factor: float) -> Figure:
@@ -42,7 +47,7 @@ class Figure:
 def share(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
     """Sum of `part` over that of `whole`, counts per waveform (n,) in groups (n,), as a figure.
 
-    Shares of nearly nothing or nearly all keep an error of what two more or fewer would be (Agresti and Coull).
+    Shares near 0 or 1 keep the error that two counts more or less would make (Agresti and Coull 1998).
     """
     total = float(whole.sum())
     if not total:
@@ -56,7 +61,7 @@ def share(part: np.ndarray, whole: np.ndarray, group: np.ndarray) -> Figure:
 def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray) -> Figure:
     """Root mean square of values (m,) of echoes of the given waveforms (m,), unique over all groups, as a figure.
 
-    The error allows for surveys that differ and for one more echo OUTLIER times as bad as the others.
+    The error includes the scatter of surveys, and one more echo OUTLIER times as bad as the others.
     """
     if len(values) < 2:
         return Figure()
@@ -74,7 +79,7 @@ def root_mean_square(values: np.ndarray, waveform: np.ndarray, group: np.ndarray
 
 
 def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
-    """Standard error of an estimate from what each independent waveform (n,) contributed to it."""
+    """Standard error of an estimate from the contribution of each independent waveform, (n,)."""
     single = float(np.sqrt(np.square(influence).sum()))
     sums = np.bincount(group, influence)[np.unique(group)]
     g = len(sums)
@@ -85,7 +90,7 @@ def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
 
 
 def median_range(values: list[float]) -> dict[str, Any]:
-    """Median, least, most and number of repeated measurements of time; None of none."""
+    """Median, least, most and number of repeated measurements; None without any."""
     if not values:
         return {"median": None, "min": None, "max": None, "repeats": 0}
     return {
@@ -94,3 +99,30 @@ def median_range(values: list[float]) -> dict[str, Any]:
         "max": float(max(values)),
         "repeats": len(values),
     }
+
+
+def find_front(costs: Sequence[Sequence[float | None]]) -> np.ndarray:
+    """Pareto front: True for the rows of costs (n, k) that no other row beats.
+
+    A row beats another if it is as good in all columns and better in one. Rows with an unknown cost (None or NaN) are
+    never on the front.
+    """
+    values = np.array(costs, np.float64)
+    known = np.isfinite(values).all(axis=1)
+    no_worse = (values[:, None, :] <= values[None, :, :]).all(axis=2)
+    better = (values[:, None, :] < values[None, :, :]).any(axis=2)
+    return known & ~(no_worse & better & known[:, None]).any(axis=0)
+
+
+def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | None:
+    """The row of least time per waveform whose isolated echoes, their error added, meet the tolerance; None if none.
+
+    rows: as in the document of the benchmark.
+    """
+    good = []
+    for row in rows:
+        rmse = row["figures"]["rmse_isolated_cm"]
+        seconds = row["kernels"]["median"]
+        if rmse["value"] is not None and seconds is not None and rmse["value"] + (rmse["error"] or 0) <= tolerance_cm:
+            good.append((seconds, row["name"], row))
+    return min(good, key=lambda entry: entry[:2])[2] if good else None

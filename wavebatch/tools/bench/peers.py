@@ -1,4 +1,8 @@
-"""Other decomposers on the same waveforms: gdecomp where it is installed, and scipy's leastsq as the baseline."""
+"""Other decomposers on the same waveforms: gdecomp where it is installed, and scipy's leastsq as the baseline.
+
+`command` calls `run_peer`. Peers run in a Worker process, because gdecomp crashes or hangs on some waveforms: it writes
+its results to a memory-mapped file, and is started again after the waveform that stopped it.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +23,23 @@ from wavebatch.stages.noise import pooled
 from wavebatch.tools.bench.worker import Worker, WorkerDied
 
 MOST = 12
-"""Echoes of a waveform that a peer may report."""
+"""Most echoes per waveform that a peer may report."""
 
 PATIENCE = 2.0
-"""Seconds after which a peer that still works on one waveform is stopped."""
+"""Seconds on one waveform after which a peer is stopped."""
 
 HEIGHT = 5.5
-"""Least height of an echo for gdecomp, in standard deviations of the noise: at it misses and false echoes balance."""
+"""Least height of an echo for gdecomp, in standard deviations of the noise: there, misses and false echoes balance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerResult:
-    """What a peer found, and how long it took without starting up."""
+    """Echoes that a peer found, and its time without start-up."""
 
     found: EchoTable
     seconds: float
     waveforms: int
-    """That it finished."""
+    """Waveforms that it finished."""
     failures: int
     """Waveforms on which it crashed or hung."""
 
@@ -46,9 +50,9 @@ def list_peers() -> list[str]:
 
 
 def run_peer(name: str, block: WaveformBlock, system: SystemPulse) -> PeerResult:
-    """The peer on every waveform of the block, one by one, in a process that it may crash.
+    """Runs the peer on every waveform of the block, one by one, in another process.
 
-    It gets the waveforms less the baselines that wavebatch finds; scipy also gets wavebatch's candidates.
+    It gets the waveforms minus the baselines of wavebatch; scipy also gets the candidates of wavebatch.
     """
     noise = pooled(block, system)
     if name == "gdecomp":
@@ -101,7 +105,7 @@ def _solve(leastsq, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarr
 
 
 def _table(rows: np.ndarray, parameters: np.ndarray, last: float) -> EchoTable:
-    """Echoes that make sense: positive, finite, within the window."""
+    """The echoes that are positive, finite and within the window."""
     amplitude, when, sigma = parameters[:, 0], parameters[:, 1], np.abs(parameters[:, 2])
     keep = np.isfinite(parameters).all(axis=1) & (amplitude > 0) & (sigma > 0) & (when > 0) & (when < last)
     return EchoTable.build(rows[keep], when[keep], amplitude[keep], sigma[keep])
@@ -127,7 +131,7 @@ def _run_gdecomp(block: WaveformBlock, noise: Noise) -> PeerResult:
 
 
 def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
-    """Runs gdecomp, starting it again behind every waveform on which it crashes or hangs; how many these are."""
+    """Runs gdecomp, starting it again after every waveform on which it crashes or hangs; returns their number."""
     failures, place = 0, 0
     while place < n:
         with Worker() as worker:
@@ -145,7 +149,7 @@ def _drive_gdecomp(signal: Path, results: Path, n: int, height: float) -> int:
 
 
 def _wait(worker: Worker, results: Path, place: int) -> None:
-    """Until the worker is done; raises WorkerDied when it ends or makes no progress."""
+    """Waits until the worker is done; raises WorkerDied when it ends or makes no progress."""
     before = -1
     while True:
         try:

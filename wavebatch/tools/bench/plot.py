@@ -1,4 +1,8 @@
-"""The work-precision plot: error against time per waveform, the chains that nobody beats joined by a line."""
+"""The plot of a benchmark: error against time per waveform, with the Pareto front of the chains as a line.
+
+`report.write_outputs` calls `plot_scene` where matplotlib is installed. Labels are placed last, because their size on
+paper is known only then.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.bench.rank_chains import find_front
+from wavebatch.tools.bench.figures import find_front
 
 PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),
@@ -21,7 +25,7 @@ PLACES = (
     *((6, 5), (6, -5), (-6, 5), (-6, -5), (0, 8), (0, -8)),
     *((6, 16), (6, -16), (-6, 16), (-6, -16), (0, 20), (0, -20)),
 )
-"""Where a label may stand, from its point [points], the first choice first."""
+"""Places of a label relative to its point [points], the best first."""
 
 
 def can_plot() -> bool:
@@ -38,7 +42,7 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
             _draw_panel(axes, section["rows"], name, factor, label)
             for axes, (name, factor, label) in zip(panels, PANELS, strict=True)
         ]
-        # Where labels end up on paper is known once the panels have their size.
+        # The panels must have their final size before labels can be placed.
         figure.draw_without_rendering()
         for axes, names in zip(panels, labels, strict=True):
             _place_labels(axes, names)
@@ -47,7 +51,7 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
 def _draw_panel(
     axes: Any, rows: list[Mapping[str, Any]], name: str, factor: float, label: str
 ) -> list[tuple[str, float, float]]:
-    """Draws one error against time; the labels of the points, and where these are."""
+    """Draws one error against time; returns the labels of the points with their positions."""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     twins = {row["same_as"]: row["name"] for row in rows if "same_as" in row}
@@ -81,7 +85,7 @@ def _draw_panel(
 
 
 def _place_labels(axes: Any, labels: list[tuple[str, float, float]]) -> None:
-    """Writes each label beside its point, at the first place where it covers no point and no other label."""
+    """Writes each label next to its point, at the first place where it covers no point and no other label."""
     from matplotlib.transforms import Bbox
 
     legend = axes.get_legend()
@@ -116,5 +120,5 @@ def _move(note: Any, place: tuple[float, float]) -> None:
 
 def _overlap(a: Any, b: Any) -> float:
     """Area that two boxes share [pixels]."""
-    width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
-    return width * height if width > 0 and height > 0 else 0.0
+    both = a.intersection(a, b)
+    return both.width * both.height if both else 0.0

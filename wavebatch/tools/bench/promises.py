@@ -1,119 +1,38 @@
-"""What each release promises (PRODUCT.md and the issues), beside what was measured."""
+"""The figures that each release promises, compared with those of a benchmark document.
+
+`wavebatch bench --promises` calls `judge` and prints `format_promises`. The limits stand in the tables SPEEDS, SHARES
+and STABLE, and in `_scene_promises` and `_system_promises` where they hold for all scenes or chains.
+"""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any
 
-from wavebatch.stages.chain_file import load_profile
 from wavebatch.tools.bench.report import align
-from wavebatch.tools.bench.scenes import find_bench_scene
-from wavebatch.tools.bench.speed import make_strip, measure_memory, time_jobs, time_start
 
-Document = Mapping[str, Any]
+Row = Mapping[str, Any]
 
+MAIN = "main"
+"""Stands for the chain `auto`, or `accurate` where `auto` was found to equal it."""
 
-def measure_system(
-    seed: int, *, pulses: int, large: bool, progress: Callable[[str], None] = lambda text: None
-) -> dict[str, Any]:
-    """Start-up, memory over the length of a strip, and speed over jobs, as plain values.
-
-    pulses: of the strip for memory; that for jobs is five times as long.
-    large: also measure memory with 100 times as many.
-    """
-    chain, scene = load_profile("accurate"), find_bench_scene("open")
-    progress("timing wavebatch --help")
-    told: dict[str, Any] = {"start_seconds": time_start(), "memory": [], "jobs": {}}
-    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
-        folder = Path(name)
-        for number in (pulses, 100 * pulses) if large else (pulses,):
-            progress(f"memory with {number} pulses")
-            strip = make_strip(scene, folder / "memory.laz", number, seed)
-            peak, waveforms = measure_memory(chain, strip, folder / "memory")
-            told["memory"].append({"waveforms": waveforms, "peak_bytes": peak})
-        progress("speed with 1 and 2 jobs")
-        strip = make_strip(scene, folder / "jobs.laz", 5 * pulses, seed)
-        times = time_jobs(chain, strip, folder / "jobs", (1, 2), 2)
-        told["jobs"] = {str(number): seconds for number, seconds in times.items()}
-    return told
-
-
-def judge(document: Document) -> list[dict[str, Any]]:
-    """A row per promise that the document can be held to: what, measured, promised, unit, met."""
-    rows: list[dict[str, Any]] = []
-    for section in document["scenes"]:
-        _judge_scene(rows, section)
-    _judge_stability(rows, document.get("stability", []))
-    if "system" in document:
-        _judge_system(rows, document["system"])
-    return rows
-
-
-SPEEDS = {
-    "mixed": {"main": ("kernels", 70_000), "balanced": ("kernels", 120_000)},
-    "open": {"main": ("file", 100_000)},
-    "forest": {"main": ("file", 25_000)},
-    "empty": {"main": ("kernels", 250_000)},
-}
-"""Least waveforms per second by scene and chain."""
+SPEEDS = (
+    ("mixed", MAIN, "kernels", 70_000),
+    ("mixed", "balanced", "kernels", 120_000),
+    ("mixed", "balanced", "file", 60_000),
+    ("open", MAIN, "file", 100_000),
+    ("forest", MAIN, "file", 25_000),
+    ("empty", MAIN, "kernels", 250_000),
+)
+"""Scene, chain, what is timed, least waveforms per second."""
 
 SHARES = {
-    "main": {"exact_count": 94.0, "completeness": 94.5, "correctness": 98.3},
+    MAIN: {"exact_count": 94.0, "completeness": 94.5, "correctness": 98.3},
     "balanced": {"exact_count": 82.0, "completeness": 85.4, "correctness": 95.8},
 }
 """Least shares on the mixed scene [%]."""
-
-
-def _add(rows: list[dict[str, Any]], what: str, value: float | None, limit: float, unit: str, most: bool) -> None:
-    if value is not None:
-        met = value <= limit if most else value >= limit
-        rows.append(
-            {"what": what, "measured": value, "promised": limit, "at_most": most, "unit": unit, "met": bool(met)}
-        )
-
-
-def _judge_scene(rows: list[dict[str, Any]], section: Mapping[str, Any]) -> None:
-    chains = {row["name"]: row for row in section["rows"]}
-    scene, main = section["scene"], "auto" if "auto" in chains else "accurate"
-    for role, (kind, limit) in SPEEDS.get(scene, {}).items():
-        row = chains[main if role == "main" else role]
-        _add(rows, f"{scene}: {row['name']}, {_KINDS[kind]}", _rate(row, kind), limit, "waveforms/s", False)
-    if scene == "mixed":
-        _add(rows, "mixed: balanced, file to file", _rate(chains["balanced"], "file"), 60_000, "waveforms/s", False)
-        for role, shares in SHARES.items():
-            row = chains[main if role == "main" else role]
-            for name, limit in shares.items():
-                _add(rows, f"mixed: {row['name']}, {name}", _percent(row, name), limit, "%", False)
-        _judge_peer(rows, chains, chains[main])
-    ratio = chains[main]["figures"]["time_ratio_isolated"]["value"]
-    _add(rows, f"{scene}: {main}, isolated, time error / bound", ratio, 1.05, "", True)
-    _add(rows, f"{scene}: {main}, false splits", _percent(chains[main], "false_splits"), 2.0, "%", True)
-
-
-_KINDS = {"kernels": "kernels", "file": "file to file"}
-
-
-def _rate(row: Mapping[str, Any], kind: str) -> float | None:
-    return 1e6 / row[kind]["median"] if row[kind]["median"] else None
-
-
-def _percent(row: Mapping[str, Any], name: str) -> float | None:
-    value = row["figures"][name]["value"]
-    return None if value is None else 100 * value
-
-
-def _judge_peer(rows: list[dict[str, Any]], chains: Mapping[str, Any], main: Mapping[str, Any]) -> None:
-    peer = chains.get("gdecomp")
-    if peer is None:
-        return
-    faster = (_rate(main, "kernels") or 0.0) / (_rate(peer, "kernels") or 1.0)
-    _add(rows, f"mixed: {main['name']} is faster than gdecomp", faster, 10.0, "times", False)
-    for name in ("completeness", "correctness"):
-        what = f"mixed: {main['name']}, {name} against gdecomp's"
-        _add(rows, what, _percent(main, name), _percent(peer, name) or 0.0, "%", False)
-
 
 STABLE = {
     "pair 1.5 s apart, SNR 50": ("exact_count", 85.0, False),
@@ -124,40 +43,105 @@ STABLE = {
     "ringing 3%": ("false_splits", 2.0, True),
     "noise of rho 0.67": ("false_splits", 0.5, True),
 }
-"""Shares that are promised by stiff case [%]: figure, limit, whether it is the most."""
+"""Stiff cases: figure, limit [%], whether the limit is the largest allowed value."""
 
 
-def _judge_stability(rows: list[dict[str, Any]], cases: list[Mapping[str, Any]]) -> None:
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """A promised limit and the measured figure."""
+
+    what: str
+    measured: float | None
+    """None where the benchmark did not measure it; such promises are left out."""
+    promised: float
+    at_most: bool = False
+    """The limit is the largest allowed value, else the least."""
+    unit: str = ""
+
+    @property
+    def met(self) -> bool:
+        """Whether the measured figure is within the limit."""
+        return bool(self.measured <= self.promised if self.at_most else self.measured >= self.promised)
+
+
+def judge(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A row per promise that the document has a figure for: what, measured, promised, at_most, unit, met."""
+    promises = chain(
+        chain.from_iterable(_scene_promises(section) for section in document["scenes"]),
+        _case_promises(document.get("stability", ())),
+        _system_promises(document["system"]) if "system" in document else (),
+    )
+    return [{**asdict(promise), "met": promise.met} for promise in promises if promise.measured is not None]
+
+
+def _scene_promises(section: Mapping[str, Any]) -> Iterator[Promise]:
+    rows = {row["name"]: row for row in section["rows"]}
+    scene, main = section["scene"], rows.get("auto") or rows["accurate"]
+    for place, role, kind, limit in SPEEDS:
+        if place == scene:
+            row = main if role == MAIN else rows[role]
+            timed = "file to file" if kind == "file" else kind
+            yield Promise(f"{scene}: {row['name']}, {timed}", _rate(row, kind), limit, unit="waveforms/s")
+    if scene == "mixed":
+        for role, shares in SHARES.items():
+            row = main if role == MAIN else rows[role]
+            for name, limit in shares.items():
+                yield Promise(f"mixed: {row['name']}, {name}", _percent(row, name), limit, unit="%")
+        if "gdecomp" in rows:
+            yield from _peer_promises(main, rows["gdecomp"])
+    ratio = main["figures"]["time_ratio_isolated"]["value"]
+    yield Promise(f"{scene}: {main['name']}, isolated, time error / bound", ratio, 1.05, at_most=True)
+    splits = _percent(main, "false_splits")
+    yield Promise(f"{scene}: {main['name']}, false splits", splits, 2.0, at_most=True, unit="%")
+
+
+def _peer_promises(main: Row, peer: Row) -> Iterator[Promise]:
+    faster = (_rate(main, "kernels") or 0.0) / (_rate(peer, "kernels") or 1.0)
+    yield Promise(f"mixed: {main['name']} is faster than gdecomp", faster, 10.0, unit="times")
+    for name in ("completeness", "correctness"):
+        what = f"mixed: {main['name']}, {name} against gdecomp's"
+        yield Promise(what, _percent(main, name), _percent(peer, name) or 0.0, unit="%")
+
+
+def _case_promises(cases: Sequence[Row]) -> Iterator[Promise]:
     for row in cases:
         if row["is_auto"] and row["case"] in STABLE:
-            figure, limit, most = STABLE[row["case"]]
-            _add(rows, f"{row['hazard']} {row['case']}: auto, {figure}", _percent(row, figure), limit, "%", most)
+            figure, limit, at_most = STABLE[row["case"]]
+            what = f"{row['hazard']} {row['case']}: auto, {figure}"
+            yield Promise(what, _percent(row, figure), limit, at_most, "%")
     if cases:
         failures = sum(sum(row["failures"].values()) for row in cases)
-        _add(rows, "stiff cases: failures of all chains", failures, 0, "", True)
+        yield Promise("stiff cases: failures of all chains", failures, 0, at_most=True)
 
 
-def _judge_system(rows: list[dict[str, Any]], system: Mapping[str, Any]) -> None:
-    _add(rows, "start-up of wavebatch --help", system["start_seconds"]["median"], 0.3, "s", True)
+def _system_promises(system: Mapping[str, Any]) -> Iterator[Promise]:
+    yield Promise("start-up of wavebatch --help", system["start_seconds"]["median"], 0.3, True, "s")
     peaks = [entry["peak_bytes"] for entry in system["memory"]]
     for entry, peak in zip(system["memory"], peaks, strict=True):
         megabytes = None if peak is None else peak / 1e6
-        _add(rows, f"peak memory with {entry['waveforms']} waveforms", megabytes, 500.0, "MB", True)
+        yield Promise(f"peak memory with {entry['waveforms']} waveforms", megabytes, 500.0, True, "MB")
     if len(peaks) > 1 and None not in peaks:
-        _add(rows, "memory of the long strip over the short", peaks[-1] / peaks[0], 1.1, "times", True)
+        yield Promise("memory of the long strip over the short", peaks[-1] / peaks[0], 1.1, True, "times")
     one, two = system["jobs"]["1"]["median"], system["jobs"]["2"]["median"]
-    _add(rows, "open: speed with 2 jobs over 1", one / two, 1.7, "times", False)
+    yield Promise("open: speed with 2 jobs over 1", one / two, 1.7, unit="times")
 
 
-def format_promises(rows: list[dict[str, Any]]) -> str:
+def _rate(row: Row, kind: str) -> float | None:
+    """Waveforms per second; None where they were not timed."""
+    return 1e6 / row[kind]["median"] if row[kind]["median"] else None
+
+
+def _percent(row: Row, name: str) -> float | None:
+    value = row["figures"][name]["value"]
+    return None if value is None else 100 * value
+
+
+def format_promises(rows: Sequence[Row]) -> str:
     """The promises as a table, each met or short."""
     lines = [["== promised", "measured", "promise", "", ""]]
     for row in rows:
-        sign = "<=" if row["at_most"] else ">="
-        verdict = "met" if row["met"] else "short"
-        lines.append(
-            [row["what"], _number(row["measured"]), f"{sign} {_number(row['promised'])}", row["unit"], verdict]
-        )
+        limit = f"{'<=' if row['at_most'] else '>='} {_number(row['promised'])}"
+        lines.append([row["what"], _number(row["measured"]), limit, row["unit"], "met" if row["met"] else "short"])
     return "\n".join(align(lines))
 
 

@@ -1,4 +1,8 @@
-"""What a benchmark prints and writes: text tables, bench.json, bench.txt and plots."""
+"""Text tables of a benchmark document, and its files: bench.json, bench.txt and plots.
+
+`wavebatch bench` calls `format_document` and `write_outputs`. A column of a table names a figure of the rows; `align`
+makes the text, for `promises` and the examples too.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,7 @@ def _ratios(kind: str) -> tuple[Column, ...]:
 
 
 def format_document(document: Mapping[str, Any]) -> str:
-    """All tables, as they are printed."""
+    """All tables as text."""
     parts = [
         f"wavebatch {document['version']} bench, seed {document['seed']}. +- is the {document['error_means']} "
         "(1.41 times that of the figure).",
@@ -64,11 +68,11 @@ def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str
     for kind in ("isolated", "overlapped"):
         lines += ["", *_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind))]
     if tolerance_cm is not None:
-        lines += ["", _tell_cheapest(section, tolerance_cm)]
+        lines += ["", _format_cheapest(section, tolerance_cm)]
     return "\n".join(lines)
 
 
-def _tell_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:
+def _format_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:
     wanted = f"an error of {tolerance_cm:g} cm for isolated echoes"
     if section["cheapest"] is None:
         return f"no chain meets {wanted}"
@@ -82,7 +86,7 @@ def _span(times: Mapping[str, Any]) -> str:
 
 
 def rate_text(times: Mapping[str, Any]) -> str:
-    """Waveforms per second from microseconds: median and range."""
+    """Waveforms per second from times in microseconds: median and range."""
     if not times["median"]:
         return "-"
     return f"{1e6 / times['median']:,.0f} ({1e6 / times['max']:,.0f}..{1e6 / times['min']:,.0f})"
@@ -119,7 +123,7 @@ def _figure_table(title: str, rows: Sequence[Mapping[str, Any]], columns: Sequen
 
 
 def figure_text(row: Mapping[str, Any], column: Column) -> str:
-    """A figure of a row with its error; a dash where there is none."""
+    """A figure of a row with its error; a dash where there is no figure."""
     _, name, factor, decimals = column
     figure = row["figures"][name]
     if figure["value"] is None:
@@ -129,7 +133,7 @@ def figure_text(row: Mapping[str, Any], column: Column) -> str:
 
 
 def align(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Cells as columns: the first to the left, the others to the right."""
+    """Lines of cells as columns: the first aligned to the left, the others to the right."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     return [
         "  ".join(
@@ -159,16 +163,16 @@ def _method_lines(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     hazards = list(dict.fromkeys(row["hazard"] for row in rows))
     lines = [["every method: exact %, mean of the cases", *hazards, "failures"]]
     for name in dict.fromkeys(row["chain"] for row in rows):
-        own = [row for row in rows if row["chain"] == name]
+        of_chain = [row for row in rows if row["chain"] == name]
         cells = []
         for hazard in hazards:
-            exact = [row["figures"]["exact_count"]["value"] for row in own if row["hazard"] == hazard]
+            exact = [row["figures"]["exact_count"]["value"] for row in of_chain if row["hazard"] == hazard]
             cells.append(f"{100 * sum(exact) / len(exact):.1f}")
-        lines.append([name, *cells, _tell_failures(own)])
+        lines.append([name, *cells, _list_failures(of_chain)])
     return lines
 
 
-def _tell_failures(rows: Sequence[Mapping[str, Any]]) -> str:
+def _list_failures(rows: Sequence[Mapping[str, Any]]) -> str:
     """Sums per kind of failure over the rows; `none` without any."""
     kinds = {name: sum(row["failures"][name] for row in rows) for name in rows[0]["failures"]}
     return ", ".join(f"{number} {name}" for name, number in kinds.items() if number) or "none"
@@ -190,19 +194,19 @@ def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list
         ]
         cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
         figures = [figure_text(row, column) for column in columns]
-        lines.append([*cells, *figures, _tell_failures([row]), _tell_flags(row)])
+        lines.append([*cells, *figures, _list_failures([row]), _list_flags(row)])
     return lines
 
 
-def _tell_flags(row: Mapping[str, Any]) -> str:
+def _list_flags(row: Mapping[str, Any]) -> str:
     shares = {name: number / max(row["echoes"], 1) for name, number in row["flags"].items()}
     return ", ".join(f"{name} {share:.0%}" if share >= 0.005 else f"{name} <1%" for name, share in shares.items())
 
 
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:
-    """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns what to tell.
+    """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns messages for the user.
 
-    Without matplotlib there are no plots, and a line says how to get them. Raises InputError where it cannot write.
+    Without matplotlib there are no plots, and a message says how to get them. Raises InputError where it cannot write.
     """
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,8 @@
-"""Scenes of the benchmark: the named ones, and one shaped like a strip by resampling its own decomposed waveforms."""
+"""Scenes of the benchmark: the named ones, and one shaped like a real strip.
+
+`command` and `speed` call this. The strip is surveyed and a sample of it decomposed; the scene draws whole waveforms of
+that sample with small changes, so that counts, amplitudes, widths and gaps of its echoes are real ones.
+"""
 
 from __future__ import annotations
 
@@ -14,37 +18,31 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import SAMPLE, survey_blocks
+from wavebatch.tools.bench.truth import smoothed_power
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.tools.simulate.draws import Drawn
 
-BENCH_SCENES: dict[str, str] = {
-    "mixed": "mixed",
-    "open": "urban",
-    "forest": "forest",
-    "empty": "empty",
-    "flat": "flat",
-    "stiff": "stiff",
-}
-"""Scenes by the name that the benchmark gives them; any other scene of simulate may be named too."""
+OTHER_NAMES = {"open": "urban"}
+"""Scenes of tools.simulate with another name in the benchmark."""
 
 LEAST_WAVEFORMS = 200
-"""Waveforms that a strip must have for its echoes to be resampled."""
+"""Least waveforms of a strip whose echoes can be resampled."""
 
 JITTER = 0.05
 """Relative change of the amplitudes and gaps of a resampled waveform, one standard deviation."""
 
 STRONG = 20.0
-"""Signal to noise from which the width of an echo is taken as it was measured."""
+"""Signal to noise from which measured widths show the true spread of widths."""
 
 
 def find_bench_scene(name: str) -> Scene:
     """The scene of that name; raises ConfigError with the nearest name when there is none."""
-    return replace(find_scene(BENCH_SCENES.get(name, name)), name=name)
+    return replace(find_scene(OTHER_NAMES.get(name, name)), name=name)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Echoes of decomposed waveforms, to be drawn again and again."""
+    """Echoes of decomposed waveforms, to draw from."""
 
     first: np.ndarray
     """Row of each waveform's first echo, i8 (n,)."""
@@ -53,18 +51,20 @@ class Sample:
     time: np.ndarray
     amplitude: np.ndarray
     sigma: np.ndarray
-    """Of the main lobe [ns], freed from the scatter of its own error, f8 (m,)."""
+    """Of the main lobe [ns], without the scatter of its error, f8 (m,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class StripScene(Scene):
-    """Waveforms like those of a strip: counts, amplitudes, widths and gaps of real ones, each drawn anew."""
+    """Waveforms like those of a strip, drawn from a sample of its echoes."""
 
     sample: Sample | None = None
 
     def draw(self, rng: np.random.Generator, n: int, incidence: np.ndarray) -> Drawn:
-        """Echoes of n waveforms: whole waveforms of the sample, moved by part of a sample, jittered and cut off at
-        the ends of the window."""
+        """Echoes of n waveforms: whole waveforms of the strip, shifted by part of a sample, with JITTER.
+
+        Echoes outside the window are dropped.
+        """
         sample, recording = self.sample, self.recording
         chosen = rng.integers(0, len(sample.count), n)
         count = sample.count[chosen]
@@ -81,16 +81,12 @@ class StripScene(Scene):
 
 
 def shape_scene(strip: Path, chain: Chain) -> StripScene:
-    """A scene like the strip's own survey: its noise, baselines, learned pulse and the echoes that `chain` finds.
+    """A scene like the strip: noise, baselines and pulse of its survey, and the echoes that `chain` finds in it.
 
     Raises InputError where the strip cannot be read or holds too few waveforms.
     """
-    with StripReader(strip) as reader:
-        scan = reader.scan()
-        try:
-            blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
-        finally:
-            scan.close()
+    with StripReader(strip) as reader, reader.scan() as scan:
+        blocks = [block for block in reader.sample_blocks(scan, SAMPLE) if len(block)]
     kinds = {(block.spacing, block.samples.shape[1]) for block in blocks}
     largest = max(kinds, key=lambda kind: sum(b.samples.size for b in blocks if _kind(b) == kind), default=None)
     chosen = [block for block in blocks if _kind(block) == largest]
@@ -115,8 +111,7 @@ def _kind(block: WaveformBlock) -> tuple[float, int]:
 def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
     """The receiver that a survey found: levels, noise and its colour, clipping, learned pulse."""
     color = _find_color(system)
-    first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
-    gain = np.sqrt((6 + 8 * first + 2 * second) / 6)
+    gain = np.sqrt(smoothed_power(color) / 6)
     pulse = PulseModel(sigma=system.sigma_ref, kappa=system.kappa)
     if len(system.components) > 1:
         weight, delay, sigma = system.components[0]
@@ -137,13 +132,11 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
 
 
 def _find_color(system: SystemPulse) -> int:
-    """Order of the binomial filter whose noise grows by smoothing as that behind the strip's echoes does."""
+    """Order of the binomial filter whose noise changes by smoothing as the noise of the strip does."""
     kinds = system.noise_by_kind
     pairs = [(kinds.get(f"{kind}_smoothed", 0.0), kinds.get(kind, 0.0)) for kind in ("tail", "quiet")]
     ratio = next((smoothed / raw for smoothed, raw in pairs if raw > 0), 1.0)
-    orders = np.arange(5)
-    first, second = orders / (orders + 1), orders * (orders - 1) / ((orders + 1) * (orders + 2))
-    return int(np.argmin(np.abs(np.sqrt((6 + 8 * first + 2 * second) / 6) - ratio)))
+    return int(np.argmin(np.abs(np.sqrt(smoothed_power(np.arange(5)) / 6) - ratio)))
 
 
 def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recording) -> Sample:
@@ -164,7 +157,7 @@ def _take_sample(found: EchoTable, n: int, system: SystemPulse, recording: Recor
 
 
 def _free_widths(found: EchoTable, system: SystemPulse) -> np.ndarray:
-    """Widths [ns] drawn towards the typical one as far as their own error explains how they differ from it."""
+    """Widths [ns] moved towards the typical one by the share of their spread that their error explains."""
     sigma = found.sigma.astype(np.float64)
     strong = sigma[found.amplitude > STRONG * system.noise_std]
     if len(strong) < 2:

@@ -1,52 +1,59 @@
-"""How long chains take: kernels alone and file to file, in processes of one thread each, taking turns."""
+"""Run time and memory of chains: kernels alone and from file to file, each chain in a process with one thread.
+
+`command` calls `time_chains`, and `measure_system` for the promises. The chains take turns, so that other load of the
+machine slows all of them alike.
+"""
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import load_profile
 from wavebatch.tools.bench.figures import median_range
+from wavebatch.tools.bench.scenes import find_bench_scene
 from wavebatch.tools.bench.worker import Worker, peak_memory
-from wavebatch.tools.simulate import Scene, simulate_strip
+from wavebatch.tools.simulate import simulate_strip
 
 PREPARATION = ("scan", "survey")
-"""Parts of a run that a strip pays once, whatever its length."""
+"""Parts of a run whose time does not grow with the strip."""
 
 
 @dataclass(slots=True)
 class Laps:
-    """Repeated measurements of one chain."""
+    """Repeated measurements of one chain; the names are those of the document."""
 
     kernels: list[float] = field(default_factory=list)
     """Microseconds per waveform."""
     file: list[float] = field(default_factory=list)
-    """Microseconds per waveform from file to file, without what a strip pays once."""
-    whole: list[float] = field(default_factory=list)
-    """Microseconds per waveform from file to file, all of it."""
-    preparation: list[float] = field(default_factory=list)
+    """Microseconds per waveform from file to file, without scan and survey."""
+    file_with_survey: list[float] = field(default_factory=list)
+    """Microseconds per waveform from file to file."""
+    survey_seconds: list[float] = field(default_factory=list)
     """Seconds of scan and survey."""
-    memory: int | None = None
-    """Most bytes in memory."""
+    peak_bytes: int | None = None
+    """Peak memory."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Medians and ranges, by what was measured."""
-        return {
-            "kernels": median_range(self.kernels),
-            "file": median_range(self.file),
-            "file_with_survey": median_range(self.whole),
-            "survey_seconds": median_range(self.preparation),
-            "peak_bytes": self.memory,
-        }
+
+class FileRun(NamedTuple):
+    """A run from file to file."""
+
+    seconds: float
+    survey_seconds: float
+    """Of these, scan and survey."""
+    waveforms: int
 
 
 def time_chains(
@@ -57,10 +64,7 @@ def time_chains(
     repeats: int,
     progress: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Laps]:
-    """Laps of every chain: kernels on the block, and from `strip` (None: not at all) to a cloud in the folder.
-
-    Each chain has a process of its own, and they take turns, so that whatever else the machine does hits all alike.
-    """
+    """Laps of every chain: kernels on the block, and from `strip` to a cloud in the folder (None: kernels only)."""
     laps = {name: Laps() for name in chains}
     workers = {name: Worker() for name in chains}
     try:
@@ -72,36 +76,31 @@ def time_chains(
                 seconds = workers[name].call(run_kernels, chain, block, system)
                 laps[name].kernels.append(1e6 * seconds / len(block))
                 if strip is not None:
-                    _add_file_lap(laps[name], workers[name].call(run_file, chain, strip, folder / _plain(name), 1))
+                    clouds = folder / re.sub(r"\W", "-", name)
+                    _add_file_lap(laps[name], workers[name].call(run_file, chain, strip, clouds, 1))
         for name, worker in workers.items():
-            laps[name].memory = worker.call(peak_memory)
+            laps[name].peak_bytes = worker.call(peak_memory)
     finally:
         for worker in workers.values():
             worker.close()
     return laps
 
 
-def _add_file_lap(lap: Laps, run: Mapping[str, float]) -> None:
-    once = run["preparation"]
-    lap.file.append(1e6 * (run["seconds"] - once) / run["waveforms"])
-    lap.whole.append(1e6 * run["seconds"] / run["waveforms"])
-    lap.preparation.append(once)
-
-
-def _plain(name: str) -> str:
-    """A name of a folder."""
-    return "".join(letter if letter.isalnum() else "-" for letter in name)
+def _add_file_lap(lap: Laps, run: FileRun) -> None:
+    lap.file.append(1e6 * (run.seconds - run.survey_seconds) / run.waveforms)
+    lap.file_with_survey.append(1e6 * run.seconds / run.waveforms)
+    lap.survey_seconds.append(run.survey_seconds)
 
 
 def run_kernels(chain: Chain, block: WaveformBlock, system: SystemPulse) -> float:
-    """Seconds that noise, detection and decomposition of the block take."""
+    """Seconds for noise, detection and decomposition of the block."""
     timing: dict[str, float] = {}
     chain.run(block, system, timing)
     return sum(timing.get(step.stage.name, 0.0) for step in chain.steps[:3])
 
 
-def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> dict[str, float]:
-    """The strip through the batch as `wavebatch run` does it: seconds, those of scan and survey, waveforms."""
+def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> FileRun:
+    """Times the strip through the batch, as `wavebatch run` does it."""
     job = StripJob(strip, chain, RunOptions(columns=choose_columns(chain)))
     begin = time.perf_counter()
     result = run_batch([job], BatchOptions(folder, jobs=jobs, overwrite=True))
@@ -110,21 +109,37 @@ def run_file(chain: Chain, strip: Path, folder: Path, jobs: int) -> dict[str, fl
         if outcome.error is not None:
             raise outcome.error
     timing = result.report.timing
-    return {
-        "seconds": seconds,
-        "preparation": sum(timing.get(name, 0.0) for name in PREPARATION),
-        "waveforms": result.report.count("waveforms"),
-    }
+    return FileRun(seconds, sum(timing.get(name, 0.0) for name in PREPARATION), result.report.count("waveforms"))
 
 
-def make_strip(scene: Scene, target: Path, pulses: int, seed: int) -> Path:
-    """A strip of the scene; an existing one is replaced."""
-    simulate_strip(scene, target, pulses=pulses, seed=seed, overwrite=True)
-    return target
+def measure_system(
+    seed: int, *, pulses: int, large: bool, progress: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
+    """Start-up time, memory over the length of a strip, and speed over the number of jobs, as plain values.
+
+    pulses: of the strip for memory; the one for jobs is five times as long.
+    large: also measure memory with 100 times as many.
+    """
+    chain, scene = load_profile("accurate"), find_bench_scene("open")
+    progress("timing wavebatch --help")
+    start, memory = time_start(), []
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
+        folder = Path(name)
+        strip = folder / "memory.laz"
+        for number in (pulses, 100 * pulses) if large else (pulses,):
+            progress(f"memory with {number} pulses")
+            simulate_strip(scene, strip, pulses=number, seed=seed, overwrite=True)
+            peak, waveforms = measure_memory(chain, strip, folder / "memory")
+            memory.append({"waveforms": waveforms, "peak_bytes": peak})
+        progress("speed with 1 and 2 jobs")
+        strip = folder / "jobs.laz"
+        simulate_strip(scene, strip, pulses=5 * pulses, seed=seed)
+        jobs = time_jobs(chain, strip, folder / "jobs", (1, 2), 2)
+    return {"start_seconds": start, "memory": memory, "jobs": jobs}
 
 
 def time_start(repeats: int = 5) -> dict[str, Any]:
-    """Seconds from calling `wavebatch --help` to its end."""
+    """Seconds that `wavebatch --help` takes."""
     command = [sys.executable, "-m", "wavebatch", "--help"]
     seconds = []
     for _ in range(repeats):
@@ -134,19 +149,19 @@ def time_start(repeats: int = 5) -> dict[str, Any]:
     return median_range(seconds)
 
 
-def time_jobs(chain: Chain, strip: Path, folder: Path, jobs: Sequence[int], repeats: int) -> dict[int, dict[str, Any]]:
-    """Seconds from file to file, without scan and survey, by number of jobs; they take turns."""
+def time_jobs(chain: Chain, strip: Path, folder: Path, jobs: Sequence[int], repeats: int) -> dict[str, dict[str, Any]]:
+    """Seconds from file to file, without scan and survey, by number of jobs; the numbers take turns."""
     seconds: dict[int, list[float]] = {number: [] for number in jobs}
     with Worker() as worker:
         for _ in range(repeats):
             for number in jobs:
                 run = worker.call(run_file, chain, strip, folder, number)
-                seconds[number].append(run["seconds"] - run["preparation"])
-    return {number: median_range(values) for number, values in seconds.items()}
+                seconds[number].append(run.seconds - run.survey_seconds)
+    return {str(number): median_range(values) for number, values in seconds.items()}
 
 
 def measure_memory(chain: Chain, strip: Path, folder: Path) -> tuple[int | None, int]:
-    """Most bytes in memory of a fresh process that takes the strip from file to file, and its waveforms."""
+    """Peak memory [bytes] of a fresh process that takes the strip from file to file, and its waveforms."""
     with Worker() as worker:
         run = worker.call(run_file, chain, strip, folder, 1)
-        return worker.call(peak_memory), int(run["waveforms"])
+        return worker.call(peak_memory), run.waveforms

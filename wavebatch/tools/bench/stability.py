@@ -1,44 +1,44 @@
-"""The stability section: every chain on every stiff case, and whatever goes wrong there counted."""
+"""The stability section of the benchmark: every chain on every stiff case of `cases`, with a count of failures.
+
+`command` calls `measure_stability`. Surveys come from ordinary scenes with the receiver of the case, not from the case:
+a chain must survive a waveform that its survey did not prepare it for.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.errors import ConfigError
-from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
-from wavebatch.stages.chain_file import effective
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
-from wavebatch.tools.bench.hazards import CASES, Case, make_scene
+from wavebatch.tools.bench.cases import CASES, Case, make_scene
+from wavebatch.tools.bench.chains import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.tools.simulate.draws import LogUniform, Mixture
 
-AUTO = "auto"
-"""Name of the chain that a survey chooses."""
-
 GROUPS = 5
-"""Groups of every case, each with a survey of its own of an ordinary scene with the same receiver."""
+"""Groups of every case; each has a survey of an ordinary scene with the same receiver."""
 
 NARROWEST = 0.7
-"""Widths of the system pulse below which no echo may be (H3)."""
+"""Least allowed width of an echo, in widths of the system pulse (docs/algorithms.md H3)."""
 
 FAILURES: dict[str, str] = {
-    "not_finite": "time, amplitude or width that is no finite number",
+    "not_finite": "time, amplitude or width that is not a finite number",
     "too_narrow": "echo narrower than 0.7 of the system pulse",
     "negative": "amplitude of 0 or less",
-    "unsorted": "echo that lies before the one before it",
+    "unsorted": "echo earlier than the one before it in the table",
     "warnings": "warning of Python or NumPy",
     "block_size": "echo that changes when the waveforms go through the chain in other blocks",
 }
-"""What must never happen, and is counted."""
+"""Kinds of failures, which must never happen."""
 
 
 def measure_stability(
@@ -52,9 +52,8 @@ def measure_stability(
 ) -> list[dict[str, Any]]:
     """A row per case and chain, plain values for JSON.
 
-    choose: chains by name for a strip of that survey.
-    waveforms: per case. surveyed: waveforms of the ordinary scene that each survey sees. methods: names of chains that
-    hold one method each, for comparison: their rows say so.
+    choose: returns the chains by name for a survey. waveforms: per case. surveyed: waveforms of each survey.
+    methods: names of chains that test a single method; their rows have `is_method`.
     """
     ordinary: dict[Recording, list[tuple[Survey, Mapping[str, Chain]]]] = {}
     rows = []
@@ -71,30 +70,10 @@ def measure_stability(
         for name in chosen[0]:
             if name == AUTO and twin:
                 continue
-            told = {"hazard": case.hazard, "case": case.name, "chain": name, "is_auto": name in (AUTO, twin)}
-            told["is_method"] = name in methods
-            rows.append({**told, **_measure([chains[name] for chains in chosen], groups)})
+            row = {"hazard": case.hazard, "case": case.name, "chain": name}
+            row |= {"is_auto": name in (AUTO, twin), "is_method": name in methods}
+            rows.append(row | _measure([chains[name] for chains in chosen], groups))
     return rows
-
-
-def list_cases(hazards: Sequence[str]) -> tuple[Case, ...]:
-    """The cases of the given hazards, all where none is given; raises ConfigError for a hazard without cases."""
-    known = list(dict.fromkeys(case.hazard for case in CASES))
-    for name in hazards:
-        if name not in known:
-            raise ConfigError(f"hazard {name!r} cannot be simulated; {nearest(name, known)}")
-    return tuple(case for case in CASES if not hazards or case.hazard in hazards)
-
-
-def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
-    """The chain that `auto` is on every strip, so that it need not be measured again; None where it is one of its own.
-
-    chosen: the chains of each strip.
-    """
-    for name in chosen[0]:
-        if name != AUTO and all(AUTO in c and effective(c[name]) == effective(c[AUTO]) for c in chosen):
-            return name
-    return None
 
 
 def _survey(
@@ -102,7 +81,7 @@ def _survey(
 ) -> list[tuple[Survey, Mapping[str, Chain]]]:
     """Survey and chains of GROUPS ordinary, open strips with this receiver.
 
-    Where the receiver is said to clip, one echo in a hundred does; else none.
+    For a receiver with a saturation level, one echo in a hundred is clipped; else none.
     """
     scale = 30.0 if recording.bits > 8 else 1.0
     urban = find_scene("urban")
@@ -148,17 +127,17 @@ def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:
         "echoes": echoes,
         "failures": failures,
         "flags": {name: number for name, number in flags.items() if number},
-        "figures": {name: figure.to_json() for name, figure in tally.figures().items() if _is_told(name)},
+        "figures": {name: figure.to_json() for name, figure in tally.figures().items() if _is_useful(name)},
     }
 
 
-def _is_told(name: str) -> bool:
-    """Lengths and reported errors mean little where echoes are made to be hard."""
+def _is_useful(name: str) -> bool:
+    """Lengths and reported errors mean little where echoes are hard on purpose."""
     return not name.startswith("rmse") and "calibration" not in name
 
 
 def count_failures(found: EchoTable, system: SystemPulse) -> dict[str, int]:
-    """Echoes per kind of failure that shows in the table alone."""
+    """Echoes per kind of failure that a table of found echoes can show."""
     finite = np.isfinite(found.time) & np.isfinite(found.amplitude) & np.isfinite(found.sigma)
     back = (np.diff(found.waveform) < 0) | ((np.diff(found.waveform) == 0) & (np.diff(found.time) <= 0))
     return {
@@ -172,12 +151,10 @@ def count_failures(found: EchoTable, system: SystemPulse) -> dict[str, int]:
 def count_changes(chain: Chain, group: Group, found: EchoTable) -> int:
     """Echoes that differ, in any bit, when the waveforms go through the chain in three unequal blocks."""
     n = len(group.block)
-    edges = [0, n // 7, n // 2, n]
-    parts = []
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
-        if stop > start:
-            parts.append((chain.run(group.block.rows(slice(start, stop)), group.system), start))
-    again = EchoTable.concatenate(parts)
+    edges = pairwise([0, n // 7, n // 2, n])
+    again = EchoTable.concatenate(
+        (chain.run(group.block.rows(slice(start, stop)), group.system), start) for start, stop in edges if stop > start
+    )
     if len(again) != len(found):
         return abs(len(again) - len(found))
     same = (again.waveform == found.waveform) & (again.flags == found.flags)

@@ -1,4 +1,8 @@
-"""True echoes in the words of the found ones, and the least error with which each of them could be found."""
+"""True echoes in the terms of found ones, and the Cramer-Rao bound of each: the least error with which it can be found.
+
+`accuracy` calls both for every group. The bounds hold for the pulse, noise and clipping of the simulated receiver; the
+closed forms of kernels.fit.bounds hold for isolated Gaussians in white noise only.
+"""
 
 from __future__ import annotations
 
@@ -20,29 +24,35 @@ _STEP = 0.02
 def describe_truth(truth: EchoTable, pulse: PulseModel) -> EchoTable:
     """The truth with the time of the peak and, as sigma, the full width at half maximum over 2.354820.
 
-    simulate counts time and sigma by the main lobe; decomposers report the whole pulse. For a Gaussian both are one.
+    Simulation gives time and sigma of the main lobe; decomposers report those of the whole pulse. For a Gaussian they
+    are equal.
     """
     delay, sigma = _measure(pulse, truth.sigma.astype(np.float64))
     return replace(truth, time=truth.time + delay, sigma=sigma.astype(np.float32))
 
 
 def effective_noise(recording: Recording) -> float:
-    """Standard deviation of one recorded sample [count] that white noise of the same weight on an echo would have.
+    """Standard deviation of one sample [count] of white noise that disturbs an echo as much as the recorded noise.
 
-    Of coloured noise that of the [1 2 1]/4-smoothed samples over the gain for white noise (ALGORITHMS.md H11).
+    Coloured noise: std of the [1 2 1]/4-smoothed samples over the gain for white noise (docs/algorithms.md H11).
     """
-    m = recording.color
-    first, second = m / (m + 1), m * (m - 1) / ((m + 1) * (m + 2))
-    smoothed = np.sqrt((6 + 8 * first + 2 * second) / 16) / SMOOTH_GAIN
+    smoothed = np.sqrt(smoothed_power(recording.color) / 16) / SMOOTH_GAIN
     return float(np.hypot(recording.noise_std * smoothed, QUANTISATION_STD))
 
 
-def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
-    """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo in its company, (m, 3).
+def smoothed_power(color: np.ndarray | int) -> np.ndarray | float:
+    """Variance of noise smoothed by [1 2 1], over that of its samples; color: as Recording.color."""
+    first, second = color / (color + 1), color * (color - 1) / ((color + 1) * (color + 2))
+    return 6 + 8 * first + 2 * second
 
-    All echoes of a waveform are unknown together, the baseline is known; clipped samples tell nothing, signal adds
-    its noise. truth: as simulate gives it; the bounds are of the words of `describe_truth`. Infinity where the samples
-    cannot tell. Source: inverse Fisher matrix, derivatives of the painted pulse by central differences.
+
+def find_bounds(recording: Recording, truth: EchoTable, n: int) -> np.ndarray:
+    """Cramer-Rao bounds of time [ns], amplitude [count] and sigma [ns] of every true echo, (m, 3).
+
+    All echoes of a waveform are estimated together, the baseline is known; clipped samples have no weight, noise grows
+    with the signal. truth: as tools.simulate gives it; the bounds are those of the terms of `describe_truth`, infinite
+    where the samples do not determine them. Source: inverse Fisher matrix, derivatives of the painted pulse by central
+    differences.
     """
     if not len(truth):
         return np.empty((0, 3))
@@ -91,7 +101,7 @@ def _invert(columns: np.ndarray) -> np.ndarray:
     scale = np.sqrt(np.square(columns).sum(axis=2))
     columns = columns / np.where(scale > 0, scale, 1.0)[:, :, None]
     values, vectors = np.linalg.eigh(columns @ columns.transpose(0, 2, 1))
-    # Scaled columns: the diagonal is 1, so that eigenvalues say how well parameters can be told apart.
+    # Scaled columns: the diagonal is 1, so that eigenvalues show how well the parameters can be separated.
     values = np.where(values > 1e-11, values, np.nan)
     variance = (np.square(vectors) / values[:, None, :]).sum(axis=2)
     known = ~np.isnan(variance) & (scale > 0)
@@ -99,7 +109,7 @@ def _invert(columns: np.ndarray) -> np.ndarray:
 
 
 def _measure(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of the peak behind the truth's time and full width at half maximum over 2.354820 [ns], each (m,)."""
+    """Delay of the peak after the truth's time and full width at half maximum over 2.354820 [ns], each (m,)."""
     if not pulse.lobes:
         skew = abs(pulse.kappa)
         wider = 2 * np.sinh(skew * FWHM_PER_SIGMA / 2) / (skew * FWHM_PER_SIGMA) if skew > 1e-6 else 1.0

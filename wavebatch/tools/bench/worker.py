@@ -1,4 +1,8 @@
-"""A process of its own for whatever is measured: one thread, clean memory, and it may crash or hang."""
+"""A separate process for measurements: one thread, clean memory, and it may crash or hang without harm.
+
+`speed` and `peers` run functions in it. It is a plain subprocess, not multiprocessing, because that would import the
+caller's main module into the measured process.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ class WorkerDied(Exception):
 
 
 class Worker:
-    """Runs functions in another Python process, one after the other; a context manager."""
+    """Runs functions in another Python process, one after another; a context manager."""
 
     def __init__(self) -> None:
         root = str(Path(__file__).resolve().parents[2])
@@ -43,7 +47,7 @@ class Worker:
         self.close()
 
     def submit(self, function: Callable, *arguments: Any) -> None:
-        """Starts `function(*arguments)`; the answer is taken with `take`."""
+        """Starts `function(*arguments)`; `take` returns the answer."""
         try:
             pickle.dump((function, arguments), self._process.stdin, pickle.HIGHEST_PROTOCOL)
             self._process.stdin.flush()
@@ -63,12 +67,12 @@ class Worker:
         return value
 
     def call(self, function: Callable, *arguments: Any) -> Any:
-        """`function(*arguments)`, which must be importable by name, as the process computes it."""
+        """`function(*arguments)` computed in the process; the function must be importable by name."""
         self.submit(function, *arguments)
         return self.take()
 
     def close(self) -> None:
-        """Ends the process, whatever it does."""
+        """Kills the process."""
         self._process.kill()
         self._process.wait()
         self._reader.join()
@@ -85,7 +89,7 @@ class Worker:
 
 
 def serve() -> None:
-    """Answers calls on stdin until it ends; whatever else writes to stdout is sent to stderr."""
+    """Answers calls on stdin until stdin ends; other output to stdout is sent to stderr."""
     from wavebatch.core.memory import keep_freed_memory
 
     keep_freed_memory()
@@ -105,7 +109,7 @@ def serve() -> None:
 
 
 def peak_memory() -> int | None:
-    """Most bytes that this process has held in memory; None where the system does not tell."""
+    """Peak memory of this process [bytes]; None where the system does not report it."""
     try:
         lines = Path("/proc/self/status").read_text("ascii").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))

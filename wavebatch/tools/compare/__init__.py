@@ -1,5 +1,6 @@
-"""What two results of one strip have in common: a cloud with a cloud, the strip, the truth, or chain with chain.
+"""Comparison of two results of one strip: clouds, chains, the vendor's returns, or the truth of a simulation.
 
-`clouds`, `chains` and `angles` each read two sides and bring together what may be of one pulse; `pairing` pairs its
-echoes; `differences`, `breakdown` and `goodness` sum up how pairs differ, what has no partner, and how well fits fit.
+`wavebatch compare` calls `clouds` (cloud with cloud, strip or truth), `chains` (chains that run on a strip) and
+`angles` (incidence angles). Each brings echoes of the same pulse together; `pairing` then pairs them. `differences`,
+`breakdown` and `goodness` sum up the pairs, the echoes without a partner, and the fits. Memory is bounded in all.
 """

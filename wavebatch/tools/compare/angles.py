@@ -1,4 +1,8 @@
-"""How far angles from echo widths agree with those from the points around: Fig. 6 of Rhomberg-Kauert et al. 2024."""
+"""Agreement of incidence angles from echo widths with those from surface normals.
+
+`wavebatch compare --angles` calls `compare_angles`, which reads one or two clouds and sums differences and histograms
+as in Fig. 6 of Rhomberg-Kauert et al. 2024. Sums are kept per piece, so that memory is bounded.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +18,21 @@ from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.pairing import check_tolerance, pair_echoes
 
 BIN, DIFFERENCE_BIN = 5.0, 2.0
-"""Widths of the histograms' bins [deg]: of angles, of their differences."""
+"""Bin widths of the histograms [deg]: of angles, and of their differences."""
 
 _FINE = 1000
-"""Bins per degree in which absolute differences are counted for their median."""
+"""Bins per degree for the median of absolute differences, which is exact to 0.001 deg."""
 
 
 @dataclass(frozen=True, slots=True)
 class AngleAgreement:
-    """Angles from widths less those from normals [deg], over the points that have both; NaN where none has."""
+    """Angles from widths less those from normals [deg], of the points that have both; NaN if there are none."""
 
     a: str
     b: str | None
-    """The second cloud; None where one cloud has both angles."""
+    """The second cloud; None if one cloud has both angles."""
     points: int
-    """Points looked at; of two clouds, those that were matched."""
+    """All points; for two clouds, the matched points."""
     with_widths: int
     with_normals: int
     number: int
@@ -41,11 +45,11 @@ class AngleAgreement:
     """Median absolute difference, to 0.001 deg."""
     rms: float
     within_error: float
-    """Share of the points whose difference is at most one standard deviation: both errors together."""
+    """Share of the points whose difference is at most one standard deviation of the difference."""
     edges: tuple[float, ...]
-    """Of the bins of both histograms of angles [deg]."""
+    """Bin edges of both histograms of angles [deg]."""
     histogram_widths: tuple[int, ...]
-    """Points per bin, of those with both angles."""
+    """Points per bin, of the points with both angles."""
     histogram_normals: tuple[int, ...]
     difference_edges: tuple[float, ...]
     histogram_difference: tuple[int, ...]
@@ -56,11 +60,11 @@ class AngleAgreement:
 
 
 def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0) -> AngleAgreement:
-    """How both kinds of angle agree in one cloud, or one kind in `a` and the other in `b`, clouds of one strip.
+    """Compares both kinds of angle of one cloud, or one kind of `a` with the other kind of `b`.
 
-    Echoes of two clouds are the same when they are of one pulse (equal GPS time) and at most `tolerance_ns` apart,
-    nearest first. Memory is bounded; large pairs of clouds need room in TMPDIR.
-    Raises InputError where a file cannot be read or lacks what is needed, ConfigError for a wrong tolerance.
+    Echoes of two clouds are the same if they have the same GPS time and are at most `tolerance_ns` apart, nearest
+    first. Memory is bounded; large pairs of clouds need room in TMPDIR.
+    Raises InputError if a file cannot be read or lacks a column, ConfigError for a wrong tolerance.
     """
     check_tolerance(tolerance_ns)
     tally = _Tally()
@@ -87,12 +91,10 @@ def _demand(cloud: AngleReader, *columns: str) -> None:
 
 
 def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally) -> None:
-    """Adds the echoes that both clouds have, bucket by bucket of pulses."""
+    """Adds the echoes that both clouds have; pulses are sorted into buckets, so that memory is bounded."""
     for cloud in (widths, normals):
         if not cloud.has_gps_time:
-            raise InputError(
-                f"{cloud.path}: has no GPS times, by which echoes of two clouds are matched; write one cloud of both"
-            )
+            raise InputError(f"{cloud.path}: has no GPS times to match echoes of two clouds; write both to one cloud")
     number = count_buckets(max(widths.point_count, normals.point_count))
     with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
         for cloud, buckets in ((widths, first), (normals, second)):
@@ -107,7 +109,7 @@ def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally
 
 
 class _Tally:
-    """Sums and histograms; whole numbers where the order of the points could matter for more than the last digits."""
+    """Sums and histograms of pieces; the median comes from counts, so that the order of the points does not matter."""
 
     def __init__(self) -> None:
         self.points = self.widths = self.normals = self.number = self.within = self.errors = 0
@@ -117,7 +119,7 @@ class _Tally:
         self.differences = np.zeros(round(180 / DIFFERENCE_BIN), np.int64)
 
     def add(self, widths: np.ndarray, normals: np.ndarray) -> None:
-        """Takes in points (n,), ANGLE_DTYPE: the one's angle from width, the other's from normals."""
+        """Adds points (n,), ANGLE_DTYPE: the angle from width of the first, the angle from normals of the second."""
         a, b = widths[WIDTHS], normals[NORMALS]
         valid = [(values >= 0) & (values <= 90) for values in (a, b)]
         both = np.flatnonzero(valid[0] & valid[1])
@@ -152,10 +154,10 @@ class _Tally:
             median_absolute=float(middle),
             rms=float(np.sqrt(square)),
             within_error=self.within / self.errors if self.errors else float("nan"),
-            edges=tuple(BIN * step for step in range(self.angles.shape[1] + 1)),
+            edges=tuple((BIN * np.arange(self.angles.shape[1] + 1)).tolist()),
             histogram_widths=tuple(self.angles[0].tolist()),
             histogram_normals=tuple(self.angles[1].tolist()),
-            difference_edges=tuple(DIFFERENCE_BIN * step - 90.0 for step in range(len(self.differences) + 1)),
+            difference_edges=tuple((DIFFERENCE_BIN * np.arange(len(self.differences) + 1) - 90.0).tolist()),
             histogram_difference=tuple(self.differences.tolist()),
         )
 

@@ -1,4 +1,7 @@
-"""Which echoes have no partner on the other side: by return number, amplitude, flag, and what else their pulse has."""
+"""Counts of echoes without a partner, by return number, amplitude, flags, and whether their pulse has other echoes.
+
+`pairing` has one Breakdown per side. Add a class of echoes here to see it in `wavebatch compare`.
+"""
 
 from __future__ import annotations
 
@@ -7,31 +10,26 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 
 _OCTAVES = 18
-"""Classes of amplitude: below 1, then one per doubling; the last one takes all that is larger."""
+"""Classes of amplitude: below 1, then one per doubling; the last one holds everything larger."""
 
 _NUMBERS = 16
+"""Return numbers that a LAS point can hold, 0 to 15."""
 
 Table = dict[str, tuple[int, int]]
 """Per class: echoes without a partner, and all echoes."""
 
 
 class Breakdown:
-    """Counts echoes of one side with and without a partner on the other, by what may be the reason."""
+    """Counts echoes of one side, with and without a partner on the other side, by possible reasons."""
 
     def __init__(self) -> None:
-        self._tallies = {
-            "return": np.zeros((_NUMBERS * _NUMBERS, 2), np.int64),
-            "amplitude": np.zeros((_OCTAVES, 2), np.int64),
-            "intensity": np.zeros((_OCTAVES, 2), np.int64),
-            "pulse": np.zeros((2, 2), np.int64),
-            "flag": np.zeros((len(EchoFlag) + 1, 2), np.int64),
-        }
+        self._tallies = {kind: np.zeros((len(names), 2), np.int64) for kind, names in _NAMES.items()}
 
     def add(self, rows: np.ndarray, alone: np.ndarray, others: np.ndarray | None) -> None:
-        """Takes in echoes (records of io.cloud.CLOUD_DTYPE).
+        """Adds echoes (k,), CLOUD_DTYPE.
 
-        alone: those without a partner, bool (k,). others: echoes that the other side has in the pulse of each, (k,);
-        None where nobody knows.
+        alone: echoes without a partner, bool (k,). others: number of echoes of the other side in the pulse of each
+        echo, (k,); None if unknown.
         """
         numbered = rows["number"] > 0
         code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
@@ -41,11 +39,9 @@ class Breakdown:
         self._count("intensity", _octave(rows["intensity"]), alone)
         if others is not None:
             self._count("pulse", (others > 0).astype(np.int64), alone)
-        for place, flag in enumerate(EchoFlag):
-            has = (rows["flags"] & np.uint16(flag)) != 0
+        flags = [*((rows["flags"] & np.uint16(flag)) != 0 for flag in EchoFlag), rows["flags"] == 0]
+        for place, has in enumerate(flags):
             self._count("flag", np.full(int(has.sum()), place), alone[has])
-        none = rows["flags"] == 0
-        self._count("flag", np.full(int(none.sum()), len(EchoFlag)), alone[none])
 
     def _count(self, kind: str, code: np.ndarray, alone: np.ndarray) -> None:
         tally = self._tallies[kind]
@@ -53,21 +49,14 @@ class Breakdown:
         tally[:, 1] += np.bincount(code, minlength=len(tally))
 
     def tables(self) -> dict[str, Table]:
-        """Per kind a table of its classes that have an echo; kinds of which the side knows nothing are left out.
+        """For each kind the classes that have an echo; kinds without data are left out.
 
-        `intensity` only where there are no amplitudes, and not if all are 0; `flag` only if any echo has one.
+        `intensity` is there only without amplitudes and if not all are 0; `flag` only if any echo has one.
         """
-        names = {
-            "return": [_name_return(*divmod(code, _NUMBERS)) for code in range(_NUMBERS * _NUMBERS)],
-            "amplitude": _OCTAVE_NAMES,
-            "intensity": _OCTAVE_NAMES,
-            "pulse": ["nothing of the other side", "other echoes of the other side"],
-            "flag": [*(flag.name for flag in EchoFlag), "none"],
-        }
         tables = {}
         for kind, tally in self._tallies.items():
             rows = np.flatnonzero(tally[:, 1]).tolist()
-            tables[kind] = {names[kind][row]: (int(tally[row, 0]), int(tally[row, 1])) for row in rows}
+            tables[kind] = {_NAMES[kind][row]: (int(tally[row, 0]), int(tally[row, 1])) for row in rows}
         if tables["amplitude"] or set(tables["intensity"]) <= {_OCTAVE_NAMES[0]}:
             del tables["intensity"]
         if set(tables["flag"]) <= {"none"}:
@@ -76,12 +65,16 @@ class Breakdown:
 
 
 def _octave(values: np.ndarray) -> np.ndarray:
-    """Class of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
+    """Classes of amplitudes: 0 below 1, 1 from 1 to 2, 2 from 2 to 4 ..., i8 (k,)."""
     return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)
 
 
 _OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
-
-
-def _name_return(total: int, number: int) -> str:
-    return f"{number} of {total}"
+_NAMES = {
+    "return": [f"{number} of {total}" for total in range(_NUMBERS) for number in range(_NUMBERS)],
+    "amplitude": _OCTAVE_NAMES,
+    "intensity": _OCTAVE_NAMES,
+    "pulse": ["nothing of the other side", "other echoes of the other side"],
+    "flag": [*(flag.name for flag in EchoFlag), "none"],
+}
+"""Per kind of class the names of its classes."""

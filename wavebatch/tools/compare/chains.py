@@ -1,4 +1,8 @@
-"""Two chains on one strip, or a chain and a cloud or the vendor's returns: what both find, and how well they fit."""
+"""Comparison of chains that run on one strip: with each other, with a cloud, and with the vendor's returns.
+
+`wavebatch compare --strip` calls `match_sides`. Two chains are paired by echo time within each waveform, because the
+positions of echoes are tied to the vendor's returns and would hide differences of the fits.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +28,13 @@ from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
 
 AUTO = "auto"
-"""The chain that the strip's survey chooses."""
+"""Name of the chain that the survey of the strip chooses."""
 
 _BLOCK = 8192
-"""Waveforms that go through the chains at a time."""
+"""Waveforms that run through the chains at once."""
 
 _KEPT = 200_000
-"""Waveforms and pairs per chain that medians are taken of, beside those of the two sides."""
+"""Waveforms and pairs per chain from which medians of goodness and returns are taken; bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,53 +42,47 @@ class Contender:
     """One side of a match on a strip."""
 
     name: str
-    """Of a chain, or the path of a cloud."""
+    """Name of a chain, or path of a cloud."""
     chain: Chain | None = None
-    """What is run; None for a cloud, and for AUTO until the strip is surveyed."""
+    """The chain; None for a cloud, and for AUTO until the strip is surveyed."""
 
     @property
     def is_cloud(self) -> bool:
-        """Whether it is a result already."""
+        """Whether it is a cloud, which needs no run."""
         return self.chain is None and self.name != AUTO
 
 
 def find_contender(name: str) -> Contender:
     """A shipped chain by its name, `auto`, a chain file (.toml), or else a cloud; ConfigError for a wrong chain."""
-    if name == AUTO:
-        return Contender(name)
     if name in list_profiles():
         return Contender(name, load_profile(name))
-    return Contender(name, load_chain(name)) if Path(name).suffix.lower() == ".toml" else Contender(name)
+    return Contender(name, load_chain(name) if Path(name).suffix.lower() == ".toml" else None)
 
 
 @dataclass(frozen=True, slots=True)
 class Matchup:
-    """What two sides, a and b, make of the waveforms of one strip; b may be the vendor's returns."""
+    """Comparison of two sides, a and b, on the waveforms of one strip; b may be the vendor's returns."""
 
     strip: str
     waveforms: int
-    """Those that were compared."""
+    """Waveforms that were compared."""
     returns: int
-    """The vendor's returns in them."""
+    """The vendor's returns in these waveforms."""
     between: Comparison
-    """a with b; two chains by time within each waveform, so that their differences are those of the fits."""
+    """a with b; two chains by time within each waveform, so that differences are those of the fits."""
     vendor: dict[str, Comparison] = field(default_factory=dict)
-    """Chains `a` and `b` with the vendor's returns, by place within each waveform."""
+    """Chains `a` and `b` with the vendor's returns, by position within each waveform."""
     fit: dict[str, dict[str, Goodness]] = field(default_factory=dict)
-    """Goodness of fit of `a` and `b`: of `all` waveforms with an echo, those with a `single` one, those with
-    several (`multi`), and those in which `both` chains have one; empty where what was fitted is not known, as it is
-    not of a cloud."""
+    """Goodness of fit of `a` and `b`: of `all` waveforms with an echo, of those with a `single` echo, with several
+    (`multi`), and with echoes of `both` chains; empty for a cloud, which does not hold the fitted model."""
 
     def to_json(self) -> dict:
         """Plain numbers, lists and dictionaries for JSON."""
-        return {
-            **self.between.to_json(),
-            "strip": self.strip,
-            "waveforms": self.waveforms,
-            "returns": self.returns,
-            "vendor": {side: one.to_json() for side, one in self.vendor.items()},
-            "fit": {side: {name: asdict(one) for name, one in fit.items()} or None for side, fit in self.fit.items()},
-        }
+        document = self.between.to_json() | asdict(self)
+        del document["between"]
+        document["vendor"] = {side: one.to_json() for side, one in self.vendor.items()}
+        document["fit"] = {side: fit or None for side, fit in document["fit"].items()}
+        return document
 
 
 def match_sides(
@@ -96,15 +94,15 @@ def match_sides(
     survey: Survey | None = None,
     limit: int | None = None,
 ) -> Matchup:
-    """Echoes that a and b find in the waveforms of a strip; without b, a and the vendor's returns.
+    """Compares the echoes of a and b on the waveforms of a strip; without b, a with the vendor's returns.
 
-    At least one side is a chain. survey: taken in place of one of the strip. limit: about as many waveforms, spread
-    evenly over the strip, in place of all; not with a cloud. Memory is bounded, as in compare_clouds.
-    Raises InputError for files that cannot be read, ConfigError for what cannot be compared.
+    At least one side is a chain. survey: used instead of a survey of the strip. limit: use about as many waveforms,
+    spread evenly over the strip, instead of all; not with a cloud. Memory is bounded, as in compare_clouds.
+    Raises InputError for files that cannot be read, ConfigError for sides that cannot be compared.
     """
     clouds = [side for side in (a, b) if side is not None and side.is_cloud]
     if len(clouds) == (1 if b is None else 2):
-        raise ConfigError(f"{a.name}: clouds need no chain to be run; compare them without --strip")
+        raise ConfigError(f"{a.name}: both sides are results already; compare them without --strip")
     if clouds and limit is not None:
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
@@ -118,15 +116,10 @@ def match_sides(
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
         else:
             between = match_chains(blocks, runs, (a.name, b.name if b else str(strip)), tolerance_ns)
-    names = {key: side.name for key, side in chains.items()}
-    return Matchup(
-        strip=str(strip),
-        waveforms=next(iter(runs.values())).vendor.pulses,
-        returns=next(iter(runs.values())).vendor.echoes[1],
-        between=between,
-        vendor={key: run.vendor.finish(names[key], str(strip), "waveform") for key, run in runs.items()},
-        fit={key: runs[key].fit.result() if key in runs else {} for key in ("a", "b")[: 1 if b is None else 2]},
-    )
+    some = next(iter(runs.values())).vendor
+    vendor = {key: run.vendor.finish(chains[key].name, str(strip), "waveform") for key, run in runs.items()}
+    fit = {key: runs[key].fit.result() if key in runs else {} for key in ("a", "b")[: 1 if b is None else 2]}
+    return Matchup(str(strip), some.pulses, some.echoes[1], between, vendor, fit)
 
 
 def _read_blocks(reader: StripReader, scan: StripScan, limit: int | None) -> Iterator[WaveformBlock]:
@@ -141,7 +134,7 @@ def _read_blocks(reader: StripReader, scan: StripScan, limit: int | None) -> Ite
 def match_chains(
     blocks: Iterator[WaveformBlock], runs: dict[str, ChainRun], names: tuple[str, str], tolerance_ns: float
 ) -> Comparison:
-    """Chains a and b, or a and the vendor's returns, waveform by waveform; each of `runs` keeps what it finds."""
+    """Compares chains a and b, or a and the vendor's returns, waveform by waveform; `runs` collect their own sums."""
     between = Pairing(tolerance_ns)
     for block in blocks:
         found = {key: run.find(block) for key, run in runs.items()}
@@ -164,7 +157,7 @@ def _match_cloud(
     runs: dict[str, ChainRun],
     tolerance_ns: float,
 ) -> Comparison:
-    """A chain and a cloud as two clouds."""
+    """Compares a chain with a cloud, as two clouds."""
     ((key, run),) = runs.items()
     cloud_side = 1 if key == "a" else 0
     with (
@@ -185,13 +178,13 @@ def _match_cloud(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """What a chain makes of a block."""
+    """Noise and echoes of a chain in a block."""
 
     noise: Noise
     echoes: EchoTable
 
     def rows(self, block: WaveformBlock) -> np.ndarray:
-        """The echoes as a cloud has them, but for their gps_time, which is the row of their waveform."""
+        """The echoes as rows of a cloud; gps_time is the row of the waveform in the block."""
         echoes = self.echoes
         rows = np.zeros(len(echoes), CLOUD_DTYPE)
         rows["gps_time"] = echoes.waveform
@@ -207,9 +200,9 @@ class _Found:
         return rows
 
     def rows_along(self, block: WaveformBlock) -> np.ndarray:
-        """The echoes on a vertical line, as far apart as their times are.
+        """The echoes on a vertical line, with distances that follow from their times.
 
-        Positions hang on a return, so that those of two chains do not differ where an echo matches it.
+        Positions would not do: an echo that matches a return lies on the return, whatever the chain has fitted.
         """
         rows = self.rows(block)
         rows["ray"] = rows["xyz"] = 0.0
@@ -217,7 +210,7 @@ class _Found:
         return rows
 
     def vendor_rows(self, block: WaveformBlock) -> np.ndarray:
-        """The returns of the block in the same way; their amplitude is that of the sample at their place."""
+        """The returns of the block as rows of a cloud; the amplitude is that of the sample nearest to the return."""
         returns = block.returns
         rows = np.zeros(0 if returns is None else len(returns), CLOUD_DTYPE)
         if returns is None:
@@ -236,7 +229,7 @@ class _Found:
 
 
 class ChainRun:
-    """A chain on the blocks of a strip, with its goodness of fit and what it has in common with the returns."""
+    """Runs a chain on blocks and collects its goodness of fit and its comparison with the vendor's returns."""
 
     def __init__(self, chain: Chain, system: SystemPulse, tolerance_ns: float) -> None:
         placed = [step for step in chain.steps if step.stage.name == "attribute.position"]
@@ -245,13 +238,13 @@ class ChainRun:
         self.fit, self.vendor = FitQuality(_KEPT), Pairing(tolerance_ns, limit=_KEPT)
 
     def find(self, block: WaveformBlock) -> _Found:
-        """What the chain makes of a block."""
+        """Runs the chain on a block."""
         echoes = self.chain.run(block, self.system)
         estimate = self.chain.steps[0]
         return _Found(estimate.stage.function(block, self.system.of(block), **estimate.parameters), echoes)
 
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
-        """Takes in what was found; both: waveforms in which the other side has an echo, bool (n,)."""
+        """Adds the result of a block; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
         misfit, floor = measure_fit(block, found.noise, self.system.of(block), self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
@@ -259,14 +252,14 @@ class ChainRun:
 
 
 def _keys(block: WaveformBlock) -> np.ndarray:
-    """Every waveform of the block, so that those without an echo count too."""
+    """All waveforms of the block, so that those without an echo count too."""
     keys = np.zeros(len(block), PACKET_DTYPE)
     keys["gps_time"] = np.arange(len(block))
     return keys
 
 
 def _rank(waveform: np.ndarray, time: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of each echo in its waveform by time, from 1, and how many the waveform has; u1 (m,), 255 at most."""
+    """Number of each echo in its waveform by time, from 1, and echoes per waveform; u1 (m,), at most 255."""
     order = np.lexsort((time, waveform))
     count = np.bincount(waveform, minlength=n)
     rank = np.empty(len(order), np.int64)

@@ -1,4 +1,9 @@
-"""Two clouds of one strip, or a cloud and the truth: which echoes both have, and how far apart they are."""
+"""Comparison of two clouds of one strip, or of a cloud and the truth of a simulation.
+
+`wavebatch compare` calls `compare_clouds` and `compare_truth`; `chains` uses `CloudTask` for a chain and a cloud. Rows
+go to buckets on disk (by GPS time, or by x if times do not separate pulses), then bucket by bucket to `Pairing`, so
+that memory does not grow with the clouds.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +15,22 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
-from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time, tell_pulses_apart
+from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
+from wavebatch.tools.return_stats.returns import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
 
 _TRUTH_DTYPE = np.dtype([*((name, CLOUD_DTYPE[name]) for name in CLOUD_DTYPE.names), ("isolated", "?")])
 PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
-"""A pulse that counts even if neither side has an echo of it."""
+"""A pulse that counts even if neither side has an echo in it."""
 
 
 def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison:
-    """Echoes of two clouds of one strip; b may be the strip itself, whose points are the vendor's returns.
+    """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
-    Echoes of a pulse (equal GPS time) at most `tolerance_ns` apart along the ray are identical, one to one, nearest
-    first. Where GPS times cannot tell pulses apart, points that are nearest neighbours of each other are.
-    Points passed through without an echo do not count. Memory is bounded; large clouds need room in TMPDIR.
+    Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
+    nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
+    without an echo are ignored. Memory is bounded; large clouds need room in TMPDIR.
     Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance.
     """
     with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
@@ -35,8 +41,8 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison
 
 
 def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:
-    """The comparison of two clouds, or of what is as they are, by GPS time where both tell pulses apart by it."""
-    by_time = _can_group(first) and _can_group(second) and _share_times(first, second)
+    """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
+    by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
     task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
     if not by_time:
         task.place_borders(first)
@@ -44,14 +50,13 @@ def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> C
 
 
 def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
-    """Pieces of a cloud without the points that were passed through."""
+    """Pieces of a cloud, without the points that were passed through."""
     for rows in reader.read_pieces():
         yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
 
 
 def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Comparison:
-    """Echoes of a cloud against the truth of the simulated strip it was made from; errors and tolerance as in
-    compare_clouds."""
+    """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does."""
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
@@ -65,16 +70,8 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Compari
             return task.finish(str(a), str(truth))
 
 
-def _can_group(reader: CloudReader) -> bool:
-    """Whether the first points' GPS times tell pulses apart."""
-    if not reader.has_gps_time:
-        return False
-    rows = next(reader.read_pieces(), None)
-    return rows is None or tell_pulses_apart(rows["gps_time"])
-
-
 def _share_times(first: CloudReader, second: CloudReader) -> bool:
-    """Whether any pulse of the shorter cloud's beginning is in the other one."""
+    """Whether any pulse of the first piece of the shorter cloud is in the other cloud."""
     short, long = sorted((first, second), key=lambda reader: reader.point_count)
     rows = next(short.read_pieces(), np.empty(0, CLOUD_DTYPE))
     times = np.unique(rows["gps_time"])
@@ -93,11 +90,10 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
 
 
 class CloudTask:
-    """One comparison: rows of a, b (and of the truth's packets) in buckets, then bucket by bucket.
+    """One comparison: `add` puts rows of both sides into buckets, `finish` compares bucket by bucket.
 
     A context manager, because temporary files hold the rows.
     """
-
 
     def __init__(self, by_time: bool, tolerance_ns: float, points: int, meta: dict | None = None) -> None:
         self.by_time, self.pairing = by_time, Pairing(tolerance_ns, meta)
@@ -114,20 +110,20 @@ class CloudTask:
             bucket.close()
 
     def place_borders(self, reader: CloudReader) -> None:
-        """Borders along x of slabs with about the same number of points."""
+        """Chooses borders along x, so that all buckets have about the same number of points."""
         if self.number > 1:
             some = np.concatenate([rows["xyz"][::100, 0] for rows in reader.read_pieces()])
             self.borders = np.quantile(some, np.arange(1, self.number) / self.number)
 
     def add(self, side: int, rows: np.ndarray) -> None:
-        """Takes in rows of a (side 0), b (1) or the truth's packets (2)."""
+        """Adds rows of a (side 0), of b (1) or of the truth's packets (2)."""
         self.buckets[side].add(rows, self._sort_by_time if self.by_time else self._sort_by_place)
 
     def _sort_by_time(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return sort_by_time(rows["gps_time"], self.number)
 
     def _sort_by_place(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The slab of every point, and the neighbouring ones that it is close to."""
+        """The slab of each point, and the neighbouring slabs that it is close to."""
         index, bucket = [], []
         low = np.searchsorted(self.borders, rows["xyz"][:, 0] - 2 * self.pairing.tolerance)
         high = np.searchsorted(self.borders, rows["xyz"][:, 0] + 2 * self.pairing.tolerance)
@@ -144,6 +140,6 @@ class CloudTask:
             if self.by_time:
                 self.pairing.pair_by_time(a, b, packets)
             else:
-                own = [np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b)]
-                self.pairing.pair_by_place(a, b, (own[0], own[1]))
+                inside = (np.searchsorted(self.borders, rows["xyz"][:, 0]) == number for rows in (a, b))
+                self.pairing.pair_by_place(a, b, *inside)
         return self.pairing.finish(name_a, name_b, "gps_time" if self.by_time else "position")

@@ -1,4 +1,7 @@
-"""Differences of matched echoes: medians and spreads of time, amplitude and width, errors in units of the bound."""
+"""Differences of paired echoes in time, amplitude and width; against a truth also in units of the Cramer-Rao bound.
+
+`pairing` adds pairs; sums are of all pairs, medians of an even sample, so that memory is bounded.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +16,15 @@ from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.stages.score import ErrorStats
 
 SPEED = 0.9997 * HALF_C
-"""Metres along the ray per ns."""
+"""Metres along the ray per ns; the factor is the refractive index of air, n = 1.0003."""
 
 _BOTH = ("echo_time", "amplitude", "echo_width")
-"""Columns whose values are compared where both sides have them."""
+"""Columns that are compared if both sides have them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Differences a minus b of one quantity over the echoes that both have."""
+    """Differences a minus b of one quantity, over the echoes that both sides have."""
 
     number: int
     median: float
@@ -31,14 +34,14 @@ class Spread:
 
 
 class Differences:
-    """Collects matched pairs (records of io.cloud.CLOUD_DTYPE): sums of all, an even sample of them for medians."""
+    """Collects pairs of echoes (CLOUD_DTYPE): sums of all pairs, and an even sample of them for medians."""
 
     def __init__(self, limit: int | None = None) -> None:
         self._sample = EvenSample(limit)
         self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
-        """Takes in pairs: a[i] with b[i]."""
+        """Adds pairs: a[i] with b[i]."""
         part = {name: a[name].astype(np.float64) - b[name] for name in _BOTH}
         part["time"] = measure_lag(a, b) / SPEED
         for name, values in part.items():
@@ -52,7 +55,7 @@ class Differences:
         self._sample.add(part)
 
     def spreads(self) -> dict[str, Spread]:
-        """Per quantity that both sides have: median, mean, rms and NMAD of a minus b."""
+        """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
         result = {}
         for name, (number, total, squares) in self.sums.items():
             if not number:
@@ -67,7 +70,7 @@ class Differences:
         return result
 
     def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
-        """Errors of time [ns], amplitude [DN] and sigma [ns] in units of the bound and of what was reported."""
+        """Errors of time [ns], amplitude [DN] and sigma [ns], in units of the bound and of the reported errors."""
         data = self._sample.read()
         if not data:
             return {}
@@ -91,9 +94,9 @@ class Differences:
 
 
 def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """How much further along the ray a lies than b [m], f8 (k,), positive away from the sensor.
+    """Distance of a after b along the ray [m], f8 (k,), positive away from the sensor.
 
-    Along the packet vector of b or a where one is stored, else by distance, with the lower point as the further one.
+    The ray is the packet vector of b, or of a; without both, the lower point counts as the farther one.
     """
     step = a["xyz"] - b["xyz"]
     ray = np.where(np.any(b["ray"] != 0, axis=1)[:, None], b["ray"], a["ray"]).astype(np.float64)

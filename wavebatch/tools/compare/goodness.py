@@ -1,4 +1,7 @@
-"""How well fitted echoes explain their waveforms: Wang's E, and what noise alone leaves of it."""
+"""Goodness of fit E of Wang et al., and the E0 that noise alone gives.
+
+`chains` measures every block with `measure_fit` and collects the values in a FitQuality per chain.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +19,23 @@ from wavebatch.stages.pulse_tables import clip_level
 
 @dataclass(frozen=True, slots=True)
 class Goodness:
-    """Goodness of fit E = |f - y|^2 / |f|^2 over waveforms with an echo; NaN where there is none."""
+    """Goodness of fit E = |f - y|^2 / |f|^2 over waveforms with an echo; NaN without such waveforms."""
 
     waveforms: int
     mean: float
     median: float
     floor_mean: float
-    """Of E0, the E that noise alone leaves of a right fit."""
+    """Mean of E0, the E that noise alone gives for a perfect fit."""
     floor_median: float
 
 
 def measure_fit(
     block: WaveformBlock, noise: Noise, system: SystemPulse, decomposer: Step, echoes: EchoTable
 ) -> tuple[np.ndarray, np.ndarray]:
-    """E and E0 of every waveform, f8 (n,); NaN without an echo, or where the decomposer's model is not known.
+    """E and E0 of each waveform, f8 (n,); NaN without an echo, or if the model of the decomposer is not known.
 
-    f is the sum of the fitted pulses, y the samples above the baseline; those at the digitizer's limit count in
-    neither. E0 = n sn^2 / |f|^2 with n samples. Source: Wang, Wang and Tseng eq. 5; ALGORITHMS 1.2.
+    f is the sum of the fitted pulses, y the samples above the baseline; samples at the digitizer's limit are left out
+    of both. E0 = n sn^2 / |f|^2 with n samples. Source: Wang, Wang and Tseng eq. 5; docs/algorithms.md 1.2.
     """
     model = rebuild_waveforms(block, system, decomposer, echoes)
     if model is None:
@@ -47,14 +50,14 @@ def measure_fit(
 
 
 class FitQuality:
-    """Collects E and E0 of waveforms: sums of all, an even sample of them for medians."""
+    """Collects E and E0 of waveforms: sums of all, and an even sample of them for medians."""
 
     def __init__(self, limit: int | None = None) -> None:
         self._sample = EvenSample(limit)
         self._sums = {name: np.zeros(3) for name in ("all", "single", "multi", "both")}
 
     def add(self, misfit: np.ndarray, floor: np.ndarray, number: np.ndarray, both: np.ndarray) -> None:
-        """Takes in waveforms (n,): E, E0, how many echoes each has, and whether the other side has one too."""
+        """Adds waveforms (n,): E, E0, number of echoes, and whether the other side has an echo too."""
         rows = np.flatnonzero(np.isfinite(misfit))
         part = {"misfit": misfit[rows], "floor": floor[rows], "number": number[rows], "both": both[rows]}
         for name, inside in _classes(part).items():
@@ -62,8 +65,8 @@ class FitQuality:
         self._sample.add(part)
 
     def result(self) -> dict[str, Goodness]:
-        """Goodness of all waveforms, those with a single echo, with several, and where both sides have one; empty
-        where E was known of none."""
+        """Goodness of all waveforms, of those with a single echo, with several, and with an echo on both sides; empty
+        if E is not known."""
         whole = self._sample.read()
         if not whole or not len(whole["misfit"]):
             return {}

@@ -1,4 +1,8 @@
-"""What two sides have in common: pairs within pulses or by place, counted and measured bucket by bucket."""
+"""Pairing of the echoes of two sides, within pulses or by position, and the sums over all pairs.
+
+`clouds` and `chains` add parts of a strip to a Pairing, `finish` gives the Comparison. A part must hold whole pulses
+(`pair_by_time`) or all neighbours of its echoes (`pair_by_place`), or pairs are lost.
+"""
 
 from __future__ import annotations
 
@@ -13,24 +17,24 @@ from wavebatch.tools.compare.breakdown import Breakdown, Table
 from wavebatch.tools.compare.differences import SPEED, Differences, Spread
 
 MOST_PER_PULSE = 64
-"""Echoes of one GPS time beyond which it is no pulse's."""
+"""More echoes than this with one GPS time are not a pulse: such times are missing or rounded."""
 
 MOST_PAIRS = 20_000_000
-"""Of such echoes: about 100 bytes each."""
+"""Most pairs of such echoes that are looked at; each needs about 100 bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What cloud a has in common with b (another cloud, or the truth). Shares are NaN where nothing is to be shared."""
+    """What side a has in common with side b (another cloud or chain, or the truth). A share of nothing is NaN."""
 
     a: str
     b: str
     matched_by: str
-    """`gps_time`: within pulses of equal time; `position`: nearest neighbours of each other; `waveform`: within each
-    waveform of the strip, by time after its first sample."""
+    """`gps_time`: within pulses of equal time; `position`: mutual nearest neighbours; `waveform`: within each waveform
+    of the strip, by time after its first sample."""
     tolerance_ns: float
     pulses: int
-    """Pulses of either (of the truth: its packets); 0 when matched by position."""
+    """Pulses of both sides together (with a truth: its packets); 0 when matched by position."""
     echoes_a: int
     echoes_b: int
     matched: int
@@ -45,30 +49,29 @@ class Comparison:
     exact_count: float
     """Share of the pulses with as many echoes in a as in b."""
     counts_a: dict[int, int]
-    """Pulses by number of echoes in a; those with none are known from b."""
+    """Pulses by number of echoes in a; pulses without an echo in a are known from b."""
     counts_b: dict[int, int]
     differences: dict[str, Spread]
     """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
     errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
-    """Against truth only: per class (all, isolated, overlapped) and quantity, with error / bound and calibration.
+    """Only with a truth: errors by class (all, isolated, overlapped) and quantity.
 
-    `time` is the error of the position; `echo_time`, where the cloud has it, that of the fit alone.
-    Medians and errors of more than a million pairs are those of an even sample."""
-
+    `time` is the error of the position; `echo_time`, if the cloud has it, the error of the fit alone.
+    Medians and errors of more than a million pairs come from an even sample."""
     missed_by: dict[str, Table] = field(default_factory=dict)
-    """What the missed echoes are: per kind (return, amplitude or intensity, pulse, flag) and class of it, those missed
-    and all of b's. An echo counts for each of its flags. Intensity stands in where b has no amplitudes."""
+    """Missed echoes by kind (return, amplitude or intensity, pulse, flag) and class: number missed, and number in b.
+    An echo counts for each of its flags. Intensity is used if b has no amplitudes."""
     extra_by: dict[str, Table] = field(default_factory=dict)
-    """What the extra echoes are, as `missed_by`."""
+    """Extra echoes, as `missed_by`."""
 
     @property
     def identical(self) -> float:
-        """Share of the echoes of both that the other side has too (Wagner et al., tables 1 and 2)."""
+        """Share of the echoes of both sides that the other side has too (Wagner et al., tables 1 and 2)."""
         return _share(2 * self.matched, self.echoes_a + self.echoes_b)
 
     @property
     def gain(self) -> float:
-        """How many more echoes a has than b, as a share of b's."""
+        """Additional echoes of a, as a share of those of b."""
         return _share(self.echoes_a - self.echoes_b, self.echoes_b)
 
     def to_json(self) -> dict:
@@ -77,10 +80,10 @@ class Comparison:
 
 
 class Pairing:
-    """Pairs echoes of a and b (records of io.cloud.CLOUD_DTYPE), part by part, and sums up what they have in common.
+    """Pairs echoes of a and b (CLOUD_DTYPE) part by part, and sums up counts and differences.
 
-    tolerance_ns: largest distance of the same echo along the ray. meta: of the truth where b is one. limit: most pairs
-    that are kept for medians.
+    tolerance_ns: largest distance of the same echo along the ray. meta: metadata of the truth, if b is one. limit: most
+    pairs that are kept for medians.
     """
 
     def __init__(self, tolerance_ns: float, meta: dict | None = None, limit: int | None = None) -> None:
@@ -93,10 +96,9 @@ class Pairing:
         self.breakdowns = (Breakdown(), Breakdown())
 
     def pair_by_time(self, a: np.ndarray, b: np.ndarray, packets: np.ndarray) -> None:
-        """Takes in pulses that are whole: echoes of equal gps_time are of one.
+        """Adds whole pulses: echoes of equal gps_time belong to one pulse.
 
-        packets: records with the gps_time of every pulse that counts, those without an echo too; where there is none,
-        all pulses with an echo count.
+        packets: gps_time of each pulse that counts, with or without echoes; if empty, all pulses with an echo count.
         """
         times = np.concatenate([a["gps_time"], b["gps_time"], packets["gps_time"]])
         known, group = np.unique(times, return_inverse=True)
@@ -114,13 +116,12 @@ class Pairing:
         self._count(1, b, right, number_a[in_b])
         self.matched += len(left)
 
-    def pair_by_place(self, a: np.ndarray, b: np.ndarray, own: tuple[np.ndarray, np.ndarray]) -> None:
-        """Takes in a region: nearest neighbours of each other are pairs.
+    def pair_by_place(self, a: np.ndarray, b: np.ndarray, inside_a: np.ndarray, inside_b: np.ndarray) -> None:
+        """Adds a region: mutual nearest neighbours are pairs.
 
-        own: echoes that count, bool (k,) for a and b; the others are there as neighbours only.
+        inside_a, inside_b: echoes in the region, bool (k,); the others are only neighbours of these.
         """
-        none = np.empty(0, np.int64)
-        left = right = none
+        left = right = np.empty(0, np.int64)
         if len(a) and len(b):
             to_b, nearest_b = cKDTree(b["xyz"]).query(a["xyz"], distance_upper_bound=self.tolerance)
             _, nearest_a = cKDTree(a["xyz"]).query(b["xyz"], distance_upper_bound=self.tolerance)
@@ -128,15 +129,15 @@ class Pairing:
             right = nearest_b[left]
             mutual = nearest_a[right] == left
             left, right = left[mutual], right[mutual]
-        self._count(0, a, left, None, own[0])
-        self._count(1, b, right, None, own[1])
-        # A pair across a border belongs to the region of its echo of a.
-        inside = own[0][left]
+        self._count(0, a, left, None, inside_a)
+        self._count(1, b, right, None, inside_b)
+        # A pair across a border belongs to the region of its echo of a, so that it counts once.
+        inside = inside_a[left]
         self.differences.add(a[left[inside]], b[right[inside]])
         self.matched += int(inside.sum())
 
     def finish(self, name_a: str, name_b: str, matched_by: str) -> Comparison:
-        """What all parts have in common."""
+        """The comparison of all parts."""
         a, b = self.echoes
         return Comparison(
             a=name_a,
@@ -161,13 +162,17 @@ class Pairing:
         )
 
     def _count(
-        self, side: int, rows: np.ndarray, paired: np.ndarray, others: np.ndarray | None, own: np.ndarray | None = None
+        self,
+        side: int,
+        rows: np.ndarray,
+        paired: np.ndarray,
+        others: np.ndarray | None,
+        inside: np.ndarray | slice = slice(None),
     ) -> None:
-        """Echoes of one side: those that are paired, and how many the other side has in their pulses."""
+        """Counts echoes of one side; others: number of echoes of the other side in the pulse of each."""
         alone = np.ones(len(rows), bool)
         alone[paired] = False
-        if own is not None:
-            rows, alone = rows[own], alone[own]
+        rows, alone = rows[inside], alone[inside]
         self.echoes[side] += len(rows)
         self.breakdowns[side].add(rows, alone, others)
 
@@ -177,14 +182,14 @@ def pair_echoes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a and b that are the same echo: of one pulse and at most `reach` [m] apart, one to one, nearest first.
 
-    pulse_a, pulse_b: whole numbers from 0 on (k,); xyz_a, xyz_b: positions f8 (k, 3) [m]. Raises InputError where
-    very many echoes of one pulse lie within reach of each other.
+    pulse_a, pulse_b: numbers of the pulses, from 0, (k,); xyz_a, xyz_b: positions f8 (k, 3) [m]. Raises InputError if
+    too many echoes of one pulse lie within reach of each other.
     """
     number = max(pulse_a.max(initial=0), pulse_b.max(initial=0)) + 1
     most = np.maximum(*(np.bincount(pulse, minlength=number) for pulse in (pulse_a, pulse_b)))
     crowd = most > MOST_PER_PULSE
     calm_a, calm_b = (np.flatnonzero(~crowd[pulse]) for pulse in (pulse_a, pulse_b))
-    # Heights differ by less than distances along the ray do: a cheap first choice of pairs.
+    # The difference in height is never larger than the distance: a fast first choice of pairs.
     left, right = list_pairs(pulse_a[calm_a], xyz_a[calm_a, 2], pulse_b[calm_b], xyz_b[calm_b, 2], reach)
     left, right = calm_a[left], calm_b[right]
     if crowd.any():
@@ -200,15 +205,15 @@ def pair_echoes(
 def _list_crowded(
     pulse_a: np.ndarray, xyz_a: np.ndarray, pulse_b: np.ndarray, xyz_b: np.ndarray, crowd: np.ndarray, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs within reach of pulses that are none: of points without a time of their own heights choose too few."""
+    """Pairs within reach among points with one GPS time; here heights would leave too many pairs to check."""
     rows_a, rows_b = (np.flatnonzero(crowd[pulse]) for pulse in (pulse_a, pulse_b))
     if not len(rows_a) or not len(rows_b):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     trees = cKDTree(xyz_a[rows_a]), cKDTree(xyz_b[rows_b])
     if trees[0].count_neighbors(trees[1], reach) > MOST_PAIRS:
         raise InputError(
-            f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others, and "
-            "lie too close together to be told apart; leave out the points without a time of their own"
+            f"{len(rows_a)} and {len(rows_b)} points share their GPS times with more than {MOST_PER_PULSE} others and "
+            "lie too close together to be paired; remove the points without a valid GPS time"
         )
     near = trees[0].sparse_distance_matrix(trees[1], reach, output_type="ndarray")
     left, right = rows_a[near["i"]], rows_b[near["j"]]
@@ -217,7 +222,7 @@ def _list_crowded(
 
 
 def check_tolerance(tolerance_ns: float) -> float:
-    """The tolerance; ConfigError where it is none."""
+    """The tolerance; ConfigError if it is not above 0."""
     if not 0 < tolerance_ns < 1e6:
         raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
     return tolerance_ns

@@ -1,4 +1,8 @@
-"""Pictures of clouds: histograms, counts of flags, maps."""
+"""Pictures of clouds, drawn with matplotlib: histograms, counts of flags, maps.
+
+`wavebatch plot histogram` and `wavebatch plot map` call these with the results of `histogram` and `raster`. Style and
+files are those of `files.figure_file`; the same data give the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +21,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
-"""Okabe and Ito's colours, which colour-blind readers tell apart; more series than these are not."""
+"""Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
 
 _LONG = 8.0
 """Longer side of a map [inches]."""
 
 
 def draw_histogram(found: Histogram, target: Path, *, log: bool = False, overwrite: bool = False) -> None:
-    """Writes a picture of a histogram; log: a logarithmic axis of counts. Raises as pictures.open_picture does."""
+    """Writes a picture of a histogram; log: logarithmic axis of counts. Raises as figure_file.open_picture does."""
     with open_picture(target, (8.0, 4.8), overwrite=overwrite) as figure:
         axes = figure.subplots()
         for series, counts in enumerate(found.counts):
@@ -53,8 +57,8 @@ def _draw_series(axes: Axes, found: Histogram, series: int, counts: np.ndarray) 
         axes.stairs(counts, found.edges, fill=True, color=color, alpha=0.35)
     unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
     low, median, high = (_value_text(value, found.edges) for value in found.percentiles[series])
-    told = f"{label}{found.tallies[series].values:,} values, median {median}{unit}"
-    axes.stairs(counts, found.edges, color=color, linewidth=1.2, label=told)
+    text = f"{label}{found.tallies[series].values:,} values, median {median}{unit}"
+    axes.stairs(counts, found.edges, color=color, linewidth=1.2, label=text)
     if math.isnan(middle):
         return
     axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
@@ -64,7 +68,7 @@ def _draw_series(axes: Axes, found: Histogram, series: int, counts: np.ndarray) 
 
 
 def _value_text(value: float, edges: np.ndarray) -> str:
-    """A value with digits down to a tenth of a bin."""
+    """The value with digits down to a tenth of a bin."""
     digits = 1 - math.floor(math.log10(edges[1] - edges[0]))
     if math.isnan(value) or digits > 12 or abs(value) >= 1e15:
         return f"{value:.5g}"
@@ -74,7 +78,7 @@ def _value_text(value: float, edges: np.ndarray) -> str:
 def draw_flags(
     found: FlagCounts, target: Path, *, names: tuple[str, ...], log: bool = False, overwrite: bool = False
 ) -> None:
-    """Writes a picture of how many points have which flag; names: of the clouds; log: a logarithmic axis of counts."""
+    """Writes a picture of the points per flag; names: of the clouds; log: logarithmic axis of counts."""
     with open_picture(target, (8.0, 5.2), overwrite=overwrite) as figure:
         axes = figure.subplots()
         flags, counts = ["no flag", *found.names], np.array([found.clean, *found.counts.tolist()])
@@ -97,13 +101,13 @@ def draw_flags(
 
 
 def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: bool = False) -> None:
-    """Writes a picture of a map; names: of the clouds. Raises as pictures.open_picture does."""
+    """Writes a picture of a map; names: of the clouds. Raises as figure_file.open_picture does."""
     grid = found.grid
     ratio = grid.rows / grid.columns
     width, height = _LONG / max(ratio, 1.0), _LONG * min(ratio, 1.0)
     flat = ratio < 0.5
     size = (max(width + (1.2 if flat else 2.4), 6.0), max(height + (2.6 if flat else 1.5), 3.0))
-    # As many dots as cells at least, or the picture would skip some.
+    # At least as many pixels as cells, or the picture would skip some cells.
     dpi = float(np.clip(1.25 * max(grid.columns, grid.rows) / _LONG, 150, 400))
     with open_picture(target, size, overwrite=overwrite, dpi=dpi) as figure:
         title = _title(names, found.total, found.facts.name, found.outside)
@@ -128,7 +132,7 @@ def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: 
 
 
 def _place_ticks(axes: Axes, width: float, height: float) -> None:
-    """Coordinates on axes of these lengths [inches]: as many as fit beside each other."""
+    """Places as many coordinates on the axes as fit; width, height: of the map [inches]."""
     narrow = width < 2.0
     for axis, length, each in ((axes.xaxis, width, 0.4 if narrow else 1.2), (axes.yaxis, height, 0.5)):
         if length < 0.4:
@@ -143,14 +147,9 @@ def _place_ticks(axes: Axes, width: float, height: float) -> None:
 
 
 def _title(names: tuple[str, ...], total: Tally, column: str, outside: int) -> str:
-    """Whose values these are, and how many points are not shown and why."""
-    parts = [f"{total.values:,} values"]
-    if total.no_data:
-        parts.append(f"{total.no_data:,} without data")
-    if total.left_out:
-        parts.append(f"{total.left_out:,} left out by flags")
-    if outside:
-        parts.append(f"{outside:,} outside the picture")
+    """Title: clouds, column, number of values, and points that are not shown, with the reason."""
+    rest = {"without data": total.no_data, "left out by flags": total.left_out, "outside the picture": outside}
+    parts = [f"{total.values:,} values", *(f"{number:,} {text}" for text, number in rest.items() if number)]
     return f"{_name_clouds(names)}   {plain_text(column, 40)}\n{', '.join(parts)}"
 
 

@@ -1,4 +1,8 @@
-"""Pictures of waveforms with their fit, residual and echoes."""
+"""Pictures of waveforms with their fit, residual and echoes, drawn with matplotlib.
+
+`wavebatch plot waveform` calls `draw_waveforms` with the views of `waveform.read_views`. Style and files are those of
+`files.figure_file`; the same views give the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +26,15 @@ if TYPE_CHECKING:
 
 INK, GREY = "#222222", "#8a8a8a"
 FIT, PULSE, ECHO, VENDOR, CLIPPED = "#0072b2", "#56b4e9", "#d55e00", "#009e73", "#e69f00"
-"""Okabe and Ito's colours, which colour-blind readers tell apart."""
+"""Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 
 _MOST_LISTED = 12
+"""Most echoes in the table below a single waveform."""
 _MANY = 150
-"""Samples from which on their dots are drawn smaller."""
+"""Waveforms with more samples get smaller dots."""
 _LEAST_SCALE = 5.0
-"""Half the height of a residual panel, at least [noise std]."""
+"""Least half height of a residual panel [noise std]: pure noise then looks small."""
+_DASHED = (0, (4, 2))
 
 
 def draw_waveforms(
@@ -42,12 +48,12 @@ def draw_waveforms(
 ) -> None:
     """Writes a picture of one waveform, or of several as small multiples.
 
-    strip, chain: names for the title. times: the part to show [ns]. Raises as pictures.open_picture does.
+    strip, chain: names for the title. times: part to show [ns]. Raises as figure_file.open_picture does.
     """
     columns = len(views) if len(views) <= 3 else math.ceil(math.sqrt(len(views)))
     rows = -(-len(views) // columns)
     table = _list_echoes(views[0]) if len(views) == 1 else ""
-    # A table takes a row of its own, as high as its lines.
+    # The table of a single waveform gets a row as high as its lines.
     below = 0.15 * (table.count("\n") + 1) if table else 0.0
     size = (9.0, 5.4 + below) if table else (max(4.3 * columns, 7.5), 3.3 * rows + 0.8)
     with open_picture(target, size, overwrite=overwrite) as figure:
@@ -72,7 +78,7 @@ def draw_waveforms(
 def _draw_panels(
     figure: Figure, place: SubplotSpec, view: WaveformView, times: tuple[float, float] | None, *, small: bool
 ) -> tuple[Axes, Axes]:
-    """Signal and residual, one above the other."""
+    """Draws signal and residual, one above the other."""
     inner = place.subgridspec(2, 1, height_ratios=(3, 1), hspace=0.04)
     upper = figure.add_subplot(inner[0])
     lower = figure.add_subplot(inner[1], sharex=upper)
@@ -115,7 +121,7 @@ def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
         markersize=1.6 * size, markeredgewidth=0.6, zorder=3,
     )  # fmt: skip
     for place in view.returns:
-        axes.axvline(place, color=VENDOR, linewidth=1.0, linestyle=(0, (4, 2)), zorder=1)
+        axes.axvline(place, color=VENDOR, linewidth=1.0, linestyle=_DASHED, zorder=1)
     _draw_echoes(axes, view, small=small)
 
 
@@ -152,7 +158,7 @@ def _draw_residual(axes: Axes, view: WaveformView) -> None:
 
 
 def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
-    """Scales the signal to the samples and the fit that are shown; long error bars do not count."""
+    """Scales the signal panel to the samples and the fit that are shown; long error bars may leave it."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
@@ -167,18 +173,16 @@ def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> N
 
 
 def _list_echoes(view: WaveformView) -> str:
-    """A table of the echoes, for a font with letters of one width."""
+    """A table of the echoes, for a monospaced font."""
     echoes = view.echoes
     if not len(echoes):
         return "no echo"
     lines = [f"{'echo':>4}  {'time [ns]':>15}  {'amplitude [DN]':>15}  {'width [ns]':>15}  flags"]
     for row in range(min(len(echoes), _MOST_LISTED)):
-        values = [
-            _measure(echoes.time[row], echoes.time_err[row]),
-            _measure(echoes.amplitude[row], echoes.amplitude_err[row]),
-            _measure(FWHM_PER_SIGMA * echoes.sigma[row], FWHM_PER_SIGMA * echoes.sigma_err[row]),
-        ]
-        front = f"{row + 1:>4}  " + "  ".join(f"{value:>15}" for value in values) + "  "
+        values = ((echoes.time, echoes.time_err, 1.0), (echoes.amplitude, echoes.amplitude_err, 1.0))
+        values += ((echoes.sigma, echoes.sigma_err, FWHM_PER_SIGMA),)
+        texts = [_measure(factor * value[row], factor * error[row]) for value, error, factor in values]
+        front = f"{row + 1:>4}  " + "  ".join(f"{text:>15}" for text in texts) + "  "
         flags = textwrap.wrap(_name_flags(int(echoes.flags[row])) or "-", 58)
         lines += [(front if first is flags[0] else " " * len(front)) + first for first in flags]
     if len(echoes) > _MOST_LISTED:
@@ -187,7 +191,7 @@ def _list_echoes(view: WaveformView) -> str:
 
 
 def _measure(value: float, error: float) -> str:
-    """`12.34 +- 0.05`: two digits of the error."""
+    """`12.34 +- 0.05`, with two digits of the error."""
     if not (math.isfinite(error) and error > 0):
         return f"{value:.4g}"
     digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
@@ -195,7 +199,7 @@ def _measure(value: float, error: float) -> str:
 
 
 def _place_legend(figure: Figure, views: Sequence[WaveformView]) -> None:
-    """One legend for all panels, of what occurs in them."""
+    """One legend for all panels, with the items that occur in them."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -204,15 +208,12 @@ def _place_legend(figure: Figure, views: Sequence[WaveformView]) -> None:
         Patch(color="#e6e6e6", label="baseline \N{PLUS-MINUS SIGN} noise"),
     ]
     if any(view.residual is not None for view in views):
-        handles += [
-            Line2D([], [], color=FIT, linewidth=1.5, label="fit"),
-            Line2D([], [], color=PULSE, linewidth=0.9, label="one echo"),
-        ]
+        handles.append(Line2D([], [], color=FIT, linewidth=1.5, label="fit"))
+        handles.append(Line2D([], [], color=PULSE, linewidth=0.9, label="one echo"))
     handles.append(Line2D([], [], marker="D", color=ECHO, markerfacecolor="none", markersize=4, label="echoes"))
     if any(len(view.returns) for view in views):
-        handles.append(Line2D([], [], color=VENDOR, linestyle=(0, (4, 2)), label="returns of the file"))
+        handles.append(Line2D([], [], color=VENDOR, linestyle=_DASHED, label="returns of the file"))
     if any(view.clipped.any() for view in views):
-        handles.append(
-            Line2D([], [], marker="^", color=CLIPPED, markeredgecolor=INK, linestyle="", label="saturated samples")
-        )
+        look = {"marker": "^", "color": CLIPPED, "markeredgecolor": INK, "linestyle": ""}
+        handles.append(Line2D([], [], **look, label="saturated samples"))
     figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))

@@ -1,4 +1,8 @@
-"""Histograms of a column over clouds of any size, and how many points have which flag."""
+"""Histograms of a column over clouds of any size, and counts of points per flag.
+
+`wavebatch plot histogram` calls `count_values` or `count_flags` and draws the result with `draw_cloud`. Clouds are read
+twice: for the limits, then for the counts.
+"""
 
 from __future__ import annotations
 
@@ -15,42 +19,42 @@ from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
 
-MOST_BINS = 10_000
 FEWEST, MOST_CHOSEN = 20, 120
-"""Bins that are chosen where nobody says how many."""
+"""Least and largest number of bins that are chosen if the user gives none."""
 
 _MOST_STEPS = 1e15
-"""Beyond, half a step is lost in the rounding of a number."""
+"""Most steps from zero for which a float64 still holds half a step."""
 
 PERCENTILES = (5.0, 50.0, 95.0)
+"""Percentiles that a picture marks."""
 
 _LEAST_SPAN = 1e-300
-"""Range below which values are one: numbers are too coarse there to be divided into bins."""
+"""A smaller range counts as a single value: float64 is too coarse there to be divided into bins."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Histogram:
-    """How often which values occur."""
+    """A histogram of one or several series."""
 
     facts: ColumnFacts
     names: tuple[str, ...]
-    """Of the series: clouds, or one name for all of them together."""
+    """Names of the series: clouds, or one name for all clouds."""
     edges: np.ndarray
-    """Of the bins, f8 (b + 1,); the last bin holds its upper edge too."""
+    """Edges of the bins, f8 (b + 1,); the last bin includes its upper edge."""
     counts: np.ndarray
-    """i8 (series, b)."""
+    """Values per series and bin, i8 (series, b)."""
     below: np.ndarray
     """Values below the first edge, i8 (series,)."""
     above: np.ndarray
-    """Values above the last, i8 (series,)."""
+    """Values above the last edge, i8 (series,)."""
     tallies: tuple[Tally, ...]
     percentiles: np.ndarray
-    """PERCENTILES of each series (series, 3), of all values in and out of the edges; NaN where it has none. Of more
-    than a million values those of an even sample."""
+    """PERCENTILES of each series (series, 3), of all values inside and outside the edges; NaN without values. For more
+    than a million values, those of an even sample."""
 
     @property
     def total(self) -> Tally:
-        """Of all series."""
+        """Counts of all series."""
         return sum(self.tallies, Tally())
 
 
@@ -60,9 +64,9 @@ class FlagCounts:
 
     facts: ColumnFacts
     names: tuple[str, ...]
-    """Of the flags."""
+    """Names of the flags."""
     counts: np.ndarray
-    """i8 (16,)."""
+    """Points with each flag, i8 (16,)."""
     clean: int
     """Points without any flag."""
     total: Tally
@@ -76,19 +80,18 @@ def count_values(
     limits: tuple[float, float] | None = None,
     each: bool = False,
 ) -> Histogram:
-    """The histogram of a column over clouds, read twice, in bounded memory.
+    """The histogram of a column of clouds, in bounded memory.
 
-    bins: how many; a column of whole steps gets at most as many, each a whole number of steps wide. Without it by the
-    rule of Freedman and Diaconis. limits: lowest and highest edge; without them all values, or all but far outliers.
-    each: a series per cloud instead of one.
-    Raises InputError where there is no value, ConfigError for wrong bins or limits.
+    bins: number of bins, by default from the rule of Freedman and Diaconis; a column with a fixed step gets at most as
+    many, each a whole number of steps wide. limits: lowest and highest edge, by default all values but far outliers.
+    each: one series per cloud instead of one for all.
+    Raises InputError without any value, ConfigError for a column of flags.
     """
-    _check(bins, limits)
     clouds = Clouds(paths, selection)
     if clouds.facts.is_flags:
         raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
     number = len(paths) if each else 1
-    tallies, samples = [Tally() for _ in range(number)], [EvenSample() for _ in range(number)]
+    tallies, samples = [Tally()] * number, [EvenSample() for _ in range(number)]
     least, largest = math.inf, -math.inf
     for cloud, rows, tally in clouds.read():
         series = cloud if each else 0
@@ -107,13 +110,6 @@ def count_values(
     percentiles = [np.percentile(values, PERCENTILES) if len(values) else np.full(3, np.nan) for values in kept]
     names = tuple(path.name for path in paths) if each or len(paths) == 1 else (f"{len(paths)} clouds",)
     return Histogram(clouds.facts, names, edges, counts, below, above, tuple(tallies), np.stack(percentiles))
-
-
-def _check(bins: int | None, limits: tuple[float, float] | None) -> None:
-    if bins is not None and not 1 <= bins <= MOST_BINS:
-        raise ConfigError(f"bins must lie between 1 and {MOST_BINS}, got {bins}")
-    if limits is not None and not (math.isfinite(limits[1] - limits[0]) and limits[0] < limits[1]):
-        raise ConfigError(f"a range must go up from one finite number to another, got {limits[0]:g}:{limits[1]:g}")
 
 
 def _count(clouds: Clouds, edges: np.ndarray, number: int, each: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,9 +131,9 @@ def place_edges(
 ) -> np.ndarray:
     """Edges of bins over [low, high], f8.
 
-    step: distance of the values that can occur, 0 for any. Bins then hold the same number of them, and so that none
-    looks fuller than its neighbours: edges lie half a step beside values, the outer ones a little outside. exact:
-    without steps the outer edges are low and high; else bins of a width that is chosen lie on multiples of it.
+    step: distance between possible values, 0 for any value. With a step all bins hold the same number of possible
+    values, so that no bin looks fuller than its neighbours, and edges lie half a step from values. Without a step, the
+    outer edges are low and high if `exact` or `bins` is given, else edges are multiples of the chosen width.
     """
     if high - low < _LEAST_SPAN:
         half = max(0.5 * step or 1e-3 * abs(low) or 0.5, high - low)
@@ -150,7 +146,7 @@ def place_edges(
         return (first - 0.5 + stride * np.arange(number + 1)) * step
     if not bins and not exact and max(abs(low), abs(high)) / width < _MOST_STEPS:
         return np.arange(math.floor(low / width), math.ceil(high / width) + 1) * width
-    # Bins narrower than the numbers' own spacing would be empty or twice there.
+    # If bins are narrower than the spacing of float64, linspace repeats edges.
     return np.unique(np.linspace(low, high, (bins or max(1, round((high - low) / width))) + 1))
 
 
@@ -165,7 +161,7 @@ def _choose_width(sample: np.ndarray, span: float) -> float:
 
 
 def count_flags(paths: Sequence[Path], selection: Selection) -> FlagCounts:
-    """How many points of the clouds have which flag. Raises InputError where there is no point."""
+    """Counts the points of the clouds per flag. Raises InputError without any point."""
     counts, clean, total = np.zeros(len(EchoFlag), np.int64), 0, Tally()
     clouds = Clouds(paths, selection)
     for _, rows, tally in clouds.read():

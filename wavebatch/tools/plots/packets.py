@@ -1,4 +1,8 @@
-"""Finding waveforms of a strip: by packet, point or time, by a flag of their echoes, or a few of them spread evenly."""
+"""Search for waveforms of a strip: by packet, point or GPS time, by flags of their echoes, or a few spread evenly.
+
+`wavebatch plot waveform` calls `find_places` and reads the waveforms at these places with `waveform.read_views`. The
+strip is read unit by unit, only as far as needed.
+"""
 
 from __future__ import annotations
 
@@ -13,66 +17,67 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 
 FARTHEST = 1e-3
-"""A pulse further from the time asked for is not meant [s]."""
+"""Largest distance of a pulse from the wanted GPS time [s]."""
 
 MOST = 24
-"""Waveforms of a picture."""
+"""Most waveforms of a picture: more would be too small to read."""
 
 MOST_ON_SHEET = 100
-"""Waveforms of a contact sheet."""
+"""Most waveforms of a contact sheet."""
 
 _BLOCK = 4096
+"""Waveforms that run through the chain at once when flags are searched."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Which waveforms; with nothing set a few of them, spread evenly over the strip."""
+    """Which waveforms to find; by default a few of them, spread evenly over the strip."""
 
-    packets: tuple[tuple[int, int], ...] = ()
-    """First number and the one behind the last, of packets in the order of their first points, from 0 on."""
+    packets: tuple[tuple[int, int | None], ...] = ()
+    """Spans of packets: first number and end (not included; None: the last), in the order of their first points."""
     points: tuple[int, ...] = ()
     """Indices of points in the file."""
     times: tuple[float, ...] = ()
-    """GPS times [s]; of each the nearest pulse."""
+    """GPS times [s]; the nearest pulse of each."""
     flags: int = 0
     """EchoFlag bits: the first waveforms with an echo that has one of them."""
     most: int = 6
-    """Of those with flags, and of those spread evenly."""
+    """Most waveforms with flags, or spread evenly."""
     random: int = 0
-    """Packets drawn at random in place of those spread evenly."""
+    """Number of packets to draw at random; 0: none."""
     seed: int = 0
-    """Of the random ones."""
+    """Seed of the random packets."""
     sheet: bool = False
-    """For a contact sheet, which has room for more."""
+    """Whether the picture is a contact sheet."""
 
     @property
     def limit(self) -> int:
-        """Waveforms that the picture has room for."""
+        """Most waveforms of the picture."""
         return MOST_ON_SHEET if self.sheet else MOST
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a waveform is."""
+    """Where a waveform is in the strip."""
 
     unit: int
     row: int
-    """Of unit.packets."""
+    """Row of unit.packets."""
     packet: int
-    """Its number in the strip; -1 where its first point lies in another unit."""
+    """Number of the packet in the strip; -1 if its first point is in another unit."""
 
 
 def find_places(
     reader: StripReader, scan: StripScan, wanted: Wanted, run: Callable[[WaveformBlock], EchoTable]
 ) -> list[Place]:
-    """Places of the waveforms that are wanted, each once: packets, then points, then times, in the order asked for.
+    """Places of the wanted waveforms, each once: packets, then points, then times, in the given order.
 
-    run: the echoes of a block; only used to look for flags. Raises ConfigError for what the strip does not have and for
-    more than MOST, InputError where it has no waveform at all.
+    run: gives the echoes of a block; only used to search for flags. Raises ConfigError for packets, points and times
+    that the strip does not have and for more waveforms than fit, InputError if the strip has no waveform.
     """
     path = reader.facts.path
     if not scan.packets:
-        raise InputError(f"{path}: holds no waveform that could be drawn; `wavebatch check` says what it holds")
+        raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
     if wanted.flags:
         return _find_flagged(reader, scan, wanted, run)
     searches = [_Number(number) for number in _list_numbers(scan, wanted, str(path))]
@@ -93,23 +98,24 @@ def find_places(
 
 
 def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
-    """Numbers of the packets that are asked for; without any request those spread evenly."""
+    """Numbers of the wanted packets; by default a few, spread evenly."""
     if wanted.random:
         number = min(wanted.random, scan.packets)
         return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
     if not (wanted.packets or wanted.points or wanted.times):
         return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, wanted.limit)).round().astype(int)).tolist()
     numbers: list[int] = []
-    for first, behind in wanted.packets:
-        if not 0 <= first < behind <= scan.packets:
-            asked = str(first) if behind == first + 1 else f"{first}:{behind}"
-            raise ConfigError(f"{path}: there is no packet {asked}; packets are 0 to {scan.packets - 1}")
-        numbers += range(first, min(behind, first + wanted.limit + 1))
+    for first, end in wanted.packets:
+        end = scan.packets if end is None else end
+        if not 0 <= first < end <= scan.packets:
+            span = str(first) if end == first + 1 else f"{first}:{end}"
+            raise ConfigError(f"{path}: there is no packet {span}; packets are 0 to {scan.packets - 1}")
+        numbers += range(first, min(end, first + wanted.limit + 1))
     return numbers
 
 
 def _read_units(reader: StripReader, scan: StripScan) -> Iterator[tuple[Unit, int]]:
-    """Units from the first one on, and how many packets those before it own."""
+    """The units of the strip, each with the number of packets in the units before it."""
     base = 0
     for number in range(reader.unit_count()):
         unit = reader.read_unit(number, scan)
@@ -122,84 +128,77 @@ def _place(unit: Unit, base: int, row: int) -> Place:
     return Place(unit.number, row, base + int(np.count_nonzero(owned[:row])) if owned[row] else -1)
 
 
-class _Number:
-    """Looks for a packet by its number."""
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-        self.place: Place | None = None
-
-    @property
-    def is_done(self) -> bool:
-        """Whether no later unit can have it."""
-        return self.place is not None
-
-    def look(self, unit: Unit, base: int) -> None:
-        owned = np.flatnonzero(unit.packets.owned)
-        if base <= self._number < base + len(owned):
-            self.place = Place(unit.number, int(owned[self._number - base]), self._number)
-
-    def finish(self, path: str) -> Place:
-        if self.place is None:
-            raise InputError(f"{path}: packet {self._number} was not found; the file changed while it was read")
-        return self.place
-
-
-class _Point:
-    """Looks for the packet of a point."""
-
-    def __init__(self, point: int) -> None:
-        self._point = point
-        self.place: Place | None = None
-        self.is_done = False
-        self._flags = 0
-
-    def look(self, unit: Unit, base: int) -> None:
-        own = self._point - unit.start
-        if not 0 <= own < len(unit.points):
-            return
-        self.is_done = True
-        row = int(unit.packet_of_point[own])
-        self._flags = int(unit.point_flags[own])
-        self.place = _place(unit, base, row) if row >= 0 else None
-
-    def finish(self, path: str) -> Place:
-        if self.place is None:
-            why = "a packet that cannot be used" if self._flags & EchoFlag.BROKEN_PACKET else "no waveform"
-            raise ConfigError(f"{path}: point {self._point} has {why}; name another")
-        return self.place
-
-
-class _Time:
-    """Looks for the pulse nearest to a time."""
+class _Search:
+    """Search for one waveform: `look` at unit after unit until `is_done`, then `finish`."""
 
     is_done = False
 
-    def __init__(self, time: float) -> None:
-        self._time, self._away = time, np.inf
+    def __init__(self, wanted: float) -> None:
+        self.wanted = wanted
         self.place: Place | None = None
+
+
+class _Number(_Search):
+    """Search for a packet by its number."""
+
+    def look(self, unit: Unit, base: int) -> None:
+        owned = np.flatnonzero(unit.packets.owned)
+        if base <= self.wanted < base + len(owned):
+            self.place = Place(unit.number, int(owned[self.wanted - base]), self.wanted)
+            self.is_done = True
+
+    def finish(self, path: str) -> Place:
+        if self.place is None:
+            raise InputError(f"{path}: packet {self.wanted} was not found; the file changed while it was read")
+        return self.place
+
+
+class _Point(_Search):
+    """Search for the packet of a point."""
+
+    flags = 0
+
+    def look(self, unit: Unit, base: int) -> None:
+        index = self.wanted - unit.start
+        if 0 <= index < len(unit.points):
+            self.is_done = True
+            row = int(unit.packet_of_point[index])
+            self.flags = int(unit.point_flags[index])
+            self.place = _place(unit, base, row) if row >= 0 else None
+
+    def finish(self, path: str) -> Place:
+        if self.place is None:
+            why = "a packet that cannot be used" if self.flags & EchoFlag.BROKEN_PACKET else "no waveform"
+            raise ConfigError(f"{path}: point {self.wanted} has {why}; name another")
+        return self.place
+
+
+class _Time(_Search):
+    """Search for the pulse nearest to a GPS time; it looks at all units, because times need not be in order."""
+
+    away = np.inf
 
     def look(self, unit: Unit, base: int) -> None:
         points = np.flatnonzero(unit.packet_of_point >= 0)
         with np.errstate(invalid="ignore"):
-            away = np.abs(unit.points["gps_time"][points] - self._time)
+            away = np.abs(unit.points["gps_time"][points] - self.wanted)
         away[np.isnan(away)] = np.inf
-        if len(away) and away.min() < self._away:
+        if len(away) and away.min() < self.away:
             nearest = int(np.argmin(away))
-            self._away = float(away[nearest])
+            self.away = float(away[nearest])
             self.place = _place(unit, base, int(unit.packet_of_point[points[nearest]]))
 
     def finish(self, path: str) -> Place:
-        if self.place is None or self._away > FARTHEST:
-            told = "no pulse has a time" if self.place is None else f"the nearest is {self._away:g} s away"
-            raise ConfigError(f"{path}: no pulse lies within {FARTHEST:g} s of GPS time {self._time!r}: {told}")
+        if self.place is None or self.away > FARTHEST:
+            why = "no pulse has a time" if self.place is None else f"the nearest is {self.away:g} s away"
+            raise ConfigError(f"{path}: no pulse lies within {FARTHEST:g} s of GPS time {self.wanted!r}: {why}")
         return self.place
 
 
 def _find_flagged(
     reader: StripReader, scan: StripScan, wanted: Wanted, run: Callable[[WaveformBlock], EchoTable]
 ) -> list[Place]:
-    """The first waveforms, in the order of the file, with an echo that has one of the flags."""
+    """The first waveforms in the file with an echo that has one of the flags."""
     found: list[Place] = []
     most = min(wanted.most, wanted.limit)
     for unit, base in _read_units(reader, scan):

@@ -1,4 +1,8 @@
-"""Maps: a statistic of a column in the cells of a grid over x and y, over clouds of any size."""
+"""Maps: a statistic of a column in the cells of a grid over x and y, for clouds of any size.
+
+`wavebatch plot map` calls `grid_values` and draws the result with `draw_cloud`. Clouds are read twice: for the grid,
+then for the cells. No result depends on how the points come in pieces.
+"""
 
 from __future__ import annotations
 
@@ -16,25 +20,25 @@ from wavebatch.files.disk.buckets import Buckets, count_buckets
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
 
 STATISTICS = ("mean", "median", "min", "max", "count", "density")
-"""Per cell; `density` is points per square metre."""
+"""Statistics of a cell; `density` is points per square metre."""
 
 MOST_CELLS = 4_000_000
-"""Of a grid: more cannot be seen in a picture."""
+"""Most cells of a grid; a picture cannot show more."""
 
 LEAST_SIZE = 1e-6
-"""Of a cell [m]."""
+"""Least side of a cell [m]: smaller than any scale of LAS coordinates in use."""
 
 LARGEST_EXTENT = 1e12
-"""Of coordinates [m]; beyond they are damage."""
+"""Largest extent of coordinates [m]; larger ones are damage."""
 
 CHOSEN_SIDE = 1500
-"""Most cells along a side of a grid that is chosen."""
+"""Most cells along a side if the size of cells is not given: about the pixels of a picture."""
 
 POINTS_PER_CELL = 6
-"""On average, where points are, in a grid that is chosen."""
+"""Mean number of points in a filled cell if the size of cells is not given."""
 
 SHOWN = (2.0, 98.0)
-"""Percentiles of the cells between which the colours lie."""
+"""Percentiles of the cells at the ends of the colour scale."""
 
 _BUCKET_POINTS = 2_000_000
 _SIDE = 128
@@ -43,7 +47,7 @@ _PLACED = np.dtype([("cell", "<u4"), ("value", "<f8")])
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Square cells of `size` metres from the south-west corner on."""
+    """Square cells of `size` metres, starting at the south-west corner (x, y)."""
 
     x: float
     y: float
@@ -57,7 +61,7 @@ class Grid:
         return self.x, self.x + self.columns * self.size, self.y, self.y + self.rows * self.size
 
     def place(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Cell of each point, row by row from the south, -1 outside, i8 (n,)."""
+        """Cell number of each point, row by row from the south; -1 outside, i8 (n,)."""
         with np.errstate(over="ignore", invalid="ignore"):
             column, row = np.floor((x - self.x) / self.size), np.floor((y - self.y) / self.size)
             inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
@@ -74,16 +78,16 @@ class Raster:
     statistic: str
     grid: Grid
     values: np.ndarray
-    """f8 (rows, columns), the first row is the southernmost; NaN where no point is."""
+    """f8 (rows, columns), the first row is the southernmost; NaN without a point."""
     total: Tally
     outside: int
-    """Points that have a value but do not lie in the grid."""
+    """Points with a value outside the grid."""
     shown: tuple[float, float]
-    """SHOWN percentiles of the cells."""
+    """The percentiles SHOWN of the cells."""
 
     @property
     def label(self) -> str:
-        """What the colours mean, with the unit."""
+        """Label of the colour scale, with the unit."""
         if self.statistic == "count":
             return "points per cell [-]"
         if self.statistic == "density":
@@ -99,11 +103,11 @@ def grid_values(
     size: float | None = None,
     bounds: tuple[float, float, float, float] | None = None,
 ) -> Raster:
-    """The map of a column over clouds, read twice; medians need room in TMPDIR where clouds are large.
+    """The map of a column of clouds; medians of large clouds need room in TMPDIR.
 
-    size: side of a cell [m], else so that about POINTS_PER_CELL points lie in one. bounds: west, south, east, north
-    [m], else all points, or all but far outliers.
-    Raises InputError where there is nothing to draw, ConfigError for wrong options and grids beyond MOST_CELLS.
+    size: side of a cell [m], by default for about POINTS_PER_CELL points per cell. bounds: west, south, east, north
+    [m], by default all points but far outliers.
+    Raises InputError if there is nothing to draw, ConfigError for wrong options and for more than MOST_CELLS cells.
     """
     _check(statistic, size, bounds)
     clouds = Clouds(paths, selection)
@@ -139,7 +143,7 @@ def _check(statistic: str, size: float | None, bounds: tuple[float, float, float
 def _survey(
     clouds: Clouds, bounds: tuple[float, float, float, float] | None
 ) -> tuple[Tally, EvenSample, tuple[float, float, float, float]]:
-    """What becomes of the points, an even sample of places (n, 2), and the box of all of them."""
+    """Counts of the points, an even sample of positions (n, 2), and the box of all positions."""
     total, sample = Tally(), EvenSample()
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for _, rows, tally in clouds.read():
@@ -165,10 +169,10 @@ def _choose_grid(
         south, north = robust_limits(places[:, 1], south, north)
     extent = max(east - west, north - south)
     if not extent <= LARGEST_EXTENT:
-        raise InputError(f"{where}: its points lie {extent:g} m apart, which is damage; give --bounds to draw a part")
+        raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bounds to draw a part")
     if size is None:
         size = _choose_size(places, sample.seen, (west, south), extent)
-    # Cells lie on multiples of their size, so that maps of neighbouring tiles fit together.
+    # Cell borders are multiples of the size, so that maps of neighbouring tiles fit together.
     x, y = (math.floor(start / size) * size for start in (west, south))
     x, y = x - size * (x > west), y - size * (y > south)
     columns, rows = (math.floor((end - start) / size) + 1 for end, start in ((east, x), (north, y)))
@@ -181,14 +185,13 @@ def _choose_grid(
 
 
 def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float) -> float:
-    """Side of a cell [m]: the area on which points are is that of the cells of a coarse grid that hold any."""
+    """Side of a cell [m], from the area that holds points: the filled cells of a coarse grid."""
     if not extent:
         return 1.0
     side = extent / _SIDE
     coarse = np.floor((places - corner) / side)
     inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
     filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
-    # A coarse cell holds a point on average at least, or the area would be that of the cells alone.
     area = filled * side**2
     return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / CHOSEN_SIDE))
 
@@ -199,19 +202,23 @@ def _nice(size: float) -> float:
     return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))
 
 
+_COMBINE = {"mean": (np.add, 0.0), "min": (np.minimum, np.inf), "max": (np.maximum, -np.inf)}
+"""Statistics that are combined value by value: how, and from which start."""
+
+
 class _Cells:
-    """The statistic of every cell, gathered point by point: no result depends on how the points come in pieces."""
+    """Collects the statistic of all cells, piece by piece; points go to disk for medians only."""
 
     def __init__(self, grid: Grid, statistic: str, points: int) -> None:
         self._grid, self._statistic = grid, statistic
         self._count = np.zeros(grid.rows * grid.columns, np.int64)
-        start = {"min": np.inf, "max": -np.inf}.get(statistic, 0.0)
+        self._combine, start = _COMBINE.get(statistic, (None, 0.0))
         self._value = np.full(len(self._count), start)
         self._number = count_buckets(points, _BUCKET_POINTS) if statistic == "median" else 0
         self._buckets = Buckets(_PLACED, max(self._number, 1))
 
     def fill(self, clouds: Clouds) -> tuple[np.ndarray, int]:
-        """Values (rows, columns), and how many points lie in them."""
+        """Values (rows, columns), and the number of points in the grid."""
         with self._buckets:
             for _, rows, _ in clouds.read():
                 cell = self._grid.place(rows["x"], rows["y"])
@@ -221,13 +228,9 @@ class _Cells:
 
     def _add(self, cell: np.ndarray, value: np.ndarray) -> None:
         np.add.at(self._count, cell, 1)
-        if self._statistic == "mean":
+        if self._combine is not None:
             with np.errstate(over="ignore"):
-                np.add.at(self._value, cell, value)
-        elif self._statistic == "min":
-            np.minimum.at(self._value, cell, value)
-        elif self._statistic == "max":
-            np.maximum.at(self._value, cell, value)
+                self._combine.at(self._value, cell, value)
         elif self._statistic == "median":
             placed = np.empty(len(cell), _PLACED)
             placed["cell"], placed["value"] = cell, value
@@ -241,13 +244,13 @@ class _Cells:
         elif self._statistic == "mean":
             self._value[filled] /= self._count[filled]
         elif self._statistic in ("count", "density"):
-            area = 1.0 if self._statistic == "count" else self._grid.size**2
-            self._value = self._count / area
+            self._value = self._count / (1.0 if self._statistic == "count" else self._grid.size**2)
         return np.where(filled, self._value, np.nan)
 
     def _take_medians(self, placed: np.ndarray) -> None:
-        """Median of every cell of a bucket; of an even number of values the mean of the middle two."""
-        pairs = np.empty(len(placed), np.complex128)  # sorted by their real, then their imaginary parts
+        """Medians of the cells of a bucket; of an even number of values the mean of the middle two."""
+        # Complex numbers sort by real, then by imaginary part: one fast sort by cell and value.
+        pairs = np.empty(len(placed), np.complex128)
         pairs.real, pairs.imag = placed["cell"], placed["value"]
         pairs.sort()
         cell, value = pairs.real.astype(np.int64), pairs.imag

@@ -1,4 +1,7 @@
-"""The values of a column over clouds of any size: which points count, robust limits."""
+"""Values of one column of clouds of any size, read piece by piece: selection of points, counts, robust limits.
+
+`histogram` and `raster` read their clouds through `Clouds`.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,25 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike
 
 OUTER = (0.1, 99.9)
-"""Percentiles that a picture must show; what lies far beyond them is damage or a rarity."""
+"""Percentiles that a picture must show; values far outside are damage or very rare."""
 
 MARGIN = 0.25
-"""Shown beyond them, in units of what lies between."""
+"""Also shown on both sides of these percentiles, as a share of the distance between them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which points count."""
+    """Which points are used."""
 
     column: str | None
     """The column; None counts points."""
     flags_with: int = 0
-    """Points need one of these EchoFlag bits; 0 asks for none."""
+    """Points must have one of these EchoFlag bits; 0: any point."""
     flags_without: int = 0
-    """Points must have none of these."""
+    """Points must have none of these EchoFlag bits."""
 
     def choose(self, rows: np.ndarray) -> np.ndarray:
-        """The rows (io.columns.VALUE_DTYPE) whose flags are as they must be."""
+        """The rows (VALUE_DTYPE) with the right flags."""
         if not self.flags_with and not self.flags_without:
             return rows
         keep = (rows["flags"] & np.uint16(self.flags_without)) == 0
@@ -43,20 +46,22 @@ class Selection:
 
 @dataclass(slots=True)
 class Tally:
-    """What became of the points of a cloud."""
+    """Counts of the points of a cloud."""
 
     points: int = 0
     left_out: int = 0
-    """By their flags."""
+    """Points that were left out because of their flags."""
     no_data: int = 0
+    """Points without a value in the column."""
     values: int = 0
+    """Points with a value."""
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
 
 def read_flags(names: Sequence[str]) -> int:
-    """The bits of flags given by name, several in one word separated by commas; raises ConfigError for an unknown."""
+    """The bits of flags given by names, also several separated by commas; ConfigError for an unknown name."""
     bits = 0
     for name in (part.strip().upper() for text in names for part in text.split(",")):
         if name not in EchoFlag.__members__:
@@ -66,10 +71,9 @@ def read_flags(names: Sequence[str]) -> int:
 
 
 class Clouds:
-    """Clouds that are read as one, more than once, one open at a time.
+    """Several clouds that are read as one, as often as needed; only one is open at a time.
 
-    Raises InputError where one cannot be read, ConfigError where one has no such column, another unit for it, or no
-    flags to select by.
+    Raises InputError if a cloud cannot be read, ConfigError if it lacks the column or the flags or units differ.
     """
 
     def __init__(self, paths: Sequence[Path], selection: Selection) -> None:
@@ -83,7 +87,7 @@ class Clouds:
         self.facts: ColumnFacts = check_alike(found)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
-        """Pieces of all clouds: number of the cloud, selected points that have a value, what became of the piece."""
+        """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
         for number, path in enumerate(self.paths):
             with ColumnReader(path, self.selection.column) as reader:
                 for rows in reader.read_pieces():
@@ -92,7 +96,7 @@ class Clouds:
                     yield number, good, Tally(len(rows), len(rows) - len(chosen), len(chosen) - len(good), len(good))
 
     def complain(self, tally: Tally) -> InputError:
-        """Why nothing can be drawn."""
+        """The error that says why nothing can be drawn."""
         where = f"{self.paths[0]}" if len(self.paths) == 1 else f"{self.paths[0]} and {len(self.paths) - 1} more"
         if not tally.points:
             return InputError(f"{where}: holds no points: nothing to draw")
@@ -105,7 +109,7 @@ class Clouds:
 
 
 def robust_limits(sample: np.ndarray, least: float, largest: float) -> tuple[float, float]:
-    """What a picture should show of values from `least` to `largest`, without outliers that would squeeze the rest."""
+    """Limits of a picture of values from `least` to `largest`, without far outliers that would compress the rest."""
     low, high = np.percentile(sample, OUTER)
     margin = MARGIN * (high - low)
     if not margin:

@@ -1,4 +1,8 @@
-"""What a picture of a waveform shows, as arrays: samples, noise, fit, residual, echoes and the vendor's returns."""
+"""The data of a picture of a waveform: samples, noise, fit, residual, echoes and the vendor's returns, as arrays.
+
+`wavebatch plot waveform` reads the views here and draws them with `draw_waveform`. The chain runs as in `wavebatch
+run`; only the curves of the fitted pulses are computed again here.
+"""
 
 from __future__ import annotations
 
@@ -17,26 +21,26 @@ from wavebatch.stages.pulse_tables import clip_level, model_parameters, shape_li
 from wavebatch.tools.plots.packets import Place
 
 FINE = 8
-"""Points of a curve per sample ..."""
+"""Points of a curve per sample."""
 
 MOST_POINTS = 20_000
-"""... as long as they are no more than this."""
+"""Most points of a curve: more than any picture resolves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaveformView:
-    """One waveform and what a chain made of it."""
+    """One waveform and the result of a chain."""
 
     packet: int
-    """Number in the strip; -1 where nobody counted."""
+    """Number in the strip; -1 if not known."""
     point: int
-    """First point of the file that has it."""
+    """Index of the first point of the file with this waveform."""
     gps_time: float
-    """[s]."""
+    """GPS time [s]."""
     time: np.ndarray
-    """Of the samples after the first one [ns], f8 (s,)."""
+    """Times of the samples after the first one [ns], f8 (s,)."""
     samples: np.ndarray
-    """[DN], f8 (s,)."""
+    """Samples [DN], f8 (s,)."""
     clipped: np.ndarray
     """Samples at the digitizer's limit, bool (s,)."""
     baseline: float
@@ -45,20 +49,18 @@ class WaveformView:
     fine: np.ndarray
     """Times of the curves [ns], f8 (q,)."""
     curves: np.ndarray
-    """Each echo's pulse above the baseline [DN], f8 (k, q); (0, q) where the chain fits nothing that could be drawn."""
+    """Pulse of each echo above the baseline [DN], f8 (k, q); (0, q) if the chain fits no pulses."""
     residual: np.ndarray | None
-    """Samples without baseline and fit, in standard deviations of the noise at each, f8 (s,); NaN for clipped samples
-    that the fit exceeds, which say no more than that. None without a fit."""
+    """Samples less baseline and fit, in standard deviations of the noise at each sample, f8 (s,); NaN for clipped
+    samples below the fit, which agree with it. None without a fit."""
     echoes: EchoTable
-    """Of this waveform, k of them."""
+    """The k echoes of this waveform."""
     returns: np.ndarray
-    """Where the input's returns lie [ns], f8 (r,)."""
-    return_points: np.ndarray
-    """Their points, i8 (r,)."""
+    """Times of the returns of the input [ns], f8 (r,)."""
 
     @property
     def spacing(self) -> float:
-        """Time between two samples [ns]; 1 where there is only one."""
+        """Time between two samples [ns]; 1 if there is only one sample."""
         return float(self.time[1]) if len(self.time) > 1 else 1.0
 
     @property
@@ -70,7 +72,7 @@ class WaveformView:
 def read_views(
     reader: StripReader, scan: StripScan, places: Sequence[Place], chain: Chain, system: SystemPulse
 ) -> list[WaveformView]:
-    """The waveforms at `places`, in their order, run through the chain as `wavebatch run` would."""
+    """The waveforms at `places`, in this order, with the result of the chain."""
     views: dict[tuple[int, int], WaveformView] = {}
     for number in sorted({place.unit for place in places}):
         unit = reader.read_unit(number, scan)
@@ -81,10 +83,8 @@ def read_views(
     return [views[place.unit, place.row] for place in places]
 
 
-def build_views(
-    block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int]
-) -> list[WaveformView]:
-    """A view per waveform of the block; packets: their numbers in the strip."""
+def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int]) -> list[WaveformView]:
+    """One view per waveform of the block; packets: their numbers in the strip."""
     system = system.of(block)
     first, decomposer = chain.steps[0], chain.steps[2]
     noise = first.stage.function(block, system, **first.parameters)
@@ -105,13 +105,11 @@ def build_views(
             pulses = _place_pulses(shape, table, system, block.spacing)
             curves = pulses(fine)
             residual = _residual(samples - baseline, pulses(time).sum(axis=0), clipped, std, system.noise_gain)
-        near = np.flatnonzero(block.returns.waveform == row) if block.returns is not None else np.empty(0, np.int64)
+        returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
-                fine, curves, residual, table,
-                returns=block.returns.time[near] if len(near) else np.empty(0),
-                return_points=block.returns.point[near] if len(near) else np.empty(0, np.int64),
+                fine, curves, residual, table, returns,
             )  # fmt: skip
         )
     return views
@@ -133,10 +131,8 @@ def _place_pulses(
     return evaluate
 
 
-def _residual(
-    signal: np.ndarray, fit: np.ndarray, clipped: np.ndarray, std: float, noise_gain: float
-) -> np.ndarray:
-    """Signal minus fit in standard deviations of the noise at each sample (H6, H12), f8 (s,)."""
+def _residual(signal: np.ndarray, fit: np.ndarray, clipped: np.ndarray, std: float, noise_gain: float) -> np.ndarray:
+    """Signal less fit, in standard deviations of the noise at each sample (docs/algorithms.md H6, H12), f8 (s,)."""
     difference = signal - fit
     noise = np.sqrt(std**2 + noise_gain * np.maximum(fit, 0.0))
     return np.where(clipped & (difference <= 0), np.nan, difference / noise)

@@ -1,1 +1,1 @@
-"""What `wavebatch stats` counts: return numbers, separations and flags, by file and area."""
+"""Statistics of the returns of point clouds, for `wavebatch stats`: `returns` counts, `areas` splits by area."""

@@ -1,7 +1,11 @@
-"""Where pulses are counted: cells of a grid or polygons, and sums of their returns per area."""
+"""Counts of returns per area: cells of a grid, or polygons.
+
+`returns` has one AreaTally per division and cloud; `wavebatch stats --area` and `--polygons` choose the divisions.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -12,41 +16,41 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.geojson import Polygon, find_inside
 
 MOST_AREAS = 50_000
-"""Areas of all clouds together that are counted, so that memory is bounded."""
+"""Most areas of all clouds together, so that memory is bounded."""
 
 MOST_NUMBER, MOST_COUNT = 15, 64
-"""Largest return number of LAS; returns of a pulse from which they are counted as one class."""
+"""Largest return number of LAS; pulses with at least so many returns are counted as one class."""
 
 _OUTSIDE = -1
 _HALF = 1 << 30
 
 _FARTHEST = 1e9
-"""No coordinate on Earth is larger; damaged ones are."""
+"""Larger coordinates are damaged: no CRS of the Earth has them."""
 
 
 class Area(NamedTuple):
-    """What an area is called."""
+    """Kind, name and corner of an area."""
 
     kind: str
-    """`cell`, `polygon`, or `outside`: in no polygon, or without a place."""
+    """`cell`, `polygon`, or `outside`: in no polygon, or without a valid position."""
     name: str
-    x: float
-    y: float
+    x: float = math.nan
+    y: float = math.nan
     """Lower left corner of a cell; NaN for others."""
 
 
 class Division(Protocol):
-    """Areas of which every place belongs to one at most."""
+    """A division of the plane into areas that do not overlap."""
 
     def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """A number per place (n,), i8, that tells areas apart; -1 outside of all."""
+        """The number of the area of each position (n,), i8; -1 outside of all areas."""
 
     def describe(self, number: int) -> Area:
-        """What the area of that number is called."""
+        """The area with this number."""
 
 
 class Grid:
-    """Square cells whose borders are multiples of `size`, in the unit of the clouds' coordinates."""
+    """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
 
     def __init__(self, size: float) -> None:
         if not (np.isfinite(size) and size > 0):
@@ -54,7 +58,7 @@ class Grid:
         self.size = float(size)
 
     def find(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """As Division.find; raises ConfigError for cells too small to be numbered where the places are."""
+        """As Division.find; ConfigError if the cells are too small to be numbered at these coordinates."""
         with np.errstate(over="ignore", invalid="ignore"):
             known = (np.abs([x, y]) < _FARTHEST).all(axis=0)
             place = np.floor(np.stack([x, y]) / self.size)
@@ -66,13 +70,13 @@ class Grid:
     def describe(self, number: int) -> Area:
         """As Division.describe."""
         if number == _OUTSIDE:
-            return Area("outside", "outside", float("nan"), float("nan"))
+            return Area("outside", "outside")
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
 
 class PolygonSet:
-    """Polygons; where they overlap, a place belongs to the first."""
+    """Polygons; where polygons overlap, a position belongs to the first one."""
 
     def __init__(self, polygons: Sequence[Polygon]) -> None:
         self.polygons = tuple(polygons)
@@ -88,36 +92,35 @@ class PolygonSet:
     def describe(self, number: int) -> Area:
         """As Division.describe."""
         if number == _OUTSIDE:
-            return Area("outside", "outside", float("nan"), float("nan"))
-        return Area("polygon", self.polygons[number].name, float("nan"), float("nan"))
+            return Area("outside", "outside")
+        return Area("polygon", self.polygons[number].name)
 
 
 @dataclass(frozen=True, slots=True)
 class AreaStats:
-    """What the returns of the pulses of one area are like."""
+    """Statistics of the returns of one area."""
 
     kind: str
-    """`cell`, `polygon`, or `outside`: in no polygon, or without a place."""
     name: str
     x: float
     y: float
-    """Lower left corner of a cell; NaN for others."""
+    """As in Area."""
     points: int
     pulses: int
     returns_per_pulse: float
     by_number: dict[int, float]
-    """Share of the area's returns that have this return number."""
+    """Share of the returns of the area with this return number."""
     by_count: dict[int, float]
-    """Share of its pulses with exactly this many returns."""
+    """Share of the pulses of the area with exactly this many returns."""
     pairs: int
-    """Separations of consecutive returns."""
+    """Pairs of consecutive returns of a pulse."""
     mean: float
     least: float
-    """Of the separations [m]; NaN where there is no pair."""
+    """Mean and least distance of the pairs [m]; NaN without a pair."""
 
 
 class AreaTally:
-    """Sums per area of a division; tallies of several clouds can be merged."""
+    """Sums per area of one division; tallies of several clouds can be merged."""
 
     def __init__(self, division: Division) -> None:
         self.division = division
@@ -129,19 +132,18 @@ class AreaTally:
         return len(self._areas)
 
     def add(self, rows: np.ndarray, first: np.ndarray, before: np.ndarray, distance: np.ndarray) -> None:
-        """Takes in whole pulses: a pulse with all of its returns belongs to the area of its first return.
+        """Adds whole pulses: a pulse belongs, with all its returns, to the area of its first return.
 
-        rows: returns sorted by pulse, then number; first: row of the first return of every pulse; before: rows that
-        have a separation from the next one; distance: that separation [m].
+        rows: returns sorted by pulse, then number; first: row of the first return of each pulse; before: rows that form
+        a pair with the next row; distance: of these pairs [m].
         """
         places = rows["xyz"][first]
-        areas, own = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
+        areas, area = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
         n, number = len(areas), np.diff(np.append(first, len(rows)))
-        of_row = np.repeat(own, number)
+        of_row = np.repeat(area, number)
         by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
-        by_count = np.bincount(
-            own * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT), minlength=n * (MOST_COUNT + 1)
-        )
+        classes = area * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT)
+        by_count = np.bincount(classes, minlength=n * (MOST_COUNT + 1))
         of_pair = of_row[before]
         pairs = np.bincount(of_pair, minlength=n)[:, None]
         least = np.full(n, np.inf)
@@ -150,11 +152,11 @@ class AreaTally:
         self._join(areas, counts, np.stack([np.bincount(of_pair, distance, n), least], axis=1))
 
     def merge(self, other: AreaTally) -> None:
-        """Adds what another cloud has."""
+        """Adds the sums of another cloud."""
         self._join(other._areas, other._counts, other._sums)
 
     def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray) -> None:
-        """areas: ascending, each once."""
+        """Adds sums of areas, which are ascending and unique."""
         known = np.union1d(self._areas, areas)
         if len(known) > MOST_AREAS:
             raise ConfigError(f"more than {MOST_AREAS} areas hold pulses; give a larger --area, or fewer clouds")
@@ -169,7 +171,7 @@ class AreaTally:
         self._sums[new, 1] = np.minimum(self._sums[new, 1], sums[:, 1])
 
     def finish(self) -> list[AreaStats]:
-        """The statistics: cells by column and row, polygons as the file has them, what is outside last."""
+        """The statistics: cells by column and row, polygons in the order of their file, `outside` last."""
         order = np.argsort(np.where(self._areas == _OUTSIDE, np.iinfo(np.int64).max, self._areas), kind="stable")
         return [self._describe(row) for row in order.tolist()]
 
@@ -185,12 +187,12 @@ class AreaTally:
             by_number=share_counts(by_number),
             by_count=share_counts(by_count),
             pairs=number,
-            mean=total / number if number else float("nan"),
-            least=least if number else float("nan"),
+            mean=total / number if number else math.nan,
+            least=least if number else math.nan,
         )
 
 
 def share_counts(counts: np.ndarray) -> dict[int, float]:
-    """Shares of the sum, of those that are not 0."""
+    """Shares of the sum, without zeros."""
     total = int(counts.sum())
     return {int(n): int(counts[n]) / total for n in np.flatnonzero(counts)}

@@ -1,9 +1,13 @@
-"""Statistics of discrete returns: how many a pulse has, how far apart they are, which flags they carry."""
+"""Statistics of discrete returns: returns per pulse, distances between them, flags, and the dead zone of the sensor.
+
+`wavebatch stats` and the examples call `count_returns`. The points of a pulse may lie anywhere in a cloud: rows go to
+buckets on disk by pulse, so that memory is bounded.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,20 +16,27 @@ import numpy as np
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
 from wavebatch.tools.return_stats.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
 
-_BIN = 0.01
-_BINS = 10_000
+_BIN, _BINS = 0.01, 10_000
+"""Width [m] and number of the bins of distances from which the dead zone is found: to 1 cm, up to 100 m."""
+
 _MOST_PAIR = 15
+"""Classes of pairs by return number; the last one holds all higher numbers."""
+
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
 _LEAST_PAIRS = 100
+"""Fewer pairs give no dead zone."""
+
 _EDGE = 0.001
-"""Share of the separations that may lie below what is called the dead zone: a few doubled points do not hide it."""
+"""Share of the distances that may lie within the dead zone, so that a few duplicate points do not hide it."""
 
 _SURE = 3.0
-"""Standard deviations by which more pulses must have the most returns than one less, to be a limit of the sensor."""
+"""A sensor limit is reported if pulses with the most returns outnumber those with one less by so many standard
+deviations; without a limit, counts fall with the number of returns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,35 +46,35 @@ class Separation:
     pairs: int
     mean: float
     least: float
-    """NaN, as the mean, where there is no pair."""
+    """NaN, as the mean, without a pair."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReturnStats:
-    """What the returns of one cloud, or of several together, are like."""
+    """Statistics of the returns of one cloud, or of several together."""
 
     cloud: str
     points: int
     pulses: int
     incomplete: int
-    """Pulses with another number of points than their points say: cut by a tile's border, thinned, or merged."""
+    """Pulses with another number of points than stored in them: cut by the border of a tile, thinned, or merged."""
     pulses_by: str
-    """`gps_time`, or `return_number` where times do not tell pulses apart."""
+    """How pulses were found: `gps_time`, or `return_number` if times do not separate pulses."""
     by_number: dict[int, float]
-    """Share of all returns that have this return number."""
+    """Share of all returns with this return number."""
     by_count: dict[int, float]
     """Share of the pulses with exactly this many returns in the cloud."""
     separations: dict[str, Separation]
-    """`all`, and `1-2`, `2-3` ... by return number. Points passed through without an echo do not count."""
+    """`all`, and `1-2`, `2-3` ... by return number, without points passed through without an echo."""
     dead_zone: float
-    """Distance [m] below which only one separation in a thousand lies; NaN with fewer than a hundred separations."""
+    """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs."""
     hidden: float
-    """Pairs per pulse that would lie in the dead zone if they were as frequent there as up to twice its size."""
+    """Pairs per pulse that the dead zone would hold if they were as frequent there as up to twice its size."""
     flags: dict[str, int] | None
-    """Points per flag of `echo_flags`; None where no cloud has the column."""
+    """Points per flag of `echo_flags`; None if no cloud has the column."""
     warnings: tuple[str, ...]
     areas: tuple[AreaStats, ...] = ()
-    """Of every area that holds a pulse, where areas are asked for; together they have all points and pulses."""
+    """Areas with a pulse, if divisions are given; together they hold all points and pulses."""
 
     @property
     def returns_per_pulse(self) -> float:
@@ -72,14 +83,17 @@ class ReturnStats:
 
 
 def count_returns(
-    clouds: Sequence[Path], skip=None, *, divisions: Sequence[Division] = ()
+    clouds: Sequence[Path],
+    skip: Callable[[InputError], None] | None = None,
+    *,
+    divisions: Sequence[Division] = (),
 ) -> tuple[list[ReturnStats], ReturnStats]:
-    """Statistics of every cloud and of all of them together, whatever the order of their points.
+    """Statistics of each cloud and of all together, for points in any order.
 
-    Pulses are points of equal GPS time in a cloud; where times do not tell them apart, runs of rising return numbers.
-    divisions: into areas, each counted on its own; a pulse belongs, with all of its returns, to the area of its first.
-    skip: called with the InputError of a cloud that cannot be read, which is then left out; None lets it through.
-    Memory does not grow with the clouds; large ones need room in TMPDIR. Raises ConfigError for too many areas.
+    A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
+    divisions: count also by areas; a pulse belongs, with all its returns, to the area of its first return. skip: called
+    with the InputError of a cloud that cannot be read, which is then left out; without it, the error is raised.
+    Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
     """
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
@@ -98,8 +112,8 @@ def count_returns(
     return each, total.finish("total")
 
 
-def pulses_told_apart(reader: ReturnReader) -> bool:
-    """Whether the GPS times of the cloud's first points tell pulses apart."""
+def pulses_told_apart(reader: ReturnReader | CloudReader) -> bool:
+    """Whether the GPS times of the first points separate pulses."""
     if not reader.has_gps_time:
         return False
     rows = next(reader.read_pieces(), None)
@@ -125,13 +139,13 @@ def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
 
 
 class _Keys:
-    """A number per pulse, piece by piece."""
+    """Numbers the pulses, piece by piece."""
 
     def __init__(self, by_time: bool) -> None:
         self._by_time, self._pulse, self._last = by_time, 0, 255
 
     def of(self, rows: np.ndarray) -> np.ndarray:
-        """u8 (n,)."""
+        """Pulse number of each row, u8 (n,)."""
         if self._by_time:
             return time_keys(rows["gps_time"])
         if not len(rows):
@@ -157,7 +171,7 @@ def _sort_by_key(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]
 
 @dataclass(slots=True, eq=False)
 class _Tally:
-    """Sums from which the statistics follow; tallies of several clouds can be merged."""
+    """Sums of one cloud; tallies of several clouds can be merged."""
 
     points: int = 0
     incomplete: int = 0
@@ -172,14 +186,14 @@ class _Tally:
     areas: list[AreaTally] = field(default_factory=list)
 
     def add_points(self, rows: np.ndarray) -> None:
-        """Return numbers and flags of some points."""
+        """Adds return numbers and flags of some points."""
         self.points += len(rows)
         self.by_number += np.bincount(rows["number"], minlength=16)
         if self.flags is not None:
             self.flags += [int(np.count_nonzero(rows["flags"] & np.uint16(flag))) for flag in EchoFlag]
 
     def add_pulses(self, rows: np.ndarray) -> None:
-        """Counts and separations of whole pulses, in any order."""
+        """Adds counts and separations of whole pulses, in any order."""
         if not len(rows):
             return
         rows = rows[np.lexsort((rows["number"], rows["key"]))]
@@ -202,7 +216,7 @@ class _Tally:
             area.add(rows, first, before, distance)
 
     def merge(self, other: _Tally) -> None:
-        """Adds what another cloud has."""
+        """Adds the sums of another cloud."""
         self.points += other.points
         self.incomplete += other.incomplete
         self.methods |= other.methods
@@ -217,10 +231,12 @@ class _Tally:
     def finish(self, cloud: str) -> ReturnStats:
         """The statistics."""
         pulses = int(self.by_count.sum())
-        zone = self._find_dead_zone()
-        near = self._count_between(zone, 2 * zone) if not math.isnan(zone) else 0
-        hidden = near / pulses if pulses and not math.isnan(zone) else float("nan")
-        names = {flag.name: int(n) for flag, n in zip(EchoFlag, self.flags, strict=True)} if self.has_flags else None
+        zone = hidden = self._find_dead_zone()
+        if not math.isnan(zone):
+            hidden = int(self.bins[round(zone / _BIN) : round(2 * zone / _BIN)].sum()) / pulses
+        flags = self.flags
+        if flags is not None:
+            flags = {flag.name: int(number) for flag, number in zip(EchoFlag, flags, strict=True)}
         return ReturnStats(
             cloud=cloud,
             points=self.points,
@@ -232,15 +248,10 @@ class _Tally:
             separations=self._list_separations(),
             dead_zone=zone,
             hidden=hidden,
-            flags=names,
+            flags=flags,
             warnings=tuple(self._warn(zone, hidden, pulses)),
             areas=tuple(stats for area in self.areas for stats in area.finish()),
         )
-
-    @property
-    def has_flags(self) -> bool:
-        """Whether any cloud has flags."""
-        return self.flags is not None
 
     def _list_separations(self) -> dict[str, Separation]:
         table = {"all": _separation(self.pairs.sum(), self.sums.sum(), self.least.min())}
@@ -250,40 +261,36 @@ class _Tally:
         return table
 
     def _find_dead_zone(self) -> float:
-        """Lower edge of the separations, to 1 cm, without the closest thousandth."""
+        """Lower edge of the distances, to 1 cm, without the closest thousandth."""
         total = int(self.bins.sum())
         if total < _LEAST_PAIRS:
-            return float("nan")
+            return math.nan
         return round(int(np.searchsorted(np.cumsum(self.bins), _EDGE * total, side="right")) * _BIN, 2)
-
-    def _count_between(self, low: float, high: float) -> int:
-        a, b = round(low / _BIN), round(high / _BIN)
-        return int(self.bins[a:b].sum())
 
     def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
         lines = []
         if zone >= 0.05 and hidden > 0.001:
             lines.append(
-                f"dead zone: hardly any two returns of a pulse lie closer than {zone:.2f} m ({zone / HALF_C:.1f} ns); "
-                "surfaces nearer to each other are one return. Were they as frequent there as just above it, there "
-                f"would be {hidden:.3f} more returns per pulse"
+                f"dead zone: almost no returns of a pulse lie closer together than {zone:.2f} m ({zone / HALF_C:.1f} "
+                "ns); surfaces that are closer give one return. If returns were as frequent there as just above it, "
+                f"there would be {hidden:.3f} more returns per pulse"
             )
         most = int(np.flatnonzero(self.by_count).max(initial=0))
         last, before = int(self.by_count[most]), int(self.by_count[max(most - 1, 0)])
         if most >= 3 and last - before > _SURE * math.sqrt(last + before):
             lines.append(
                 f"limit: {self.by_count[most] / pulses:.1%} of the pulses have {most} returns, more than have "
-                f"{most - 1}; the sensor records no more than {most}, and what lies behind is not there"
+                f"{most - 1}; the sensor records at most {most}, and later surfaces are missing"
             )
         if self.incomplete > 0.001 * pulses:
             lines.append(
-                f"incomplete: {self.incomplete} of {pulses} pulses have another number of points than their points "
-                "say; tiles and thinned clouds give fewer returns per pulse than the sensor had"
+                f"incomplete: {self.incomplete} of {pulses} pulses have another number of points than stored in them; "
+                "tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
             )
         return lines
 
 
 def _separation(pairs: int, total: float, least: float) -> Separation:
     if not pairs:
-        return Separation(0, float("nan"), float("nan"))
+        return Separation(0, math.nan, math.nan)
     return Separation(int(pairs), float(total) / int(pairs), float(least))

@@ -1,9 +1,14 @@
-"""Scenes to blocks: waveforms with geometry, and the table of the echoes that are in them."""
+"""A scene as blocks of waveforms in memory, each with the table of its true echoes.
+
+Tests, benchmarks and examples call `simulate_block(s)`; `strip` stores the same pulses in files. All random numbers of
+a pulse are drawn here, from the scene, the seed and the number of its seed block: that keeps pulse k of a seed the same
+however many pulses are made and however they are cut into blocks.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -15,25 +20,35 @@ from wavebatch.tools.simulate.render import Recording, paint_echoes, record_coun
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 
 SEED_BLOCK = 8192
-"""Pulses that share one seed: pulse k of a seed is the same whatever else is simulated with it."""
+"""Pulses that share one random generator. Another value makes other strips of the same seed."""
 
 NEIGHBOUR = 4.0
-"""Echoes closer than this many sigma (of the wider one) count as overlapped (ALGORITHMS.md 2.2)."""
+"""Echoes closer than this many sigma (of the wider one) count as overlapped (docs/algorithms.md 2.2)."""
 
 EDGE = 2.0
-"""Echoes closer than this many sigma to an end of the window count as near the edge (H8)."""
+"""Echoes closer than this many sigma to an end of the window count as near the edge (docs/algorithms.md H8)."""
 
 WEAK = 5.0
-"""Echoes below this many standard deviations of the noise count as weak."""
+"""Echoes below this many standard deviations of the noise count as weak, as EchoFlag.WEAK states."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulated:
-    """Waveforms, the echoes in them, and the rays they came along."""
+    """Waveforms, the echoes in them, and the rays along which they came."""
 
     block: WaveformBlock
     truth: EchoTable
     rays: Rays
+
+    def cut(self, start: int, stop: int) -> Simulated:
+        """Pulses [start, stop)."""
+        if start == 0 and stop == len(self.block):
+            return self
+        a, b = np.searchsorted(self.truth.waveform, [start, stop])
+        truth = self.truth.take(np.arange(a, b))
+        rays = Rays(**{field.name: getattr(self.rays, field.name)[start:stop] for field in fields(Rays)})
+        truth = replace(truth, waveform=truth.waveform - np.int32(start))
+        return Simulated(self.block.rows(slice(start, stop)), truth, rays)
 
 
 def simulate_block(
@@ -41,10 +56,10 @@ def simulate_block(
 ) -> tuple[WaveformBlock, EchoTable]:
     """A block of n waveforms of the scene and the truth: an EchoTable of the echoes in it.
 
-    scene: a Scene or the name of one; recording: replaces the scene's own; first: number of the first pulse.
-    The truth's time is the peak [ns after sample 0], amplitude the height of the peak above the baseline [count],
-    sigma the standard deviation of the main lobe [ns]; its flags say OVERLAPPED, NEAR_EDGE, SATURATED and WEAK.
-    The block's origin is the true position of sample 0. Errors: ConfigError for an unknown scene.
+    scene: a Scene or the name of one. recording: replaces the scene's receiver. first: number of the first pulse.
+    In the truth, time is the peak [ns after sample 0], amplitude the height of the peak above the baseline [count] and
+    sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The block's origin is the
+    true position of sample 0. Raises ConfigError for an unknown scene.
     """
     simulated = simulate_pulses(_prepare(scene, recording), n, rng, first=first)
     return simulated.block, simulated.truth
@@ -53,16 +68,20 @@ def simulate_block(
 def simulate_blocks(
     scene: Scene | str, n: int, *, seed: int = 0, recording: Recording | None = None, size: int = SEED_BLOCK
 ) -> Iterator[tuple[WaveformBlock, EchoTable]]:
-    """Blocks of at most `size` waveforms, n in all, and their truth; waveform k depends on scene and seed only.
+    """Blocks of at most `size` waveforms, n in all, and their truth.
 
-    So any two calls agree in the waveforms that both make, whatever their n and size.
+    Waveform k depends on scene and seed only: two calls with other n or size agree in the waveforms that both make.
     """
     scene = _prepare(scene, recording)
     if n < 0 or size < 1:
         raise ConfigError(f"cannot simulate {n} waveforms in blocks of {size}; give numbers above 0")
     for start in range(0, n, size):
-        parts = list(_simulate_range(scene, seed, start, min(start + size, n)))
-        yield parts[0] if len(parts) == 1 else _join(parts, start)
+        stop = min(start + size, n)
+        parts = []
+        for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
+            low = number * SEED_BLOCK
+            parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, SEED_BLOCK)))
+        yield (parts[0].block, parts[0].truth) if len(parts) == 1 else _join(parts, start)
 
 
 def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
@@ -74,7 +93,7 @@ def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | N
 def simulate_pulses(
     scene: Scene, n: int, rng: np.random.Generator, *, first: int = 0, flight: Flight | None = None
 ) -> Simulated:
-    """Block, truth and rays of pulses [first, first + n); the only function that draws random numbers."""
+    """Block, truth and rays of pulses [first, first + n)."""
     recording = scene.recording
     rays = trace_rays(flight or scene.flight or Flight(), scene.terrain, first + np.arange(n))
     drawn = scene.draw(rng, n, rays)
@@ -97,7 +116,7 @@ def simulate_pulses(
 
 
 def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
-    """The truth with flags for what makes an echo hard: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
+    """The truth with flags for what makes an echo hard to find: OVERLAPPED, NEAR_EDGE, SATURATED, WEAK."""
     sigma = truth.sigma.astype(np.float64)
     close = np.diff(truth.time) < NEIGHBOUR * np.maximum(sigma[1:], sigma[:-1])
     close &= np.diff(truth.waveform) == 0
@@ -105,15 +124,10 @@ def flag_truth(truth: EchoTable, recording: Recording) -> EchoTable:
     overlapped[1:] |= close
     overlapped[:-1] |= close
     depth = np.minimum(truth.time, recording.duration - truth.time)
-    flags = np.zeros(len(truth), np.uint16)
-    for flag, where in (
-        (EchoFlag.OVERLAPPED, overlapped),
-        (EchoFlag.NEAR_EDGE, depth < EDGE * sigma),
-        (EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip),
-        (EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise),
-    ):
-        flags[where] |= np.uint16(flag)
-    return replace(truth, flags=flags)
+    truth = truth.with_flags(EchoFlag.OVERLAPPED, overlapped)
+    truth = truth.with_flags(EchoFlag.NEAR_EDGE, depth < EDGE * sigma)
+    truth = truth.with_flags(EchoFlag.SATURATED, truth.amplitude + recording.baseline > recording.clip)
+    return truth.with_flags(EchoFlag.WEAK, truth.amplitude < WEAK * recording.recorded_noise)
 
 
 def _ground_time(truth: EchoTable, n: int, recording: Recording) -> np.ndarray:
@@ -124,31 +138,14 @@ def _ground_time(truth: EchoTable, n: int, recording: Recording) -> np.ndarray:
 
 
 def _prepare(scene: Scene | str, recording: Recording | None) -> Scene:
-    scene = find_scene(scene) if isinstance(scene, str) else scene
+    scene = find_scene(scene)
     return scene if recording is None else replace(scene, recording=recording)
 
 
-def _simulate_range(scene: Scene, seed: int, start: int, stop: int) -> Iterator[tuple[WaveformBlock, EchoTable]]:
-    for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
-        low, high = number * SEED_BLOCK, (number + 1) * SEED_BLOCK
-        simulated = simulate_seed_block(scene, seed, number)
-        if start <= low and high <= stop:
-            yield simulated.block, simulated.truth
-        else:
-            yield cut_block(simulated.block, simulated.truth, max(start - low, 0), min(stop, high) - low)
-
-
-def cut_block(block: WaveformBlock, truth: EchoTable, start: int, stop: int) -> tuple[WaveformBlock, EchoTable]:
-    """Waveforms [start, stop) of the block and their truth."""
-    a, b = np.searchsorted(truth.waveform, [start, stop])
-    part = truth.take(np.arange(a, b))
-    return block.rows(slice(start, stop)), replace(part, waveform=part.waveform - np.int32(start))
-
-
-def _join(parts: list[tuple[WaveformBlock, EchoTable]], first: int) -> tuple[WaveformBlock, EchoTable]:
-    blocks = [block for block, _ in parts]
+def _join(parts: list[Simulated], first: int) -> tuple[WaveformBlock, EchoTable]:
+    blocks = [part.block for part in parts]
     shifts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    truth = EchoTable.concatenate([(truth, int(shift)) for (_, truth), shift in zip(parts, shifts, strict=True)])
+    truth = EchoTable.concatenate((part.truth, int(shift)) for part, shift in zip(parts, shifts, strict=True))
     columns = {
         name: np.concatenate([getattr(block, name) for block in blocks])
         for name in ("samples", "point", "gps_time", "origin", "direction")

@@ -1,4 +1,7 @@
-"""Stands of plants over level ground: a small model that explains published return statistics (ALGORITHMS.md 1.5)."""
+"""Stands of plants over level ground: a small model that explains published statistics of returns.
+
+`scenes.find_scene` makes a scene `canopy.<name>` of each. Source: Ussyshkin and Theriault, docs/algorithms.md 1.5.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ MARGIN = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Canopy:
-    """Scatterers at random heights: each takes a random part of what is left of the pulse, the ground the rest."""
+    """Scatterers at random heights: each takes a random part of the light that is left, the ground the rest."""
 
     height: float
-    """[m]."""
+    """Height of the stand [m]."""
     density: float
     """Scatterers that a pulse meets per metre."""
     cover: float
@@ -29,7 +32,7 @@ class Canopy:
 
     @property
     def duration(self) -> float:
-        """Light's way through the stand and back [ns]."""
+        """Two-way travel time through the stand [ns]."""
         return self.height / AIR_SPEED
 
     def draw(self, rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -62,4 +65,5 @@ CANOPIES: dict[str, tuple[str, Canopy]] = {
     "gemini-24": ("trees 24.5 m high, as the Gemini's table of 22 to 27 m (dead zone 2 m)", Canopy(24.5, 0.16, 1.0)),
 }
 """Meaning and model of every stand: `canopy.<name>` is its scene. Fitted to return-number tables with a threshold of
-6 % of a whole pulse; density and threshold trade against each other, so they say little of real plants."""
+6 % of a whole pulse. Density and threshold can replace each other in the fit: do not read the density of real plants
+from them."""

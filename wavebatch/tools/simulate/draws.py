@@ -1,4 +1,8 @@
-"""How a scene draws its echoes: distributions of amplitude, width and time, each a small object that is called."""
+"""Distributions of the echoes of a scene: amplitude, width and time, each a small object that is called.
+
+`scenes` combines them. Their order of calls to the random generator is part of the result: changing it changes every
+simulated strip.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +16,24 @@ from wavebatch.tools.simulate.render import Recording
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """Echoes of n waveforms, sorted by waveform: what is truth, and what is painted without being an echo."""
+    """Echoes of n waveforms, sorted by waveform, and lobes that are painted but are no echo."""
 
     waveform: np.ndarray
-    """i8 (m,)."""
+    """Row of the waveform, i8 (m,)."""
     time: np.ndarray
+    """Peak after sample 0 [ns], f8 (m,)."""
     amplitude: np.ndarray
+    """[count], f8 (m,)."""
     sigma: np.ndarray
+    """Of the main lobe [ns], f8 (m,)."""
     ghost: np.ndarray | None = None
     """True for lobes that are no echo (ringing); None when all are echoes."""
     constant: np.ndarray | None = None
-    """Level of waveforms that hold one count only, NaN for the others, (n,); None when there is none."""
+    """Level of waveforms whose samples are all equal [count], NaN for the others, (n,); None when there is none."""
 
 
 def tabulate_echoes(time: np.ndarray, amplitude, sigma, ghost: np.ndarray | None = None) -> Drawn:
-    """Arrays (n, k), or what can be spread to them, as a flat, sorted list; NaN times are left out."""
+    """Arrays (n, k), or values broadcast to them, as a flat list sorted by waveform, then time, without NaN times."""
     n, k = time.shape
     order = np.argsort(time, axis=1, kind="stable")
     keep = ~np.isnan(np.take_along_axis(time, order, 1)).ravel()
@@ -135,7 +142,7 @@ class WithGaps:
         return times[np.arange(most + 1) < np.maximum(count, 0)[:, None]]
 
     def _draw_gaps(self, rng, count, most: int, room: float, fallback: float) -> np.ndarray:
-        """Gaps (n, most), 0 behind the last echo. After 32 draws that did not fit, gaps up to `fallback` are used."""
+        """Gaps (n, most), 0 after the last echo. After 32 draws that did not fit, gaps are at most `fallback`."""
         used = np.arange(1, most + 1) < count[:, None]
         gaps = np.zeros((len(count), most))
         todo = np.flatnonzero(count > 1)
@@ -165,7 +172,7 @@ def draw_counts(rng: np.random.Generator, n: int, probabilities: tuple[float, ..
 def widen_on_slope(
     sigma: np.ndarray, amplitude: np.ndarray, incidence: np.ndarray, beam_radius: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """sigma [ns] and amplitude of echoes of a tilted plane (ALGORITHMS.md 1.4): s_alpha = w tan(alpha)/c.
+    """sigma [ns] and amplitude of echoes of a tilted plane: s_alpha = w tan(alpha)/c (docs/algorithms.md 1.4).
 
     incidence: angle between ray and normal [rad]; beam_radius: 1/e^2 radius of the footprint [m]. The energy falls
     with cos(alpha) and is spread over the longer echo.

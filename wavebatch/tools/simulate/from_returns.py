@@ -1,4 +1,8 @@
-"""Waveforms modelled from discrete returns: a Gaussian per return, from its range and intensity."""
+"""A cloud of discrete returns as a strip with modelled waveforms: a Gaussian per return, from range and intensity.
+
+`wavebatch synthesize` calls `synthesize_strip`. The cloud is read once in pieces that cut no pulse, and once before to
+choose the gain where none is given. The other modules of this folder invent echoes; this one takes them from a file.
+"""
 
 from __future__ import annotations
 
@@ -20,26 +24,32 @@ from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
 
 INTENSITIES = ("peak", "reflectance")
+"""Meanings of the intensities of a cloud, see SynthesisOptions."""
+
 MARGIN = 6.0
-"""Time before the first and behind the last return of a pulse, in standard deviations of the pulse."""
+"""Time before the first and after the last return of a pulse, in standard deviations of the pulse."""
+
 FULL_SHARE = 0.8
-"""Without a gain, the strongest return but one in a thousand gets this share of the digitizer's range."""
+"""Share of the digitizer's range that the 99.9 % quantile of the strengths fills where no gain is given."""
 
 _FORMATS = {0: 4, 1: 4, 2: 5, 3: 5, 4: 4, 5: 5, 6: 9, 7: 10, 8: 10, 9: 9, 10: 10}
-_OWN_FIELDS = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location")
+_PACKET_FIELDS = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location")
 _LENGTHS = tuple(64 << number for number in range(8))
-"""Samples of the waveforms, a digitizer for each: pulses that need more keep their points, without a packet."""
+"""Lengths of the waveforms [samples], a digitizer for each. Pulses that need more keep their points without packet."""
 _PIECE = 50_000
+"""Points read at a time. Random numbers are drawn per piece: another value gives other noise."""
 _PAINTED = 1 << 22
+"""Samples painted at a time."""
 _LEVELS = np.geomspace(1e-12, 1e12, 4801)
+"""Edges of the histogram of strengths, 1.2 % apart, from which the gain is chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class Radar:
-    """What the lidar equation needs besides range and reflectance."""
+    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
 
     height: float
-    """Of the sensor, in the heights of the cloud [m]."""
+    """Height of the sensor, in the height system of the cloud [m]."""
     power: float = 1.0
     """Peak power of the pulse [W]; matters only with a gain."""
     aperture: float = 0.1
@@ -47,13 +57,14 @@ class Radar:
     divergence: float = 0.5e-3
     """Full angle of the beam [rad]."""
     efficiency: float = 0.5
+    """Share of the light that the optics let through."""
     attenuation: float = 0.22
-    """Of the air [dB/km]."""
+    """Attenuation by the air [dB/km]."""
 
     def __post_init__(self) -> None:
         positive = (self.power, self.aperture, self.divergence, self.efficiency)
         if not (min(positive) > 0 and self.attenuation >= 0):
-            raise ConfigError("power, aperture, divergence and efficiency must be above 0, attenuation not below")
+            raise ConfigError("power, aperture, divergence and efficiency must be above 0, attenuation not below 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,25 +74,28 @@ class SynthesisOptions:
     intensity: str = "peak"
     """`peak`: intensities are peak amplitudes; `reflectance`: they are reflectances, weakened by the lidar equation."""
     gain: float | None = None
-    """`peak`: DN per unit of intensity; `reflectance`: DN per W, intensity 65535 being reflectance 1. None: chosen so
-    that the strongest returns fill FULL_SHARE of the digitizer's range."""
+    """`peak`: DN per unit of intensity; `reflectance`: DN per W, where intensity 65535 is reflectance 1. None: chosen
+    so that the strongest returns fill FULL_SHARE of the digitizer's range."""
     radar: Radar | None = None
-    """For `reflectance`."""
+    """Needed for `reflectance`, and only there."""
     width: float = 4.7
-    """Full width at half maximum of an echo [ns]; a column echo_width of the cloud comes first."""
+    """Full width at half maximum of an echo [ns]; a column echo_width of the cloud goes first."""
     spacing: float = 1.0
+    """Time between two samples [ns]."""
     bits: int = 8
     baseline: float = 12.0
+    """Level without signal [DN]."""
     noise: float = 0.0
     """Standard deviation before rounding [DN]."""
     seed: int = 0
     internal: bool = True
+    """Packets in the file itself, else in a .wdp next to it."""
 
     def __post_init__(self) -> None:
         if self.intensity not in INTENSITIES:
             raise ConfigError(f"intensity {self.intensity!r} is unknown; choose peak or reflectance")
         if (self.radar is None) != (self.intensity == "peak"):
-            raise ConfigError("intensities that are reflectances, and only they, need the sensor's height")
+            raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
         if not (self.width > 0 and (self.gain is None or self.gain > 0)):
             raise ConfigError("width and gain must be above 0")
         if self.sigma < 0.5 * self.spacing:
@@ -93,7 +107,7 @@ class SynthesisOptions:
         return self.width / FWHM_PER_SIGMA
 
     def recording(self, n_samples: int) -> Recording:
-        """The receiver; ConfigError for what none can be."""
+        """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
         return Recording(
             n_samples=n_samples,
             spacing=self.spacing,
@@ -105,20 +119,40 @@ class SynthesisOptions:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SynthesisSummary:
-    """What a synthesized strip holds."""
+    """Counts of a synthesized strip."""
 
-    points: int
-    packets: int
-    without_packet: int
+    points: int = 0
+    packets: int = 0
+    without_packet: int = 0
     """Points without a packet: their pulse is longer than the longest waveform."""
-    saturated: int
+    saturated: int = 0
     """Returns whose amplitude leaves the digitizer's range."""
-    scattered: int
-    """Pulses with another number of points in a row than their points say."""
-    gain: float
+    scattered: int = 0
+    """Pulses whose number of points in a row is not the number of returns that the points state."""
+    gain: float = 1.0
     """DN per unit of intensity, or per W."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pulses:
+    """n whole pulses with k returns, and the echoes that model them."""
+
+    pulse: np.ndarray
+    """Pulse of each return, i8 (k,)."""
+    time: np.ndarray
+    """Time of each return after sample 0 [ns], f8 (k,)."""
+    amplitude: np.ndarray
+    """[DN], f8 (k,)."""
+    sigma: np.ndarray
+    """Standard deviation of each echo [ns], f8 (k,)."""
+    ray: np.ndarray
+    """Unit vector of each pulse away from the sensor, f8 (n, 3)."""
+    kind: np.ndarray
+    """Index in _LENGTHS of the waveform of each pulse, i8 (n,); len(_LENGTHS) where none is long enough."""
+    is_scattered: np.ndarray
+    """Pulses whose points state another number of returns, bool (n,)."""
 
 
 def synthesize_strip(
@@ -131,25 +165,33 @@ def synthesize_strip(
 ) -> SynthesisSummary:
     """Writes the points of `cloud` with modelled waveforms to `target` (.las or .laz); returns the counts.
 
-    A pulse is a run of points of equal GPS time. Its waveform is a Gaussian per return, at the return's distance behind
+    A pulse is a run of points of equal GPS time. Its waveform is a Gaussian per return, at the return's distance from
     the first one. The ray runs from the first to the last return; lone returns take the direction that the pulses
     around them have at their scan angle. All points keep their coordinates and fields (extra bytes are left out); point
     formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. Memory does not grow with the cloud.
-    Raises InputError where the cloud cannot be read or has no GPS times, or the target exists; nothing remains then.
+    Raises InputError where the cloud cannot be read or has no GPS times, or the target exists; no file remains then.
     """
     options = options or SynthesisOptions()
+    recordings = [options.recording(length) for length in _LENGTHS]
     with ReturnReader(cloud) as reader:
         if not reader.has_gps_time:
-            raise InputError(f"{cloud}: point format {reader.point_format} has no gps times, which tell pulses apart")
+            raise InputError(
+                f"{cloud}: point format {reader.point_format} has no GPS times, which are needed to group points into "
+                "pulses; give a cloud of another point format"
+            )
         gain = _choose_gain(reader, options) if options.gain is None else options.gain
-        job = _Job(reader, options, gain)
+        summary = SynthesisSummary(gain=gain)
         with _open_writer(reader, Path(target), options, overwrite) as writer:
-            for rows, records in _read_pulses(reader):
-                job.write(writer, rows, records)
+            for number, (rows, records) in enumerate(_read_pulses(reader)):
+                rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
+                pulses = _model_pulses(rows, options, gain, reader.path, rng)
+                offset = _write_packets(writer, recordings, pulses, rng)
+                writer.write_points(_fill_points(writer.dtype, records, pulses, offset, options))
+                _count(summary, pulses, recordings[0])
                 if progress:
                     progress(len(rows))
             writer.commit()
-    return SynthesisSummary(**job.counts, gain=gain)
+    return summary
 
 
 def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -168,14 +210,13 @@ def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]
 
 def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
     point_format = _FORMATS[reader.point_format]
-    recording = options.recording(_LENGTHS[0])
     return FullwaveWriter(
         target,
         version="1.3" if point_format < 6 else "1.4",
         point_format=point_format,
         internal=options.internal,
         digitizers=[
-            Digitizer(number, options.bits, length, recording.spacing) for number, length in enumerate(_LENGTHS, 1)
+            Digitizer(number, options.bits, length, options.spacing) for number, length in enumerate(_LENGTHS, 1)
         ],
         scales=reader.scales,
         offsets=reader.offsets,
@@ -206,7 +247,7 @@ def _measure_strength(rows: np.ndarray, options: SynthesisOptions, path: Path) -
 
 
 def _choose_gain(reader: ReturnReader, options: SynthesisOptions) -> float:
-    """The gain that fills the digitizer, from one look at all points."""
+    """The gain that fills the digitizer; reads all points."""
     counts = np.zeros(len(_LEVELS) + 1, np.int64)
     for rows in reader.read_pieces():
         strength = _measure_strength(rows, options, reader.path)
@@ -219,82 +260,75 @@ def _choose_gain(reader: ReturnReader, options: SynthesisOptions) -> float:
     return float(room / _LEVELS[min(level, len(_LEVELS) - 1)])
 
 
-class _Job:
-    """Pieces of a cloud to points and packets, with their counts."""
+def _model_pulses(
+    rows: np.ndarray, options: SynthesisOptions, gain: float, path: Path, rng: np.random.Generator
+) -> _Pulses:
+    """Echoes of the returns, with sample 0 a margin and a random part of a sample before the first of each pulse."""
+    starts = group_pulses(rows["gps_time"], rows["number"])
+    count = np.diff(np.append(starts, len(rows)))
+    pulse = np.repeat(np.arange(len(starts)), count)
+    ray = fit_rays(rows["xyz"], starts, rows["angle"], rows["source"])
+    known = rows["echo_width"] > 0
+    measured = np.where(known, rows["echo_width"], 0) / FWHM_PER_SIGMA
+    sigma = np.where(known, np.clip(measured, 0.5 * options.spacing, 50.0), options.sigma)
+    delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
+    margin = MARGIN * np.maximum.reduceat(sigma, starts)
+    phase = options.spacing * rng.random(len(starts))
+    time = delay + (margin + phase - np.minimum.reduceat(delay, starts))[pulse]
+    n_samples = np.ceil((np.maximum.reduceat(time, starts) + margin) / options.spacing) + 1
+    return _Pulses(
+        pulse=pulse,
+        time=time,
+        amplitude=gain * _measure_strength(rows, options, path),
+        sigma=sigma,
+        ray=ray,
+        kind=np.searchsorted(_LENGTHS, n_samples),
+        is_scattered=rows["total"][starts] != count,
+    )
 
-    def __init__(self, reader: ReturnReader, options: SynthesisOptions, gain: float) -> None:
-        self._path, self._options, self._gain = reader.path, options, gain
-        self._recordings = [options.recording(length) for length in _LENGTHS]
-        self._piece = 0
-        self.counts = {"points": 0, "packets": 0, "without_packet": 0, "saturated": 0, "scattered": 0}
 
-    def write(self, writer: FullwaveWriter, rows: np.ndarray, records: np.ndarray) -> None:
-        """Points and packets of whole pulses."""
-        rng = np.random.default_rng(np.random.SeedSequence(self._options.seed, spawn_key=(self._piece,)))
-        self._piece += 1
-        starts = group_pulses(rows["gps_time"], rows["number"])
-        count = np.diff(np.append(starts, len(rows)))
-        pulse = np.repeat(np.arange(len(starts)), count)
-        rays = fit_rays(rows["xyz"], starts, rows["angle"], rows["source"])
-        sigma = self._choose_sigma(rows)
-        time, duration = self._place(rows, rays, pulse, starts, sigma, rng)
-        strength = self._gain * _measure_strength(rows, self._options, self._path)
-        samples = np.ceil(duration / self._options.spacing) + 1
-        kind = np.searchsorted(_LENGTHS, samples)
-        offset = self._write_packets(writer, kind, pulse, time, strength, sigma, rng)
-        self._count(rows, count, starts, strength, kind, pulse)
-        writer.write_points(self._fill(writer.dtype, records, kind[pulse], offset[pulse], time, rays[pulse]))
+def _write_packets(
+    writer: FullwaveWriter, recordings: list[Recording], pulses: _Pulses, rng: np.random.Generator
+) -> np.ndarray:
+    """Byte offset of every pulse's packet, u8 (n,); 0 where it has none."""
+    offset = np.zeros(len(pulses.kind), np.uint64)
+    for number, recording in enumerate(recordings):
+        same = np.flatnonzero(pulses.kind == number)
+        step = max(_PAINTED // recording.n_samples, 1)
+        for begin in range(0, len(same), step):
+            chosen = same[begin : begin + step]
+            place = np.full(len(offset), -1)
+            place[chosen] = np.arange(len(chosen))
+            waveform = place[pulses.pulse]
+            echoes = waveform >= 0
+            columns = (values[echoes] for values in (waveform, pulses.time, pulses.amplitude, pulses.sigma))
+            signal = paint_echoes(recording, len(chosen), *columns)
+            offset[chosen] = writer.write_packets(record_counts(recording, signal, rng), number + 1)
+    return offset
 
-    def _choose_sigma(self, rows: np.ndarray) -> np.ndarray:
-        """Standard deviation of every echo [ns]: that of the cloud where it has one."""
-        known = rows["echo_width"] > 0
-        measured = np.where(known, rows["echo_width"], 0) / FWHM_PER_SIGMA
-        return np.where(known, np.clip(measured, 0.5 * self._options.spacing, 50.0), self._options.sigma)
 
-    def _place(self, rows, rays, pulse, starts, sigma, rng) -> tuple[np.ndarray, np.ndarray]:
-        """Time of every return after sample 0 [ns], and time that each pulse's waveform must last."""
-        behind = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], rays[pulse]) / HALF_C
-        margin = MARGIN * np.maximum.reduceat(sigma, starts)
-        phase = self._options.spacing * rng.random(len(starts))
-        time = behind + (margin + phase - np.minimum.reduceat(behind, starts))[pulse]
-        return time, np.maximum.reduceat(time, starts) + margin
+def _fill_points(
+    dtype: np.dtype, records: np.ndarray, pulses: _Pulses, offset: np.ndarray, options: SynthesisOptions
+) -> np.ndarray:
+    """Output points: fields of the input, and where their packets are."""
+    points = np.zeros(len(records), dtype)
+    for name in set(dtype.names) & set(records.dtype.names) - set(_PACKET_FIELDS):
+        points[name] = records[name]
+    kind = pulses.kind[pulses.pulse]
+    has = kind < len(_LENGTHS)
+    points["wavepacket_index"] = np.where(has, kind + 1, 0)
+    points["wavepacket_offset"] = np.where(has, offset[pulses.pulse], 0)
+    points["wavepacket_size"] = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
+    points["return_point_wave_location"] = np.where(has, pulses.time * PS_PER_NS, 0)
+    for axis, name in enumerate(("x_t", "y_t", "z_t")):
+        points[name] = np.where(has, -pulses.ray[pulses.pulse, axis] * HALF_C / PS_PER_NS, 0)
+    return points
 
-    def _write_packets(self, writer, kind, pulse, time, strength, sigma, rng) -> np.ndarray:
-        """Byte offset of every pulse's packet, u8; 0 where it has none."""
-        offset = np.zeros(len(kind), np.uint64)
-        for number, recording in enumerate(self._recordings):
-            same = np.flatnonzero(kind == number)
-            step = max(_PAINTED // recording.n_samples, 1)
-            for begin in range(0, len(same), step):
-                chosen = same[begin : begin + step]
-                place = np.full(len(kind), -1)
-                place[chosen] = np.arange(len(chosen))
-                echoes = np.flatnonzero(place[pulse] >= 0)
-                waveform = place[pulse[echoes]]
-                signal = paint_echoes(recording, len(chosen), waveform, time[echoes], strength[echoes], sigma[echoes])
-                offset[chosen] = writer.write_packets(record_counts(recording, signal, rng), number + 1)
-        return offset
 
-    def _count(self, rows, count, starts, strength, kind, pulse) -> None:
-        limit = (1 << self._options.bits) - 1 - self._options.baseline
-        self.counts["points"] += len(rows)
-        self.counts["packets"] += int(np.count_nonzero(kind < len(_LENGTHS)))
-        self.counts["without_packet"] += int(np.count_nonzero(kind[pulse] == len(_LENGTHS)))
-        self.counts["saturated"] += int(np.count_nonzero(strength > limit))
-        self.counts["scattered"] += int(np.count_nonzero(rows["total"][starts] != count))
-
-    def _fill(self, dtype, records, kind, offset, time, rays) -> np.ndarray:
-        """Output points: fields of the input, and where their packets are."""
-        points = np.zeros(len(records), dtype)
-        for name in dtype.names:
-            if name in records.dtype.names and name not in _OWN_FIELDS:
-                points[name] = records[name]
-        has = kind < len(_LENGTHS)
-        size = np.append(_LENGTHS, 0)[kind] * (self._options.bits // 8)
-        points["wavepacket_index"] = np.where(has, kind + 1, 0)
-        points["wavepacket_offset"] = np.where(has, offset, 0)
-        points["wavepacket_size"] = size
-        points["return_point_wave_location"] = np.where(has, time * PS_PER_NS, 0)
-        for axis, name in enumerate(("x_t", "y_t", "z_t")):
-            points[name] = np.where(has, -rays[:, axis] * HALF_C / PS_PER_NS, 0)
-        return points
+def _count(summary: SynthesisSummary, pulses: _Pulses, recording: Recording) -> None:
+    too_long = pulses.kind == len(_LENGTHS)
+    summary.points += len(pulses.pulse)
+    summary.packets += int(np.count_nonzero(~too_long))
+    summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))
+    summary.saturated += int(np.count_nonzero(pulses.amplitude > recording.clip - recording.baseline))
+    summary.scattered += int(np.count_nonzero(pulses.is_scattered))

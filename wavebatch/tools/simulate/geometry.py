@@ -1,4 +1,7 @@
-"""Where simulated pulses go: the aircraft's path, the scan, the ground and its slope, all from the pulse's number."""
+"""Flight, scan and terrain: the ray of each pulse from its number alone, without random numbers.
+
+`blocks` traces the rays of a scene. A scene names its terrain by a key of TERRAINS.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ AIR_SPEED = 0.9997 * HALF_C
 """One-way metres per two-way ns in air, as vendors store it."""
 
 EAST, NORTH, GROUND = 500_000.0, 5_400_000.0, 120.0
-"""Corner of the simulated land [m], UTM zone 32 north."""
+"""South-west corner and height of the simulated land [m], UTM zone 32 north."""
 
 START_TIME = 300_000_000.0
 """Adjusted standard GPS time of the first pulse [s]."""
@@ -23,7 +26,7 @@ class Flight:
     """How the aircraft flies and scans."""
 
     height: float = 800.0
-    """Above the lowest ground [m]."""
+    """Height above the lowest ground [m]."""
     speed: float = 60.0
     """[m/s], towards the east."""
     pulse_rate: float = 100_000.0
@@ -43,7 +46,7 @@ class Rays:
     gps_time: np.ndarray
     """f8 (n,) [s]."""
     ground: np.ndarray
-    """f8 (n, 3) [m]."""
+    """Where the ray meets the ground, f8 (n, 3) [m]."""
     direction: np.ndarray
     """f8 (n, 3) [m/ns], away from the sensor; length AIR_SPEED."""
     distance: np.ndarray

@@ -1,4 +1,7 @@
-"""The stiff and extreme cases (ALGORITHMS.md 3), each a way to draw echoes that break careless decomposers."""
+"""Hazards: ways to draw echoes that break careless decomposers (docs/algorithms.md 3).
+
+Scene `stiff` mixes them, scene `stiff.<name>` holds one. tools.bench.cases uses some of them at stated values.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ Draw = Callable[[np.random.Generator, int, Recording], Drawn]
 
 
 def _middle(rng: np.random.Generator, n: int, recording: Recording, room: float = 10.0) -> np.ndarray:
-    """Times (n, 1) away from both ends by `room` sigma_ref, or as far as the window allows."""
+    """Times (n, 1) at least `room` sigma_ref from both ends, or as far as the window allows."""
     keep = min(room * recording.pulse.sigma, 0.4 * recording.duration)
     return rng.uniform(keep, recording.duration - keep, (n, 1))
 
@@ -42,13 +45,13 @@ def draw_saturated(rng: np.random.Generator, n: int, recording: Recording) -> Dr
 
 
 def draw_huge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
-    """One echo 5 to 500 times as high as the receiver can record: a flat top, its amplitude is anyone's guess."""
+    """One echo 5 to 500 times as high as the receiver can record: a flat top hides its amplitude."""
     strong = (recording.clip - recording.baseline) * _log(rng, 5, 500, (n, 1))
     return tabulate_echoes(_middle(rng, n, recording), strong, recording.pulse.sigma)
 
 
 def draw_ringing(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
-    """One strong echo with lobes of -r at 4 and +r at 8 sigma behind it, r = 1 to 5 %: one target only."""
+    """One strong echo with lobes of -r at 4 and +r at 8 sigma after it, r = 1 to 5 %: one target only."""
     s = recording.pulse.sigma
     time = _middle(rng, n, recording)
     strong = rng.uniform(100, 220, (n, 1))
@@ -72,7 +75,7 @@ def draw_tiny(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
 
 
 def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
-    """A strong echo and one of 6 to 12 counts 3.5 to 8 sigma before or behind it."""
+    """A strong echo and one of 6 to 12 counts 3.5 to 8 sigma before or after it."""
     s = recording.pulse.sigma
     time = _middle(rng, n, recording)
     gap = s * rng.uniform(3.5, 8, (n, 1)) * rng.choice([-1, 1], (n, 1))
@@ -87,7 +90,7 @@ def draw_broad(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
 
 
 def draw_crowd(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
-    """Eight echoes evenly over the window: more than decomposers like to fit."""
+    """Eight echoes evenly over the window: more than most decomposers fit."""
     s = recording.pulse.sigma
     at = np.linspace(4 * s, recording.duration - 4 * s, 8) + 0.3 * s * rng.standard_normal((n, 8))
     return tabulate_echoes(at, _log(rng, 15, 150, (n, 8)), s)
@@ -101,16 +104,11 @@ def draw_constant(rng: np.random.Generator, n: int, recording: Recording) -> Dra
 
 
 HAZARDS: dict[str, Draw] = {
-    "near": draw_near,
-    "saturated": draw_saturated,
-    "huge": draw_huge,
-    "ringing": draw_ringing,
-    "edge": draw_edge,
-    "tiny": draw_tiny,
-    "contrast": draw_contrast,
-    "broad": draw_broad,
-    "crowd": draw_crowd,
-    "constant": draw_constant,
+    draw.__name__.removeprefix("draw_"): draw
+    for draw in (
+        *(draw_near, draw_saturated, draw_huge, draw_ringing, draw_edge),
+        *(draw_tiny, draw_contrast, draw_broad, draw_crowd, draw_constant),
+    )
 }
 """Every hazard by name; scene `stiff` mixes them evenly, scene `stiff.<name>` holds one of them."""
 

@@ -1,4 +1,8 @@
-"""Shapes of the simulated echo: Gaussian, skewed, with ringing, or a sum of components as real sensors have them."""
+"""Shapes of the simulated echo: Gaussian, skewed, with ringing, or a sum of components as real sensors have them.
+
+`render` paints the lobes that `spread_lobes` returns; tools.bench.truth measures the same lobes. Truth is given by the
+main lobe, so both must scale the other lobes alike.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from wavebatch.core.suggest import nearest
 
 @dataclass(frozen=True, slots=True)
 class PulseModel:
-    """The system pulse: a main lobe, Gaussian or skewed, and lobes that follow or flank it.
+    """The system pulse: a main lobe, Gaussian or skewed, and further lobes.
 
     The time of an echo is where the pulse of a flat target has its peak. A target that broadens the main lobe from
     `sigma` to s adds the variance s^2 - sigma^2 to every lobe, and lobes lose height as they widen.
@@ -22,12 +26,12 @@ class PulseModel:
     sigma: float = 2.0
     """Standard deviation of the main lobe for a flat target [ns]."""
     kappa: float = 0.0
-    """Skew of the main lobe (ALGORITHMS.md 0); its peak stays at the echo's time, its height is the amplitude."""
+    """Skew of the main lobe (docs/algorithms.md 0); its peak stays at the echo's time, its height is the amplitude."""
     lobes: tuple[tuple[float, float, float], ...] = ()
     """(height relative to the main lobe, delay [ns], sigma [ns]) of every further lobe."""
 
     def with_ringing(self, share: float) -> PulseModel:
-        """The pulse with a lobe of -share at 4 sigma and +share at 8 sigma behind its peak."""
+        """The pulse with a lobe of -share at 4 sigma and +share at 8 sigma after its peak."""
         if share == 0:
             return self
         ring = ((-share, 4 * self.sigma, self.sigma), (share, 8 * self.sigma, self.sigma))
@@ -40,7 +44,7 @@ PULSES: dict[str, PulseModel] = {
     "riegl": PulseModel(1.85, 0.0, ((0.16, 2.4, 2.2), (0.04, 10.5, 2.2), (0.016, 20.0, 4.0), (0.008, 40.0, 8.0))),
     "leica": PulseModel(3.0, 0.0, ((0.22, 7.2, 4.0), (0.03, 15.0, 5.0))),
 }
-"""Named pulses: riegl has the after-pulse of +4 % at 10.5 ns and the tail of the Q680i, leica its strong skew."""
+"""Named pulses: riegl has the after-pulse of +4 % at 10.5 ns and the tail of the Q680i, leica the skew of the ALS."""
 
 
 def find_pulse(name: str) -> PulseModel:
@@ -50,12 +54,35 @@ def find_pulse(name: str) -> PulseModel:
     return PULSES[name]
 
 
+def shape_pulse(
+    old: PulseModel,
+    *,
+    pulse: str | None = None,
+    sigma: float | None = None,
+    kappa: float | None = None,
+    ringing: float = 0.0,
+) -> PulseModel:
+    """The system pulse `old` with the given values replaced.
+
+    pulse: name of a shape in PULSES; those of real sensors replace sigma too. sigma [ns], kappa: width and skew of the
+    main lobe. ringing: share of the amplitude in lobes 4 and 8 sigma after the peak.
+    Raises ConfigError for an unknown name or a value out of range.
+    """
+    shape = old if pulse is None else find_pulse(pulse)
+    width = sigma or (shape.sigma if shape.lobes else old.sigma)
+    skew = shape.kappa if kappa is None else kappa
+    if not (0 < width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
+        raise ConfigError(f"pulse: sigma {width} ns must be above 0, kappa {skew} and ringing {ringing} within +-0.5")
+    return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)
+
+
 def spread_lobes(
     pulse: PulseModel, time: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Main lobe first, then the others: (time [ns], height [count], sigma [ns]) of echoes whose truth is given.
+    """Lobes of echoes, the main lobe first: (time [ns], height [count], sigma [ns]) of each, (m,).
 
-    time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that the lobes peak at `amplitude`.
+    time, amplitude, sigma: (m,) as in the truth table. Heights are scaled so that all lobes together peak at
+    `amplitude`.
     """
     if not pulse.lobes:
         return [(time, amplitude, sigma)]
@@ -71,15 +98,15 @@ def spread_lobes(
 
 
 def _widen(pulse: PulseModel, sigma: np.ndarray):
-    """(share, delay, width, loss of height relative to the main lobe) of every lobe under a target that broadens."""
+    """(share, delay, width, relative height) of every further lobe when a target broadens the main lobe to sigma."""
     extra = sigma**2 - pulse.sigma**2
-    for share, delay, own in pulse.lobes:
-        width = np.sqrt(np.maximum(own**2 + extra, 0.01 * own**2))
-        yield share, delay, width, own / width * sigma / pulse.sigma
+    for share, delay, flat in pulse.lobes:
+        width = np.sqrt(np.maximum(flat**2 + extra, 0.01 * flat**2))
+        yield share, delay, width, flat / width * sigma / pulse.sigma
 
 
 def _find_peak(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Delay of the peak behind the main lobe's centre [ns] and its height per unit of the main lobe, each (m,)."""
+    """Delay of the peak after the main lobe's centre [ns] and its height per unit of the main lobe, each (m,)."""
     step = pulse.sigma / 200
     x = np.arange(-400, 401)[:, None] * step
     total = main_lobe(x / sigma, pulse.kappa)
@@ -90,7 +117,10 @@ def _find_peak(pulse: PulseModel, sigma: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def main_lobe(z: np.ndarray, kappa: float) -> np.ndarray:
-    """Height of the unit pulse at z = (time - peak)/sigma: exp(-L^2/2), L = log1p(kappa z)/kappa (ALGORITHMS.md 0)."""
+    """Height of the unit pulse at z = (time - peak)/sigma: exp(-L^2/2) with L = log1p(kappa z)/kappa.
+
+    Source: docs/algorithms.md 0.
+    """
     if abs(kappa) < 1e-6:
         return np.exp(-0.5 * z * z)
     inside = kappa * z

@@ -1,4 +1,8 @@
-"""Echoes to raw counts: lobes painted into waveforms, noise, clipping and rounding, all waveforms at once."""
+"""Echoes to raw counts: lobes painted into waveforms, noise, clipping and rounding, all waveforms at once.
+
+`blocks`, `given_echoes` and `from_returns` call `paint_echoes`, then `record_counts`. This is the slow part of a
+simulation: lobes of equal length are painted together, noise is drawn in cache-sized parts.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,7 @@ REACH = 5.5
 """Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""
 
 _ROWS = 2048
-"""Waveforms that get noise at a time: small enough for the cache."""
+"""Waveforms that get noise at a time: few enough for the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,7 @@ class Recording:
 
     @property
     def digitizer(self) -> Digitizer:
-        """The wave packet descriptor."""
+        """The wave packet descriptor of the waveforms."""
         return Digitizer(1, self.bits, self.n_samples, self.spacing)
 
 
@@ -93,9 +97,9 @@ def paint_echoes(
     jobs = []
     for number, (start, height, width) in enumerate(spread_lobes(recording.pulse, time, amplitude, sigma)):
         kappa = recording.pulse.kappa if number == 0 else 0.0
-        behind = (np.expm1(REACH * abs(kappa)) / abs(kappa) if abs(kappa) > 1e-6 else REACH) * width
-        left = np.ceil((behind if kappa < 0 else REACH * width) / recording.spacing).astype(np.int64)
-        right = np.ceil((behind if kappa > 0 else REACH * width) / recording.spacing).astype(np.int64)
+        long_side = (np.expm1(REACH * abs(kappa)) / abs(kappa) if abs(kappa) > 1e-6 else REACH) * width
+        left = np.ceil((long_side if kappa < 0 else REACH * width) / recording.spacing).astype(np.int64)
+        right = np.ceil((long_side if kappa > 0 else REACH * width) / recording.spacing).astype(np.int64)
         length = -(-(left + right + 1) // 8) * 8
         jobs.append((start, height, width, left, length, kappa))
     pad = max((int(job[4].max(initial=8)) for job in jobs), default=8)
@@ -107,8 +111,11 @@ def paint_echoes(
 
 
 def _paint_lobes(canvas, pad, stride, recording, waveform, rank, start, height, width, left, length, kappa) -> None:
-    """Add one lobe per echo. Rows of one rank are distinct, so that a gather, an add and a scatter lose nothing;
-    neighbouring rows share only the padding between them, which nobody reads."""
+    """Adds one lobe per echo.
+
+    Echoes of equal rank lie in different waveforms, so that a gather, an add and a scatter lose nothing. Neighbouring
+    waveforms share only the padding between them, which is not read.
+    """
     position = start / recording.spacing
     sample = np.floor(position).astype(np.int64) - left
     inside = (sample > -pad) & (sample < recording.n_samples)
@@ -135,14 +142,14 @@ def _paint_lobes(canvas, pad, stride, recording, waveform, rank, start, height, 
 def record_counts(
     recording: Recording, signal: np.ndarray, rng: np.random.Generator, constant: np.ndarray | None = None
 ) -> np.ndarray:
-    """Raw counts, unsigned (n, s): signal [count] on its baseline with noise, clipped and rounded.
+    """Raw counts, unsigned (n, s): baseline plus signal [count] plus noise, clipped and rounded.
 
-    constant: level of the waveforms that hold nothing but one count, NaN for the others, (n,).
+    constant: level of the waveforms whose samples are all equal, NaN for the others, (n,).
     """
     n, s = signal.shape
     dtype = {8: np.uint8, 16: np.uint16, 32: np.uint32}[recording.bits]
     counts = np.empty((n, s), dtype)
-    # Half a count is added once, so that the cast rounds to nearest.
+    # Adding half a count makes the cast round to nearest, which is faster than np.rint.
     level = (recording.baseline + 0.5 + recording.baseline_spread * rng.standard_normal(n)).astype(np.float32)
     top = recording.clip + 0.5
     for a in range(0, n, _ROWS):

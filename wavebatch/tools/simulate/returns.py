@@ -1,4 +1,8 @@
-"""The discrete returns that a vendor's software would have put beside the waveforms."""
+"""From true echoes to discrete returns: those of a vendor's software, and those of a receiver with a dead zone.
+
+`strip.simulate_strip` stores the returns of `list_returns` with the waveforms; `strip.simulate_returns` stores those of
+a DiscreteReceiver, which has no waveforms. Both models give a Returns table.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.tools.simulate.render import Recording
 
 WEAKEST = 3.0
@@ -26,40 +31,110 @@ class Returns:
     time: np.ndarray
     """True time after sample 0 [ns], f8 (k,)."""
     amplitude: np.ndarray
-    """[count], f4 (k,); 0 for the stand-in of a pulse without any."""
+    """[count], (k,); 0 for the stand-in return of a pulse without echo."""
     number: np.ndarray
     """Return number from 1, i8 (k,)."""
     total: np.ndarray
     """Number of returns of the pulse, i8 (k,)."""
 
 
-def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, keep_empty: bool) -> Returns:
-    """Returns of n pulses: one per distinguishable echo inside the window, at its true time, at most `most` per pulse.
+@dataclass(frozen=True, slots=True)
+class DiscreteReceiver:
+    """A receiver that is blind for one dead zone after each return (docs/algorithms.md 1.5).
 
-    keep_empty: a pulse without any gets one stand-in return in the middle of its window, else it gets none.
+    A return fires at the first echo from which the amplitudes, summed over one dead zone, exceed the threshold.
+    """
+
+    dead_zone: float = 0.65
+    """Least distance of two returns of a pulse [m]."""
+    threshold: float = 12.0
+    """[count]."""
+    most: int = 4
+    """Returns per pulse."""
+
+    def __post_init__(self) -> None:
+        if not (self.dead_zone > 0 and self.threshold >= 0 and 1 <= self.most <= 15):
+            raise ConfigError(
+                f"receiver: dead zone {self.dead_zone} m must be above 0, threshold {self.threshold} not below 0, "
+                f"and {self.most} returns must be 1 to 15"
+            )
+
+    def list_returns(self, truth: EchoTable, n: int) -> Returns:
+        """The returns that the echoes of n pulses fire."""
+        row, number, amplitude = self.fire(truth.waveform, truth.time * HALF_C, truth.amplitude)
+        pulse = truth.waveform[row].astype(np.int64)
+        return Returns(pulse, truth.time[row], amplitude, number, np.bincount(pulse, minlength=n)[pulse])
+
+    def fire(
+        self, pulse: np.ndarray, distance: np.ndarray, amplitude: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which echoes fire a return.
+
+        Parameters
+        ----------
+        pulse, distance, amplitude : echoes (m,), sorted by pulse, then distance [m]; amplitude [count]
+
+        Returns
+        -------
+        row of the echo that fired, i8 (k,); return number from 1, i8 (k,); summed amplitude, f8 (k,)
+        """
+        m = len(pulse)
+        first = np.searchsorted(pulse, pulse, side="left")
+        end = np.searchsorted(pulse, pulse, side="right")
+        reach = _end_of_dead_zone(distance, distance + self.dead_zone, end)
+        sums = np.concatenate([[0.0], np.cumsum(amplitude, dtype=np.float64)])
+        energy = sums[reach] - sums[:m]
+        loud = np.where(energy > self.threshold, np.arange(m), m)
+        next_loud = np.append(np.minimum.accumulate(loud[::-1])[::-1], m)
+        rows, numbers = [], []
+        at = np.unique(first)
+        for number in range(1, self.most + 1):
+            hit = next_loud[at]
+            hit = hit[hit < end[at]]
+            rows.append(hit)
+            numbers.append(np.full(len(hit), number))
+            at = reach[hit[reach[hit] < end[hit]]]
+        row, number = np.concatenate(rows), np.concatenate(numbers)
+        order = np.argsort(row, kind="stable")
+        return row[order], number[order], energy[row[order]]
+
+
+def _end_of_dead_zone(distance: np.ndarray, limit: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """First row of the same pulse at or beyond the limit, else the row after the pulse, i8 (m,)."""
+    reach = np.arange(len(distance))
+    moving = reach.copy()
+    while len(moving):
+        reach[moving] += 1
+        moving = moving[reach[moving] < end[moving]]
+        moving = moving[distance[reach[moving]] < limit[moving]]
+    return reach
+
+
+def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, keep_empty: bool) -> Returns:
+    """Returns of n pulses as a vendor delivers them with waveforms.
+
+    One per distinguishable echo inside the window, at its true time, at most `most` per pulse. keep_empty: a pulse
+    without echo gets one stand-in return in the middle of its window.
     """
     inside = (truth.time >= 0) & (truth.time <= recording.duration)
     inside &= truth.amplitude >= WEAKEST * recording.recorded_noise
     echoes = truth.take(np.flatnonzero(inside))
-    strongest = _pick_strongest(echoes)
-    pulse, time = echoes.waveform[strongest].astype(np.int64), echoes.time[strongest]
-    amplitude = echoes.amplitude[strongest]
-    number = _count_within(pulse)
-    keep = number < most
-    pulse, time, amplitude = pulse[keep], time[keep], amplitude[keep]
+    echoes = echoes.take(_pick_strongest(echoes))
+    echoes = echoes.take(np.flatnonzero(_count_within(echoes.waveform) < most))
+    pulse, time, amplitude = echoes.waveform.astype(np.int64), echoes.time, echoes.amplitude
     if keep_empty:
         empty = np.flatnonzero(np.bincount(pulse, minlength=n) == 0)
         pulse = np.concatenate([pulse, empty])
-        time = np.concatenate([time, np.full(len(empty), recording.duration / 2)])
-        amplitude = np.concatenate([amplitude, np.zeros(len(empty), np.float32)])
         order = np.argsort(pulse, kind="stable")
-        pulse, time, amplitude = pulse[order], time[order], amplitude[order]
+        pulse = pulse[order]
+        time = np.append(time, np.full(len(empty), recording.duration / 2))[order]
+        amplitude = np.append(amplitude, np.zeros(len(empty), np.float32))[order]
     total = np.bincount(pulse, minlength=n)[pulse]
     return Returns(pulse, time, amplitude, _count_within(pulse) + 1, total)
 
 
 def _pick_strongest(echoes: EchoTable) -> np.ndarray:
-    """Row of the strongest echo of every run of echoes that a discrete receiver cannot tell apart."""
+    """Row of the strongest echo of every run of echoes that a discrete receiver cannot separate."""
     if not len(echoes):
         return np.empty(0, np.int64)
     width = FWHM_PER_SIGMA * echoes.sigma
@@ -71,6 +146,5 @@ def _pick_strongest(echoes: EchoTable) -> np.ndarray:
 
 
 def _count_within(group: np.ndarray) -> np.ndarray:
-    """Position of every row within its run of equal values, from 0."""
-    starts = np.flatnonzero(np.concatenate([[True], np.diff(group) != 0])) if len(group) else np.empty(0, np.int64)
-    return np.arange(len(group)) - np.repeat(starts, np.diff(np.append(starts, len(group))))
+    """Position of every row within its run of equal values, from 0; group: sorted."""
+    return np.arange(len(group)) - np.searchsorted(group, group)

@@ -1,4 +1,7 @@
-"""The scenes: what lies under the laser, as probabilities of echoes, and what draws them."""
+"""The scenes by name: how many echoes their waveforms hold, how strong, wide and far apart, over which terrain.
+
+`wavebatch simulate` lists them, `blocks` draws from them. A scene is data; tools.bench adds scenes with another `draw`.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ from wavebatch.tools.simulate.draws import (
 )
 from wavebatch.tools.simulate.geometry import GROUND, Flight, Rays
 from wavebatch.tools.simulate.hazards import HAZARDS, draw_hazards
-from wavebatch.tools.simulate.pulses import PulseModel, find_pulse
+from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording
 
 GROUND_REFLECTS, ROOFS_REFLECT = 0.2, 0.4
@@ -35,7 +38,7 @@ LEAST_ROOF = 1.0
 """Height above the ground from which a surface is a roof [m]."""
 
 AIR_ATTENUATION = 0.22
-"""Of the air in scenes with light, one way [dB/km]."""
+"""Attenuation by the air in scenes with light, one way [dB/km]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,25 +52,25 @@ class Scene:
     amplitude: LogUniform | LogNormal | Mixture = LogNormal(25.0, 0.8, 5.0, 230.0)
     width: FoldedWidth | HalfBroadened = FoldedWidth(0.35, 0.105)
     times: WithinDepth | WithGaps = WithinDepth(24.0)
-    """24 ns deep, the decomposer of ALGORITHMS.md 4.3 gets the exact counts that are stated there (.96, .61)."""
+    """With 24 ns, the decomposer of docs/algorithms.md 4.3 gets the share of exact counts stated there (.96, .61)."""
     terrain: str = "flat"
-    """Name of the ground's shape, see simulate.geometry."""
+    """A key of geometry.TERRAINS."""
     divergence: float = 0.0
     """Full angle of the beam between the 1/e^2 points [mrad]; above 0, slopes widen the echoes."""
     light: float = 0.0
-    """amplitude sigma range^2 of a white surface that faces the sensor, before the air takes its share [count ns m2].
-    Above 0, echoes are as bright as Lambertian surfaces of GROUND_REFLECTS and ROOFS_REFLECT are.
-    """
+    """amplitude sigma range^2 of a white surface that faces the sensor, without attenuation by the air [count ns m2].
+    Above 0, amplitudes are those of Lambertian surfaces with GROUND_REFLECTS and ROOFS_REFLECT."""
     flight: Flight | None = None
-    """How the scene is flown over; None: as all others are."""
+    """None: the default Flight."""
     hazards: tuple[str, ...] = ()
     """Names of hazards that replace all of the above."""
     canopy: Canopy | None = None
     """A stand of plants that replaces counts, amplitude, width and times."""
     recording: Recording = field(default_factory=Recording)
+    """The receiver."""
 
     def draw(self, rng: np.random.Generator, n: int, rays: Rays) -> Drawn:
-        """Echoes of n waveforms that came along n rays."""
+        """Echoes of n waveforms along n rays."""
         if self.hazards:
             return draw_hazards(rng, n, self.recording, self.hazards)
         if self.canopy:
@@ -93,11 +96,7 @@ def _light_surfaces(light: float, rays: Rays) -> np.ndarray:
     return light * reflectance * transmit(rays.distance, AIR_ATTENUATION) / rays.distance**2
 
 
-def _scenes(*scenes: Scene) -> dict[str, Scene]:
-    return {scene.name: scene for scene in scenes}
-
-
-SCENES: dict[str, Scene] = _scenes(
+_SCENES = (
     Scene(
         "flat",
         "bare, level ground: one echo of the system's width in every waveform",
@@ -106,13 +105,13 @@ SCENES: dict[str, Scene] = _scenes(
     ),
     Scene(
         "urban",
-        "streets, roofs, few trees: 0, 1, 2, 3 echoes at 5, 85, 8, 2 % (`open/urban` of ALGORITHMS.md 4.3)",
+        "streets, roofs, few trees: 0, 1, 2, 3 echoes at 5, 85, 8, 2 % (`open/urban` of docs/algorithms.md 4.3)",
         counts=(0.05, 0.85, 0.08, 0.02),
         terrain="blocks",
     ),
     Scene(
         "forest",
-        "canopy over ground: 0 to 5 echoes at 2, 25, 35, 25, 10, 3 % (ALGORITHMS.md 4.3)",
+        "canopy over ground: 0 to 5 echoes at 2, 25, 35, 25, 10, 3 % (docs/algorithms.md 4.3)",
         counts=(0.02, 0.25, 0.35, 0.25, 0.10, 0.03),
         terrain="hills",
     ),
@@ -127,8 +126,8 @@ SCENES: dict[str, Scene] = _scenes(
     Scene(
         "village",
         "gable roofs of 0 to 60 degrees on level ground under a green laser: pulse of 1.5 ns, sampled every 0.5 ns, "
-        "beam of 1.1 mrad, 640 m, so that widths tell angles; the ground reflects 20 %, roofs 40 %, the air takes "
-        "0.22 dB/km, the calibration constant is 4 / 1.4e8",
+        "beam of 1.1 mrad, 640 m, so that widths depend on the angle; the ground reflects 20 %, roofs 40 %, "
+        "the air takes 0.22 dB/km, the calibration constant is 4 / 1.4e8",
         width=FoldedWidth(0.0, 0.0),
         terrain="village",
         divergence=1.1,
@@ -138,7 +137,8 @@ SCENES: dict[str, Scene] = _scenes(
     ),
     Scene(
         "shore",
-        "water-free shore: wet sand that returns 4 to 25 counts beside dry sand, empty waveforms over pools, few reeds",
+        "water-free shore: wet sand that returns 4 to 25 counts next to dry sand, empty waveforms over pools, "
+        "few reeds",
         counts=(0.25, 0.67, 0.07, 0.01),
         amplitude=Mixture(0.5, LogUniform(4.0, 25.0), LogNormal(90.0, 0.4, 30.0, 230.0)),
         width=FoldedWidth(0.2, 0.03),
@@ -168,12 +168,18 @@ SCENES: dict[str, Scene] = _scenes(
         recording=Recording(n_samples=96),
     ),
 )
+
+SCENES: dict[str, Scene] = {scene.name: scene for scene in _SCENES}
 """Every scene by name."""
 
 
-def find_scene(name: str) -> Scene:
-    """The scene called `name`, also `stiff.<hazard>` and `canopy.<stand>`; ConfigError with the nearest name when there
-    is none."""
+def find_scene(name: str | Scene) -> Scene:
+    """The scene of that name, also `stiff.<hazard>` and `canopy.<stand>`; a Scene is returned as it is.
+
+    Raises ConfigError, with the nearest name, for an unknown name.
+    """
+    if isinstance(name, Scene):
+        return name
     if name in SCENES:
         return SCENES[name]
     head, _, hazard = name.partition(".")
@@ -186,25 +192,3 @@ def find_scene(name: str) -> Scene:
         return Scene(name, meaning, canopy=canopy, recording=window)
     names = [*SCENES, *(f"stiff.{known}" for known in HAZARDS), *(f"canopy.{known}" for known in CANOPIES)]
     raise ConfigError(f"scene {name!r} is unknown; {nearest(name, names)}")
-
-
-def shape_pulse(
-    old: PulseModel,
-    *,
-    pulse: str | None = None,
-    sigma: float | None = None,
-    kappa: float | None = None,
-    ringing: float = 0.0,
-) -> PulseModel:
-    """The system pulse `old` with what is given in its place.
-
-    pulse: name of a shape in PULSES; those of a real sensor bring their own sigma. sigma [ns]: of the main lobe.
-    kappa: skew of the main lobe. ringing: share of the amplitude in lobes 4 and 8 sigma behind the peak.
-    Raises ConfigError for an unknown name or a value that no pulse has.
-    """
-    shape = old if pulse is None else find_pulse(pulse)
-    width = sigma or (shape.sigma if shape.lobes else old.sigma)
-    skew = shape.kappa if kappa is None else kappa
-    if not (0 < width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
-        raise ConfigError(f"pulse: sigma {width} ns must be above 0, kappa {skew} and ringing {ringing} within +-0.5")
-    return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)

@@ -1,22 +1,29 @@
-"""Scenes to strips: points with wave packets as vendors deliver them, and the truth beside them."""
+"""A scene as a file: a strip with wave packets and its truth, or a cloud of discrete returns without packets.
+
+`wavebatch simulate` calls `simulate_strip` and `simulate_returns`. Both store the pulses of `blocks`, one seed block at
+a time, so that memory does not grow with the number of pulses. Random numbers of storage (what the points get wrong)
+come from a generator of their own: the waveforms do not depend on StripOptions.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.cloud.return_io import ReturnWriter
+from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
-from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, cut_block, simulate_seed_block
-from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight, Rays
-from wavebatch.tools.simulate.returns import Returns, list_returns
+from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
+from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight
+from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, list_returns
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 from wavebatch.tools.simulate.truth import TruthWriter
 
@@ -32,13 +39,13 @@ WKT = (
 
 @dataclass(frozen=True, slots=True)
 class StripOptions:
-    """How a simulated strip is stored; what it holds is the scene's matter."""
+    """How a simulated strip is stored; its contents are those of the scene."""
 
     version: str | None = None
     """LAS version; None: 1.3 for point formats 4 and 5, 1.4 for 9 and 10."""
     point_format: int = 4
     internal: bool = True
-    """Packets in the file itself, else in a .wdp beside it."""
+    """Packets in the file itself, else in a .wdp next to it."""
     scale: float = 0.001
     """Unit of the stored coordinates [m]."""
     without_waveform: float = 0.01
@@ -59,16 +66,31 @@ class StripOptions:
         """The LAS version that is written."""
         return self.version or ("1.3" if self.point_format < 6 else "1.4")
 
+    @property
+    def most_returns(self) -> int:
+        """Returns per pulse that the point format can number."""
+        return 7 if self.point_format < 6 else 15
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True)
 class StripSummary:
-    """What a simulated strip holds."""
+    """Counts of a simulated strip."""
 
-    pulses: int
-    packets: int
-    points: int
-    echoes: int
+    pulses: int = 0
+    packets: int = 0
+    points: int = 0
+    echoes: int = 0
     """True echoes in the packets."""
+
+
+@dataclass(slots=True)
+class ReturnSummary:
+    """Counts of a simulated cloud of discrete returns."""
+
+    pulses: int = 0
+    points: int = 0
+    empty: int = 0
+    """Pulses without any return."""
 
 
 def simulate_strip(
@@ -86,43 +108,94 @@ def simulate_strip(
     """Writes a strip of the scene to `target` (.las or .laz), and the truth to the .npz `truth`; returns the counts.
 
     Waveforms and truth of pulse k depend on scene and seed only, not on how many are made. The points are a vendor's
-    returns: one per distinguishable echo, all returns of a pulse with one packet, their `return location` shifted
-    together by up to half a sample, so that sample 0 lies up to 7.5 cm from where the location says.
+    returns: one per distinguishable echo, all returns of a pulse with one packet. The `return location` of a pulse is
+    shifted by up to half a sample, so that the stored position of sample 0 is wrong by up to 7.5 cm.
     progress: called with the number of pulses done since the last call. Memory does not grow with `pulses`.
-    Raises ConfigError for wrong values, InputError when a file exists or cannot be written; nothing remains then.
+    Raises ConfigError for wrong values, InputError when a file exists or cannot be written; no file remains then.
     """
-    scene = find_scene(scene) if isinstance(scene, str) else scene
-    options = options or StripOptions()
-    if pulses < 1:
-        raise ConfigError(f"a strip needs at least one pulse, not {pulses}")
-    notes = TruthWriter(truth, overwrite=overwrite) if truth else None
+    scene, options = find_scene(scene), options or StripOptions()
+    parts = _simulate_parts(scene, pulses, seed, flight, progress)
+    truth_writer = TruthWriter(truth, overwrite=overwrite) if truth else None
+    summary = StripSummary()
     try:
         with _open_writer(target, scene, options, overwrite) as writer:
-            summary = StripSummary(0, 0, 0, 0)
-            for number in range(-(-pulses // SEED_BLOCK)):
-                n = min(SEED_BLOCK, pulses - number * SEED_BLOCK)
-                simulated = cut_pulses(simulate_seed_block(scene, seed, number, flight), n)
+            for number, simulated in enumerate(parts):
                 rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, 1)))
-                summary = _write_block(writer, notes, simulated, scene, options, rng, summary)
-                if progress:
-                    progress(n)
-            _publish(writer, notes, _describe(scene, seed, summary))
+                _write_part(writer, truth_writer, simulated, scene, options, rng, summary)
+            if truth_writer:
+                truth_writer.publish(_describe(scene, seed, summary))
+            try:
+                writer.commit()
+            except BaseException:  # both files or none
+                if truth_writer:
+                    truth_writer.withdraw()
+                raise
     finally:
-        if notes:
-            notes.discard()
+        if truth_writer:
+            truth_writer.discard()
     return summary
 
 
-def _publish(writer: FullwaveWriter, notes: TruthWriter | None, meta: dict) -> None:
-    """Both files or none: the strip appears last."""
-    if notes:
-        notes.publish(meta)
-    try:
+def simulate_returns(
+    scene: Scene | str,
+    target: Path,
+    *,
+    pulses: int,
+    seed: int = 0,
+    receiver: DiscreteReceiver | None = None,
+    options: StripOptions | None = None,
+    flight: Flight | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int], object] | None = None,
+) -> ReturnSummary:
+    """Writes the returns that a discrete receiver has of the scene to `target` (.las or .laz); returns the counts.
+
+    Pulse k of a scene and seed meets the same echoes as in simulate_strip. A return lies at the first echo that fires
+    it; its intensity is ten times the summed amplitude. Of `options` only scale and point_format are used (4, 5, 9, 10
+    become 1, 3, 6, 8). Errors as in simulate_strip.
+    """
+    scene, options, receiver = find_scene(scene), options or StripOptions(), receiver or DiscreteReceiver()
+    if receiver.most > options.most_returns:
+        raise ConfigError(
+            f"point formats 4 and 5 number {options.most_returns} returns, the receiver has {receiver.most}; "
+            "take 9 or 10"
+        )
+    parts = _simulate_parts(scene, pulses, seed, flight, progress)
+    summary = ReturnSummary()
+    with ReturnWriter(
+        target,
+        point_format=WITHOUT_WAVES[options.point_format],
+        scales=(options.scale,) * 3,
+        offsets=(EAST, NORTH, 0.0),
+        wkt=WKT,
+        overwrite=overwrite,
+    ) as writer:
+        for simulated in parts:
+            n = len(simulated.block)
+            returns = receiver.list_returns(simulated.truth, n)
+            writer.write(_fill_points(writer.dtype, simulated, returns, options.scale))
+            summary.pulses += n
+            summary.points += len(returns.pulse)
+            summary.empty += n - len(np.unique(returns.pulse))
         writer.commit()
-    except BaseException:
-        if notes:
-            notes.withdraw()
-        raise
+    return summary
+
+
+def _simulate_parts(
+    scene: Scene, pulses: int, seed: int, flight: Flight | None, progress: Callable[[int], object] | None
+) -> Iterator[Simulated]:
+    """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
+    if pulses < 1:
+        raise ConfigError(f"a strip needs at least one pulse, not {pulses}")
+
+    def parts() -> Iterator[Simulated]:
+        for first in range(0, pulses, SEED_BLOCK):
+            n = min(SEED_BLOCK, pulses - first)
+            yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
+            if progress:
+                progress(n)
+
+    return parts()
 
 
 def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: bool) -> FullwaveWriter:
@@ -140,130 +213,118 @@ def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: b
     )
 
 
-def cut_pulses(simulated: Simulated, n: int) -> Simulated:
-    """The first n pulses."""
-    if n == len(simulated.block):
-        return simulated
-    rays = simulated.rays
-    columns = {name: getattr(rays, name)[:n] for name in Rays.__slots__}
-    return Simulated(*cut_block(simulated.block, simulated.truth, 0, n), Rays(**columns))
-
-
-def _write_block(
+def _write_part(
     writer: FullwaveWriter,
-    notes: TruthWriter | None,
+    truth_writer: TruthWriter | None,
     simulated: Simulated,
     scene: Scene,
     options: StripOptions,
     rng: np.random.Generator,
-    before: StripSummary,
-) -> StripSummary:
+    summary: StripSummary,
+) -> None:
+    """Packets, points and truth of a seed block; adds to the summary."""
     block, n = simulated.block, len(simulated.block)
-    most = 7 if options.point_format < 6 else 15
-    returns = list_returns(simulated.truth, n, scene.recording, most, keep_empty=options.keep_empty)
+    returns = list_returns(simulated.truth, n, scene.recording, options.most_returns, keep_empty=options.keep_empty)
+    # Always a whole block of random numbers: pulse k gets the same whatever the number of pulses.
     jitter = rng.uniform(-0.5, 0.5, SEED_BLOCK)[:n] * scene.recording.spacing
     stored = rng.random(SEED_BLOCK)[:n] >= options.without_waveform
     stored &= np.bincount(returns.pulse, minlength=n) > 0
     rows = np.flatnonzero(stored)
     offset = np.zeros(n, np.uint64)
     offset[rows] = writer.write_packets(block.samples[rows], 1)
-    writer.write_points(_fill_points(writer.dtype, simulated, returns, jitter, stored, offset, options))
-    packet = np.full(n, -1)
-    packet[rows] = before.packets + np.arange(len(rows))
+    points = _fill_points(writer.dtype, simulated, returns, options.scale)
+    _fill_packets(points, block, returns, jitter, stored, offset)
+    writer.write_points(points)
     kept = simulated.truth.take(np.flatnonzero(stored[simulated.truth.waveform]))
-    if notes:
-        notes.add({"packet_byte_offset": offset[rows], "packet_gps_time": block.gps_time[rows]})
-        notes.add(_list_truth(kept, simulated, packet, offset))
-    return StripSummary(
-        before.pulses + n, before.packets + len(rows), before.points + len(returns.pulse), before.echoes + len(kept)
-    )
+    if truth_writer:
+        packet = summary.packets + np.cumsum(stored) - 1
+        truth_writer.add({"packet_byte_offset": offset[rows], "packet_gps_time": block.gps_time[rows]})
+        truth_writer.add(_list_truth(Simulated(block, kept, simulated.rays), packet, offset))
+    summary.pulses += n
+    summary.packets += len(rows)
+    summary.points += len(returns.pulse)
+    summary.echoes += len(kept)
 
 
-def _fill_points(
-    dtype: np.dtype,
-    simulated: Simulated,
-    returns: Returns,
-    jitter: np.ndarray,
-    stored: np.ndarray,
-    offset: np.ndarray,
-    options: StripOptions,
-) -> np.ndarray:
-    """Point records of the returns, every field set."""
+def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale: float) -> np.ndarray:
+    """Point records of the returns: every field but those of the packets."""
     block, pulse = simulated.block, returns.pulse
     points = np.zeros(len(pulse), dtype)
-    place_points(points, locate(block, pulse, returns.time), options)
+    xyz = _locate(block, pulse, returns.time)
+    for axis, (name, origin) in enumerate((("X", EAST), ("Y", NORTH), ("Z", 0.0))):
+        values = np.rint((xyz[:, axis] - origin) / scale)
+        if len(values) and np.abs(values).max() >= 2**31:
+            raise ConfigError(f"a scale of {scale} m is too fine for a strip this long; choose a coarser one")
+        points[name] = values
     points["intensity"] = np.clip(np.rint(10 * returns.amplitude), 0, 65535)
     points["gps_time"] = block.gps_time[pulse]
     points["point_source_id"] = 1
-    last = returns.number == returns.total
-    set_returns(points, returns, np.where(last, 2, 5), simulated.rays.scan_angle[pulse])
     for number, name in enumerate(("red", "green", "blue", "nir")):
         if name in dtype.names:
             points[name] = 20_000 + 9_000 * number + 20 * (pulse % 256)
-    has = stored[pulse]
-    samples = block.samples
-    points["wavepacket_index"] = has
-    points["wavepacket_offset"] = np.where(has, offset[pulse], 0)
-    points["wavepacket_size"] = np.where(has, samples.shape[1] * samples.itemsize, 0)
-    points["return_point_wave_location"] = np.where(has, (returns.time + jitter[pulse]) * PS_PER_NS, 0)
-    for axis, name in enumerate(("x_t", "y_t", "z_t")):
-        points[name] = np.where(has, -block.direction[pulse, axis] / PS_PER_NS, 0)
-    return points
-
-
-def locate(block: WaveformBlock, pulse: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """True position of what lies `time` ns after sample 0 of the pulses, f8 (k, 3) [m]."""
-    return block.origin[pulse] + time[:, None] * block.direction[pulse]
-
-
-def place_points(points: np.ndarray, xyz: np.ndarray, options: StripOptions) -> None:
-    """Coordinates as the file stores them."""
-    for axis, (name, origin) in enumerate((("X", EAST), ("Y", NORTH), ("Z", 0.0))):
-        values = np.rint((xyz[:, axis] - origin) / options.scale)
-        if len(values) and np.abs(values).max() >= 2**31:
-            raise ConfigError(f"a scale of {options.scale} m is too fine for a strip this long; choose a coarser one")
-        points[name] = values
-
-
-def set_returns(points: np.ndarray, returns: Returns, kind: np.ndarray, scan_angle: np.ndarray) -> None:
-    """Return numbers, class, scan angle and flags in the fields of the point format."""
-    if "classification_flags" in points.dtype.names:
+    ground_or_plants = np.where(returns.number == returns.total, 2, 5)
+    scan_angle = simulated.rays.scan_angle[pulse]
+    if "classification_flags" in dtype.names:
         points["bit_fields"] = returns.number | returns.total << 4
-        points["classification"] = kind
+        points["classification"] = ground_or_plants
         points["classification_flags"] = 0x40
         points["scan_angle"] = np.rint(scan_angle / 0.006)
     else:
         points["bit_fields"] = returns.number | returns.total << 3 | 0x40
-        points["raw_classification"] = kind
+        points["raw_classification"] = ground_or_plants
         points["scan_angle_rank"] = np.rint(scan_angle)
+    return points
 
 
-def _list_truth(kept: EchoTable, simulated: Simulated, packet: np.ndarray, offset: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of the truth file for the echoes in stored packets."""
-    block, rows = simulated.block, kept.waveform
-    xyz = locate(block, rows, kept.time)
+def _fill_packets(
+    points: np.ndarray,
+    block: WaveformBlock,
+    returns: Returns,
+    jitter: np.ndarray,
+    stored: np.ndarray,
+    offset: np.ndarray,
+) -> None:
+    """Where the packets of the points are, and how the points lie in them."""
+    pulse = returns.pulse
+    has = stored[pulse]
+    points["wavepacket_index"] = has
+    points["wavepacket_offset"] = np.where(has, offset[pulse], 0)
+    points["wavepacket_size"] = np.where(has, block.samples.shape[1] * block.samples.itemsize, 0)
+    points["return_point_wave_location"] = np.where(has, (returns.time + jitter[pulse]) * PS_PER_NS, 0)
+    for axis, name in enumerate(("x_t", "y_t", "z_t")):
+        points[name] = np.where(has, -block.direction[pulse, axis] / PS_PER_NS, 0)
+
+
+def _locate(block: WaveformBlock, pulse: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """True positions `time` ns after sample 0 of the pulses, f8 (k, 3) [m]."""
+    return block.origin[pulse] + time[:, None] * block.direction[pulse]
+
+
+def _list_truth(simulated: Simulated, packet: np.ndarray, offset: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of the truth file for the echoes in stored packets; packet, offset: of every pulse, (n,)."""
+    block, truth, rays = simulated.block, simulated.truth, simulated.rays
+    rows = truth.waveform
+    xyz = _locate(block, rows, truth.time)
     speed = np.linalg.norm(block.direction[rows], axis=1)
-    behind = np.einsum("ij,ij->i", xyz - simulated.rays.ground[rows], block.direction[rows]) / speed
+    past_ground = np.einsum("ij,ij->i", xyz - rays.ground[rows], block.direction[rows]) / speed
     return {
         "waveform": packet[rows],
         "byte_offset": offset[rows],
         "gps_time": block.gps_time[rows],
-        "time": kept.time,
-        "amplitude": kept.amplitude,
-        "sigma": kept.sigma,
-        "x": xyz[:, 0],
-        "y": xyz[:, 1],
-        "z": xyz[:, 2],
-        "incidence_angle": np.degrees(simulated.rays.incidence[rows]),
-        "range": simulated.rays.distance[rows] + behind,
-        "flags": kept.flags,
-        "isolated": find_isolated(kept),
-        "overlapped": (kept.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0,
+        "time": truth.time,
+        "amplitude": truth.amplitude,
+        "sigma": truth.sigma,
+        **dict(zip("xyz", xyz.T, strict=True)),
+        "incidence_angle": np.degrees(rays.incidence[rows]),
+        "range": rays.distance[rows] + past_ground,
+        "flags": truth.flags,
+        "isolated": find_isolated(truth),
+        "overlapped": (truth.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0,
     }
 
 
 def _describe(scene: Scene, seed: int, summary: StripSummary) -> dict:
-    """What the truth file says of the whole strip."""
+    """The `meta` of the truth file: what holds for the whole strip."""
     recording = scene.recording
     return {
         "scene": scene.name,

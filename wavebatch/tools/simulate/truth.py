@@ -1,7 +1,11 @@
-"""The truth of a strip as a .npz: columns spooled to disk while the strip is made, read back in pieces."""
+"""The truth file of a simulated strip: a .npz with one array per column, written and read in pieces.
+
+`strip.simulate_strip` writes it, `wavebatch compare` and the tests read it. Columns and their types are declared here.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -31,11 +35,12 @@ ECHO_COLUMNS: dict[str, str] = {
 }
 """Per true echo, in file order: packet number, byte offset of its packet, GPS time of its pulse [s], time after
 sample 0 [ns], amplitude [count], sigma [ns], position [m], angle to the ground's normal [deg], sensor to echo [m],
-EchoFlag bits, whether the closed bounds hold for it, whether a neighbour overlaps it."""
+EchoFlag bits, whether it is isolated, whether a neighbour overlaps it."""
 
 PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time": "<f8"}
 """Per packet, in file order, those without an echo too."""
 
+_DTYPES = {**ECHO_COLUMNS, **PACKET_COLUMNS}
 _META = "meta"
 _PIECE = 1 << 18
 
@@ -43,26 +48,26 @@ _PIECE = 1 << 18
 class TruthWriter(NpzWriter):
     """Takes columns block by block and writes them as one .npz on `publish`; memory does not grow with their length.
 
-    Each `add` gives every column of a kind the same length. Raises InputError where it cannot write.
+    Raises InputError where it cannot write.
     """
 
     def __init__(self, target: Path, *, overwrite: bool = False) -> None:
-        super().__init__(target, {**ECHO_COLUMNS, **PACKET_COLUMNS}, overwrite=overwrite)
+        super().__init__(target, _DTYPES, overwrite=overwrite)
 
     def publish(self, meta: Mapping[str, Any]) -> None:
-        """Writes the .npz and gives it its name; meta: plain values, kept as JSON in the array `meta`."""
+        """Writes and publishes the .npz; meta: plain values, stored as JSON in the array `meta`."""
         super().publish({_META: json.dumps(meta, sort_keys=True)})
 
 
 class TruthReader:
-    """The truth file of a simulated strip; columns are read in pieces. Raises InputError when it is none."""
+    """Reads a truth file; raises InputError when `path` is none."""
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         try:
             self._archive = zipfile.ZipFile(self.path)
             known = set(self._archive.namelist())
-            lacking = [name for name in (*ECHO_COLUMNS, *PACKET_COLUMNS, _META) if f"{name}.npy" not in known]
+            lacking = [name for name in (*_DTYPES, _META) if f"{name}.npy" not in known]
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
@@ -82,40 +87,33 @@ class TruthReader:
 
     def read_pieces(self, *names: str, size: int = _PIECE) -> Iterator[dict[str, np.ndarray]]:
         """The named columns, all per echo or all per packet, at most `size` rows at a time."""
-        members = [self._archive.open(f"{name}.npy") for name in names]
-        try:
-            left = []
-            dtypes = []
-            for name, member in zip(names, members, strict=True):
-                np.lib.format.read_magic(member)
-                shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-                expected = np.dtype(ECHO_COLUMNS.get(name) or PACKET_COLUMNS[name])
-                if dtype != expected or len(shape) != 1:
-                    raise InputError(f"{self.path}: column {name} is {dtype}, not {expected}; simulate the strip again")
-                left.append(shape[0])
-                dtypes.append(dtype)
-            if len(set(left)) != 1:
+        with contextlib.ExitStack() as stack:
+            members = {name: stack.enter_context(self._archive.open(f"{name}.npy")) for name in names}
+            lengths = {self._read_length(name, member) for name, member in members.items()}
+            if len(lengths) != 1:
                 raise InputError(f"{self.path}: columns {', '.join(names)} differ in length; simulate the strip again")
-            for start in range(0, left[0], size):
-                rows = min(size, left[0] - start)
-                yield {
-                    name: np.frombuffer(_read_exactly(member, rows * dtype.itemsize, self.path), dtype)
-                    for name, member, dtype in zip(names, members, dtypes, strict=True)
-                }
-        finally:
-            for member in members:
-                member.close()
+            (length,) = lengths
+            for start in range(0, length, size):
+                rows = min(size, length - start)
+                yield {name: self._read_column(name, member, rows) for name, member in members.items()}
 
     def read(self, *names: str) -> dict[str, np.ndarray]:
         """The named columns whole."""
         pieces = list(self.read_pieces(*names))
         if not pieces:
-            return {name: np.empty(0, ECHO_COLUMNS.get(name) or PACKET_COLUMNS[name]) for name in names}
+            return {name: np.empty(0, _DTYPES[name]) for name in names}
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
+    def _read_length(self, name: str, member: IO[bytes]) -> int:
+        np.lib.format.read_magic(member)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
+            raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again")
+        return shape[0]
 
-def _read_exactly(member: IO[bytes], size: int, path: Path) -> bytes:
-    data = member.read(size)
-    if len(data) != size:
-        raise InputError(f"{path}: ends too early; simulate the strip again")
-    return data
+    def _read_column(self, name: str, member: IO[bytes], rows: int) -> np.ndarray:
+        dtype = np.dtype(_DTYPES[name])
+        data = member.read(rows * dtype.itemsize)
+        if len(data) != rows * dtype.itemsize:
+            raise InputError(f"{self.path}: ends too early; simulate the strip again")
+        return np.frombuffer(data, dtype)

@@ -1,4 +1,8 @@
-"""The waveforms of a strip, scan line by scan line."""
+"""Reads the waveforms of a strip scan line by scan line.
+
+A line ends where the scan angle turns or jumps back, or at a pause. Pulses must be in the order of time. The last line
+of a unit is joined with the next unit, so that no line is cut between units.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +12,23 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.strip.shared_packets import expand
 from wavebatch.kernels.geometry.scan_lines import find_sweeps
 
 LEAST_PULSES = 8
-"""Shorter lines are left out."""
+"""Shorter lines are left out: they hold no surface to find."""
 MOST_PULSES = 16_384
-"""Longer ones are cut: without a moving mirror a strip is one line."""
+"""Longer lines are cut: without a moving mirror, a strip would be one line and memory would not be bounded."""
 _BLOCK = 4096
 _FLOOR = 0.25
-"""Quantile of a waveform that counts as its level without signal."""
+"""Quantile of a waveform that is used as its level without signal: signal fills less than three quarters."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pulses:
-    """n pulses in the order of the file; the samples of pulse i are values[first[i] : first[i] + count[i]]."""
+    """n pulses in file order; the samples of pulse i are values[first[i] : first[i] + count[i]]."""
 
     point: np.ndarray
     gps_time: np.ndarray
@@ -38,7 +43,7 @@ class _Pulses:
         return len(self.point)
 
     def take(self, rows: np.ndarray) -> _Pulses:
-        """Some pulses, with their own samples only."""
+        """Some pulses, with only their samples."""
         count = self.count[rows]
         kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:5]}
         return _Pulses(
@@ -48,35 +53,35 @@ class _Pulses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanLine:
-    """n consecutive pulses of one sweep, and m samples of them."""
+    """n consecutive pulses of one sweep, with m samples."""
 
     number: int
-    """From 0, over all lines of the strip that are long enough."""
+    """Number of the line in the strip, from 0; short lines are not counted."""
     point: np.ndarray
-    """Index in the file of the pulse's first point, i8 (n,)."""
+    """Index in the file of the first point of each pulse, i8 (n,)."""
     gps_time: np.ndarray
     origin: np.ndarray
     """Position of sample 0, f8 (n, 3) [m]."""
     direction: np.ndarray
-    """f8 (n, 3) [m/ns]."""
+    """Away from the sensor, f8 (n, 3) [m/ns]."""
     spacing: float
     """Time between two samples of the first pulse [ns]."""
     row: np.ndarray
-    """Pulse of the sample, i8 (m,)."""
+    """Pulse of each sample, i8 (m,)."""
     time: np.ndarray
-    """After sample 0 [ns], f8 (m,)."""
+    """Time after sample 0 [ns], f8 (m,)."""
     value: np.ndarray
-    """Above the level without signal [count], f4 (m,)."""
+    """Sample above the level without signal [count], f4 (m,)."""
 
     def __len__(self) -> int:
         return len(self.point)
 
 
 def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
-    """The scan lines of a strip in the order of the file: found where the angle turns or jumps, and at pauses.
+    """The scan lines of a strip in file order.
 
-    Lines of fewer than LEAST_PULSES pulses are left out, longer ones than MOST_PULSES are cut. Memory is bounded.
-    Raises InputError where the pulses of most lines are too few: the file is not in the order of time.
+    Lines of fewer than LEAST_PULSES pulses are left out, lines of more than MOST_PULSES are cut. Memory is bounded.
+    Raises InputError if most pulses are in lines that are too short: the file is not in the order of time.
     """
     number = lost = total = 0
     axis = None
@@ -102,8 +107,8 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
         rest = pulses.take(np.arange(edges[-2], len(pulses)))
     if lost > total / 2:
         raise InputError(
-            f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {LEAST_PULSES}; slices "
-            "need pulses in the order of time: sort the strip by gps time"
+            f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {LEAST_PULSES} pulses; "
+            "slices need pulses in the order of time: sort the strip by GPS time"
         )
 
 
@@ -117,21 +122,13 @@ def _read_pulses(reader: StripReader, unit: Unit) -> _Pulses:
     return pulses.take(np.argsort(pulses.point, kind="stable"))
 
 
-def _shape(block) -> _Pulses:
+def _shape(block: WaveformBlock) -> _Pulses:
     n, s = block.samples.shape
     values = block.samples.astype(np.float32)
     at = int(_FLOOR * (s - 1))
     values -= np.partition(values, at, axis=1)[:, at : at + 1]
-    return _Pulses(
-        point=block.point,
-        gps_time=block.gps_time,
-        origin=block.origin,
-        direction=block.direction,
-        spacing=np.full(n, block.spacing),
-        first=np.arange(n) * s,
-        count=np.full(n, s),
-        values=values.reshape(-1),
-    )
+    place = (block.point, block.gps_time, block.origin, block.direction)
+    return _Pulses(*place, np.full(n, block.spacing), np.arange(n) * s, np.full(n, s), values.reshape(-1))
 
 
 def _join(parts: list[_Pulses]) -> _Pulses:
@@ -142,7 +139,7 @@ def _join(parts: list[_Pulses]) -> _Pulses:
 
 
 def _find_axis(direction: np.ndarray) -> np.ndarray:
-    """Horizontal axis (2,) along which the rays spread most: across the flight."""
+    """Horizontal axis (2,) with the largest spread of the rays: across the flight."""
     flat = direction[:, :2] / np.linalg.norm(direction, axis=1)[:, None]
     flat = flat - flat.mean(axis=0)
     axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
@@ -154,21 +151,13 @@ def _measure_angle(pulses: _Pulses, axis: np.ndarray) -> np.ndarray:
 
 
 def _cut_long(edges: np.ndarray) -> np.ndarray:
-    """Edges with more between those that are too far apart."""
+    """The edges, with further edges in lines that are too long."""
     more = [np.arange(a, b, MOST_PULSES) for a, b in zip(edges[:-1], edges[1:], strict=True)]
     return np.concatenate([*more, edges[-1:]])
 
 
 def _build_line(number: int, pulses: _Pulses) -> ScanLine:
     row = np.repeat(np.arange(len(pulses)), pulses.count)
-    return ScanLine(
-        number=number,
-        point=pulses.point,
-        gps_time=pulses.gps_time,
-        origin=pulses.origin,
-        direction=pulses.direction,
-        spacing=float(pulses.spacing[0]),
-        row=row,
-        time=(np.arange(len(row)) - pulses.first[row]) * pulses.spacing[row],
-        value=pulses.values,
-    )
+    time = (np.arange(len(row)) - pulses.first[row]) * pulses.spacing[row]
+    place = (pulses.point, pulses.gps_time, pulses.origin, pulses.direction)
+    return ScanLine(number, *place, float(pulses.spacing[0]), row, time, pulses.values)

@@ -1,4 +1,7 @@
-"""Segments as CSV or GeoJSON, and pictures of slices."""
+"""Writes segments as CSV or GeoJSON, and pictures of slices.
+
+`wavebatch slice` adds segments line by line; the file appears only when it is complete.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,15 @@ _PLACE = ("pulses", "first_pulse", "last_pulse", "first_point")
 _FIGURES = ("length", "slope", "residual", *_PLACE, "theta", "rho", "weight")
 _HEAD = ("line", "segment", "x1", "y1", "z1", "x2", "y2", "z2", *_FIGURES)
 _MOST_PIXELS = 40_000_000
+"""Most pixels of a picture (160 MB): more come from damaged coordinates."""
 
 
 class SegmentWriter:
-    """Streams segments to a .csv or .geojson: `write`, then `commit`; as a context manager nothing remains unless
-    committed.
+    """Writes segments to a .csv or .geojson file: `write` as often as needed, then `commit`.
 
-    crs: WKT that goes into the GeoJSON as `crs_wkt`; coordinates are those of the strip. Raises ConfigError for
-    another suffix, InputError where the target exists (without overwrite) or cannot be written.
+    A context manager: without `commit` no file remains. crs: WKT that is stored in the GeoJSON as `crs_wkt`;
+    coordinates are those of the strip. Raises ConfigError for another suffix, InputError if the target exists (without
+    overwrite) or cannot be written.
     """
 
     def __init__(self, target: Path, *, crs: str | None = None, overwrite: bool = False) -> None:
@@ -55,7 +59,7 @@ class SegmentWriter:
             self._count += 1
 
     def commit(self) -> None:
-        """Completes and publishes the file."""
+        """Completes the file and moves it to its place."""
         if self._geojson:
             self._put("\n]}\n")
         self._draft.publish()
@@ -85,7 +89,7 @@ def _round(place: Sequence[float]) -> list[float]:
 
 
 def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overwrite: bool = False) -> None:
-    """Writes a picture of a slice with its segments; raises as `pictures.open_picture` does."""
+    """Writes a picture of a slice with its segments; raises as figure_file.open_picture does."""
     with open_picture(target, (12, 5), overwrite=overwrite, dpi=120) as figure:
         axes = figure.subplots()
         image, extent = _paint(piece)
@@ -102,7 +106,7 @@ def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overw
 
 
 def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Largest value per pixel, and where the picture lies in its units."""
+    """Largest value per pixel, and the extent of the picture in its units."""
     x, y = np.rint(piece.x).astype(np.int64), np.rint(piece.y).astype(np.int64)
     low_x, low_y = int(x.min()), int(y.min())
     width, height = int(x.max()) - low_x + 1, int(y.max()) - low_y + 1

@@ -1,4 +1,8 @@
-"""A scan line as a slice - a vertical plane, or pulses by time - and the straight segments of surfaces in it."""
+"""Cuts slices from scan lines and finds the straight segments of surfaces in them.
+
+A slice is either a vertical plane, in metres, or an image of pulses by time. Lines are found by a Hough transform
+(`kernels.geometry.hough`) of the samples above a threshold.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +17,23 @@ from wavebatch.tools.slices.lines import ScanLine
 
 GEOMETRIES = ("plane", "time")
 _GAP, _PULSES_PER_GAP = 10.0, 3.0
+"""Largest hole in a segment [pixels, pulses]: whichever is larger in a plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class SliceOptions:
-    """How slices are made and searched."""
+    """How slices are cut and searched."""
 
     geometry: str = "plane"
-    """`plane`: vertical, in metres; `time`: rows are pulses, columns samples, straight surfaces then bend."""
+    """`plane`: vertical plane, in metres; `time`: rows are pulses, columns are samples; flat surfaces then bend."""
     std: float = 2.0
-    """Samples above this many standard deviations of their slice are looked at."""
+    """Samples above this many standard deviations of their slice are searched."""
     sigma: float = 2.0
     """Standard deviation of the pulse [ns]."""
     shortest: float = 20.0
-    """Least length of a segment [pixels]: of one sample's way in a plane, else of one sample or pulse."""
+    """Least length of a segment [pixels]: a pixel is the length of a sample in a plane, else a sample or a pulse."""
     most: int = 20
-    """Segments per slice."""
+    """Most segments per slice."""
 
     def __post_init__(self) -> None:
         if self.geometry not in GEOMETRIES:
@@ -39,14 +44,14 @@ class SliceOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slice:
-    """A scan line in the coordinates in which lines are sought: those of all samples, in pixels (m,)."""
+    """A scan line with the coordinates of its m samples in the slice, in pixels."""
 
     line: ScanLine
     geometry: str
     x: np.ndarray
-    """Plane: along the ground; time: sample."""
+    """Plane: along the ground; time: sample, f8 (m,)."""
     y: np.ndarray
-    """Plane: height; time: pulse."""
+    """Plane: height; time: pulse, f8 (m,)."""
     pixel: float
     """Size of a pixel in x [m], or [ns]."""
     base: np.ndarray
@@ -54,10 +59,10 @@ class Slice:
     axis: np.ndarray
     """Plane: its horizontal direction (3,), of length 1."""
     roi: np.ndarray
-    """Samples that are looked at, bool (m,)."""
+    """Samples that are searched, bool (m,)."""
 
     def locate(self, end: tuple[float, float]) -> tuple[float, float, float]:
-        """Position of a point of the slice in space [m]."""
+        """Position in space of a point of the slice [m]."""
         if self.geometry == "plane":
             place = self.base + self.pixel * (end[0] * self.axis + np.array([0.0, 0.0, end[1]]))
         else:
@@ -80,7 +85,7 @@ class Segment:
     line: int
     """Scan line."""
     segment: int
-    """From 0, the strongest first."""
+    """Number in the slice, from 0, the strongest first."""
     start: tuple[float, float, float]
     end: tuple[float, float, float]
     """Ends in space [m]."""
@@ -89,18 +94,18 @@ class Segment:
     length: float
     """Distance of the ends in space [m]."""
     slope: float
-    """Angle above the horizontal from start to end [deg]."""
+    """Angle above the horizontal, from start to end [deg]."""
     residual: float
-    """Root mean square distance of the pulses' centroids from the line: [m] across it in a plane, else [ns] in time."""
+    """Root mean square distance of the centroids of pulses from the line: across it [m], or along time [ns]."""
     pulses: int
     first_pulse: int
     last_pulse: int
-    """Pulses within the scan line that it lies on."""
+    """Pulses of the scan line on the segment: number, first and last."""
     first_point: int
     """Index in the file of the first point of first_pulse."""
     theta: float
     rho: float
-    """Of the line in the slice [deg, pixels]."""
+    """Normal form of the line in the slice [deg, pixels]."""
     weight: float
     """Sum of intensities [count]."""
 
@@ -126,20 +131,14 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
     if len(rows) < 2:
         return []
     x, y = piece.x[rows], piece.y[rows]
-    lines = find_lines(
-        x,
-        y,
-        piece.line.value[rows].astype(np.float64),
-        sigma=options.sigma / piece.line.spacing,
-        gap=_choose_gap(piece),
-        shortest=options.shortest,
-        most=options.most,
-    )
+    weight, sigma = piece.line.value[rows].astype(np.float64), options.sigma / piece.line.spacing
+    gap = _choose_gap(piece)
+    lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most)
     return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
 
 
 def _find_plane(line: ScanLine, roi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A point of the vertical plane and its direction: the main axis of what is looked at, seen from above."""
+    """A point of the vertical plane and its direction: the main axis of the searched samples, seen from above."""
     use = np.flatnonzero(roi) if roi.any() else np.arange(len(line.row))
     place = line.origin[line.row[use]] + line.time[use, None] * line.direction[line.row[use]]
     base = place.mean(axis=0)
@@ -151,7 +150,7 @@ def _find_plane(line: ScanLine, roi: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _choose_gap(piece: Slice) -> float:
-    """Largest hole in a segment [pixels]: ten, or three pulses where they lie further apart."""
+    """Largest hole in a segment [pixels]: ten, or three pulses if they lie farther apart."""
     if piece.geometry == "time":
         return _GAP
     step = np.diff(piece.line.origin @ piece.axis) / piece.pixel
@@ -183,7 +182,7 @@ def _describe(piece: Slice, found: HoughLine, rows: np.ndarray, number: int) -> 
 
 
 def _measure_residual(piece: Slice, found: HoughLine, rows: np.ndarray) -> float:
-    """Spread of the pulses' centroids about the line: the width of the pulse itself does not count."""
+    """Spread of the centroids of pulses about the line, so that the width of a pulse does not count."""
     theta = np.radians(found.theta)
     off = piece.x[rows] * np.cos(theta) + piece.y[rows] * np.sin(theta) - found.rho
     if piece.geometry == "time":

@@ -1,4 +1,8 @@
-"""How high up a strip's rays matter: above the highest return of its neighbourhood a ray crosses nothing but air."""
+"""Map of the highest returns of a strip: above them, rays cross only air and need not be followed.
+
+`strip.voxelize_strip` makes one where --headroom is not given. It counts each ray from the height of this map, so that
+voxels near the surface get all light that crossed them, whether recorded or not.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +12,30 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.scanner import locate
 
 LEAST_CELL = 4.0
-"""Of the map of highest returns [m]."""
+"""Least cell of the map [m]."""
 
 VOXELS_PER_CELL = 4.0
+"""Least cell of the map, in voxels."""
+
 MOST_CELLS = 1 << 18
-"""Where a strip has more, they become twice as large."""
+"""Beyond this number, cells become twice as large: memory does not grow with the strip."""
 
 MARGIN = 3.0
-"""Above the highest return, in which signal may lie that is none [m]."""
+"""Height above the highest return up to which there can be signal without a return [m]."""
 
 STEEP = 0.1
-"""Least share of a ray that is vertical: flatter ones are not followed upwards."""
+"""Least vertical part of a ray: flatter rays are not followed upwards."""
 
 MOST_STEPS = 1024
+"""Cells over which a ray is followed at most."""
 _REACH = 1 << 28
 _SHIFT = np.int64(1 << 30)
 
 
 class Ceiling:
-    """Highest return of each cell of a map and the eight around it; cells without any have none.
+    """Highest return of each cell of a map and its eight neighbours.
 
-    middle: a place in the strip; what lies absurdly far from it does not count. size: of the voxels [m].
+    middle: a position in the strip; returns more than 2^28 cells from it are ignored. size: of the voxels [m].
     """
 
     def __init__(self, middle: np.ndarray, size: float) -> None:
@@ -39,7 +46,7 @@ class Ceiling:
         self.highest = -np.inf
 
     def add(self, xyz: np.ndarray) -> None:
-        """Takes returns (m, 3) into account."""
+        """Adds returns (m, 3) [m]."""
         index = np.floor((xyz[:, :2] - self._middle) / self.cell)
         good = (np.abs(index) < _REACH).all(axis=1) & np.isfinite(xyz[:, 2])
         index = index[good].astype(np.int64)
@@ -50,7 +57,7 @@ class Ceiling:
             self._merge((x >> 1) * _SHIFT + (y >> 1), self._top, fresh=True)
 
     def finish(self) -> Ceiling:
-        """The map with every cell as high as the highest around it."""
+        """Raises every cell to the highest around it; returns the map."""
         if len(self._key):
             self.highest = float(self._top.max())
             around = [a * _SHIFT + b for a in (-1, 0, 1) for b in (-1, 0, 1)]
@@ -59,7 +66,7 @@ class Ceiling:
         return self
 
     def measure_headroom(self, start: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Way (n,) [m] before positions (n, 3), against their direction, up to where rays are above all returns."""
+        """Distance (n,) [m] from positions (n, 3) back along the rays to where they are above all returns."""
         with np.errstate(invalid="ignore", divide="ignore"):
             up = -step / np.sqrt((step * step).sum(axis=1))[:, None]
         headroom = np.zeros(len(start))
@@ -81,7 +88,7 @@ class Ceiling:
         return np.where(self._key[at] == key, self._top[at], -np.inf)
 
     def _merge(self, key: np.ndarray, top: np.ndarray, *, fresh: bool = False) -> None:
-        """Takes cells in, or in place of those that are there."""
+        """Adds cells, keeping the highest of equal ones; fresh: replaces all cells."""
         if not fresh:
             key, top = np.concatenate([self._key, key]), np.concatenate([self._top, top])
         order = np.lexsort((top, key))
@@ -96,7 +103,7 @@ class Ceiling:
 
 
 def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size: float) -> Ceiling:
-    """The ceiling of a strip from all of its points, which are read once more."""
+    """The ceiling of a strip; reads all of its points."""
     ceiling = Ceiling(middle, size)
     for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
         ceiling.add(locate(reader.read_points(begin, end), reader.facts))

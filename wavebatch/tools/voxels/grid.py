@@ -1,4 +1,8 @@
-"""Rays summed over the voxels of a grid, in integers, so that no order of summation shows."""
+"""Sums over the voxels of a grid: rays, light, path, energy and cross section.
+
+`strip.voxelize_strip` adds the rays of every block, then writes `pieces`. Sums are integers, in the units below, so
+that the result does not depend on block size or order.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +25,13 @@ from wavebatch.kernels.geometry.voxels import (
 from wavebatch.tools.voxels.rays import RayTable, measure_lengths
 
 LIGHT_UNIT = 2.0**-30
-"""Of a ray's light, as it is summed."""
+"""Unit in which light is summed [rays]."""
 
 PATH_UNIT = 2.0**-20
-"""[m]."""
+"""Unit in which path is summed [m]."""
 
 SECTION_UNIT = 2.0**-40
-"""[m2]."""
+"""Unit in which cross sections are summed [m2]."""
 
 _RAYS, _LIGHT, _CAUGHT, _PATH, _ENERGY, _SECTION, _UNKNOWN = range(7)
 
@@ -40,9 +44,9 @@ class VoxelColumn:
     dtype: str
     unit: str
     meaning: str
-    """With the unit it fits the 32 bytes of a LAS description."""
+    """With the unit at most 32 bytes, for the description in LAS."""
     no_data: float | None = None
-    """In LAS; NPZ files have NaN."""
+    """Value for no data in LAS; .npz files have NaN."""
 
 
 COLUMNS = (
@@ -53,19 +57,19 @@ COLUMNS = (
     VoxelColumn("light", "f4", "rays", "what was left of them"),
     VoxelColumn("share", "f4", "-", "share of it that came back", -9999.0),
 )
-"""Of every voxel that is written; cross_section only where there is a calibration."""
+"""Values of every voxel; cross_section only with a calibration."""
 
 
 def energy_unit(bits: int) -> float:
-    """Unit in which energies are summed [DN ns], by the bits of the digitizer: fine enough, and large enough sums."""
+    """Unit in which energies are summed [DN ns]: fine, but with room for the sum of all samples in 63 bits."""
     return 2.0**-20 if bits <= 16 else 2.0**-8
 
 
 class VoxelGrid:
-    """Sums of what the rays of a strip say about voxels; a context manager, since large ones lie partly on disk.
+    """Sums of the rays of a strip per voxel; a context manager, since large sums lie partly on disk.
 
-    size: of the voxels [m], whose faces lie at multiples of it. anchor: a voxel in the middle of the strip, i8 (3,), by
-    index from the origin of the coordinates. unit: of energies [DN ns]. sections: whether rays have cross sections.
+    size: of the voxels [m]; faces lie at multiples of it. anchor: index of a voxel in the middle of the strip, counted
+    from the origin of the coordinates, i8 (3,). unit: of energies [DN ns]. sections: whether rays have cross sections.
     everything: also keeps voxels that rays crossed without any signal. held: see KeyedSums.
     """
 
@@ -82,7 +86,7 @@ class VoxelGrid:
         self.rays = 0
         """Rays that were added."""
         self.outside = 0
-        """Rays whose position is no number, or too far from all others."""
+        """Rays left out: their position is not a number, or too far from all others."""
         self.unknown = 0
         """Rays with signal of unknown cross section."""
 
@@ -128,7 +132,7 @@ class VoxelGrid:
             self._sums.add(pack_index(found.index), values)
 
     def _list_values(self, found: Crossings, rays: RayTable, spacing: float) -> np.ndarray:
-        """What every crossing adds to its voxel, i8 (m, columns); those of a ray add up to the ray's exactly."""
+        """Values that every crossing adds to its voxel, i8 (m, columns); over a ray they add up to its total."""
         ray = found.ray
         first = np.append(True, ray[1:] != ray[:-1])[: len(ray)]
 
@@ -150,7 +154,7 @@ class VoxelGrid:
         return values
 
     def pieces(self) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Voxels and their columns, some at a time, in the order of x, then y, then z.
+        """Index and columns of the voxels, some at a time, in the order of x, then y, then z.
 
         The index i8 (m, 3) counts from `low`.
         """
@@ -179,6 +183,6 @@ def _count(values: np.ndarray | float, unit: float) -> np.ndarray:
 
 
 def _sum_before(values: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Sum of the values (m,) of the same ray before each, given where rays begin."""
+    """Sum of the earlier values of the same ray, (m,); first: True where a ray begins."""
     before = np.cumsum(values) - values
     return before - before[first][np.cumsum(first) - 1] if len(values) else before

@@ -1,9 +1,12 @@
-"""Voxels as a sparse NPZ, or as a point cloud with a point at the centre of each."""
+"""Voxels as a sparse .npz, or as a point cloud with a point at the centre of each.
+
+`strip.voxelize_strip` calls `check_target` before it reads the strip, and `write_voxels` at the end.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,9 +35,12 @@ from wavebatch.tools.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
 
+Piece = tuple[np.ndarray, Mapping[str, np.ndarray]]
+"""Index (m, 3) and columns of some voxels."""
+
 
 def check_target(target: Path, strip: Path) -> None:
-    """Raises ConfigError for a name that says no format, InputError where the output is the strip, or cannot be."""
+    """Raises ConfigError for an unknown suffix, InputError where the output is the strip or cannot be written."""
     if target.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if target.exists() and strip.exists() and target.samefile(strip):
@@ -44,100 +50,86 @@ def check_target(target: Path, strip: Path) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelSpace:
-    """What a file says of its voxels beside their values."""
+    """Contents of a voxel file besides the values of the voxels."""
 
     columns: Sequence[VoxelColumn]
     facts: StripFacts
-    """Of the strip."""
+    """Facts of the strip, for its CRS and header."""
     origin: np.ndarray
     """Lower corner of voxel 0, f8 (3,) [m]."""
     size: float
-    """Of a voxel [m]."""
+    """Edge of a voxel [m]."""
     meta: Mapping[str, Any]
-    """How they were made."""
+    """How the voxels were made."""
 
 
-class NpzVoxels:
-    """Writes voxels to an .npz: `write`, then `commit`; as a context manager nothing remains unless committed.
+def write_voxels(target: Path, space: VoxelSpace, pieces: Iterable[Piece], *, overwrite: bool) -> int:
+    """Writes voxels in the format of the target's suffix; returns their number.
 
-    Arrays: index i4 (n, 3), one array per column, origin f8 (3,) [m], size [m], crs (WKT, or empty), meta (JSON). Voxel
-    i lies between origin + i size and origin + (i + 1) size. No-data is NaN. Raises InputError where it cannot write.
+    pieces: index i8 (m, 3) and columns of some voxels at a time. After an error nothing remains.
+    Raises InputError where the target cannot be written.
     """
-
-    def __init__(self, target: Path, space: VoxelSpace, *, overwrite: bool) -> None:
-        text = json.dumps(space.meta, sort_keys=True)
-        self._single = {"origin": space.origin, "size": space.size, "crs": space.facts.crs or "", "meta": text}
-        dtypes = {"index": np.dtype(("<i4", (3,)))}
-        dtypes |= {column.name: np.dtype(f"<{column.dtype}") for column in space.columns}
-        self._file = NpzWriter(target, dtypes, overwrite=overwrite)
-
-    def __enter__(self) -> NpzVoxels:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._file.discard()
-
-    def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
-        """Appends voxels (m, 3) and their columns."""
-        self._file.add({"index": index, **columns})
-
-    def commit(self) -> None:
-        """Completes and publishes the file."""
-        self._file.publish(self._single)
+    write = _write_npz if target.suffix.lower() == ".npz" else _write_las
+    return write(target, space, pieces, overwrite)
 
 
-class LasVoxels:
-    """Writes voxels as points with extra bytes to a .las or .laz; used as NpzVoxels is.
+def _write_npz(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwrite: bool) -> int:
+    """An .npz of index i4 (n, 3), an array per column, origin f8 (3,) [m], size [m], crs (WKT or empty), meta (JSON).
 
-    The centre of every voxel is exact: coordinates count half voxels from the lower corner of the grid. The strip's CRS
-    is kept.
+    Voxel i lies between origin + i size and origin + (i + 1) size. No-data is NaN.
     """
-
-    def __init__(self, target: Path, space: VoxelSpace, *, overwrite: bool) -> None:
-        self._columns = space.columns
-        records = [
-            ExtraRecord.build(
-                column.name,
-                column.dtype,
-                column.meaning if column.unit == "-" else f"{column.meaning} [{column.unit}]",
-                no_data=column.no_data,
-            )
-            for column in space.columns
-        ]
-        header = _build_header(space)
-        self._returns = 0b1_0001 if header.point_format >= 6 else 0b1001
-        self._dtype = build_dtype(header.point_format, records)
-        self._file = PointFile(target, header, self._dtype, records, overwrite=overwrite)
-
-    def __enter__(self) -> LasVoxels:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._file.abort()
-
-    def write(self, index: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
-        """Appends voxels (m, 3) and their columns."""
-        rows = np.zeros(len(index), self._dtype)
-        for axis, name in enumerate("XYZ"):
-            rows[name] = 2 * index[:, axis] + 1
-        rows["bit_fields"] = self._returns
-        for column in self._columns:
-            values = columns[column.name]
-            if column.no_data is not None:
-                values = np.where(np.isnan(values), values.dtype.type(column.no_data), values)
-            rows[column.name] = values
-        self._file.write(rows)
-
-    def commit(self) -> None:
-        """Completes and publishes the file."""
-        self._file.finish_points()
-        self._file.finish()
-        self._file.draft.publish()
+    dtypes = {"index": np.dtype(("<i4", (3,)))}
+    dtypes |= {column.name: np.dtype(f"<{column.dtype}") for column in space.columns}
+    meta = json.dumps(space.meta, sort_keys=True)
+    file = NpzWriter(target, dtypes, overwrite=overwrite)
+    number = 0
+    try:
+        for index, columns in pieces:
+            file.add({"index": index, **columns})
+            number += len(index)
+        file.publish({"origin": space.origin, "size": space.size, "crs": space.facts.crs or "", "meta": meta})
+    finally:
+        file.discard()
+    return number
 
 
-def open_voxels(target: Path, space: VoxelSpace, *, overwrite: bool) -> NpzVoxels | LasVoxels:
-    """The writer of the format that the target's suffix says."""
-    return (NpzVoxels if target.suffix.lower() == ".npz" else LasVoxels)(target, space, overwrite=overwrite)
+def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwrite: bool) -> int:
+    """A .las or .laz with a point at the centre of each voxel, the columns as extra bytes, and the CRS of the strip.
+
+    The centres are exact: coordinates count half voxels from the lower corner of the grid.
+    """
+    header = _build_header(space)
+    records = [
+        ExtraRecord.build(
+            column.name,
+            column.dtype,
+            column.meaning if column.unit == "-" else f"{column.meaning} [{column.unit}]",
+            no_data=column.no_data,
+        )
+        for column in space.columns
+    ]
+    dtype = build_dtype(header.point_format, records)
+    file = PointFile(target, header, dtype, records, overwrite=overwrite)
+    number = 0
+    try:
+        for index, columns in pieces:
+            rows = np.zeros(len(index), dtype)
+            for axis, name in enumerate("XYZ"):
+                rows[name] = 2 * index[:, axis] + 1
+            rows["bit_fields"] = 0b1_0001 if header.point_format >= 6 else 0b1001  # return 1 of 1
+            for column in space.columns:
+                values = columns[column.name]
+                if column.no_data is not None:
+                    values = np.where(np.isnan(values), values.dtype.type(column.no_data), values)
+                rows[column.name] = values
+            file.write(rows)
+            number += len(rows)
+        file.finish_points()
+        file.finish()
+        file.draft.publish()
+    finally:
+        file.abort()
+    return number
 
 
 def _build_header(space: VoxelSpace) -> LasHeader:

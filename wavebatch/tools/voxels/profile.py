@@ -1,4 +1,8 @@
-"""Blocks of waveforms to profiles along their rays: deconvolved, freed of noise, placed against known returns."""
+"""Waveforms to profiles along their rays: deconvolved, noise removed, placed by the returns of their packets.
+
+`strip.voxelize_strip` calls `deconvolve_block` for every block. Waveforms are handled one by one in effect: a profile
+does not depend on the other waveforms of its block.
+"""
 
 from __future__ import annotations
 
@@ -25,47 +29,49 @@ from wavebatch.surveying.learn_pulse import AFTER, BEFORE
 
 METHODS = ("richardson_lucy", "gold", "wiener")
 ITERATIONS = {"richardson_lucy": 40, "gold": 100}
-"""Unless told otherwise."""
+"""Default iterations: Gold converges more slowly (docs/algorithms.md 2.5)."""
 
 SNR = 20.0
-"""Amplitude over noise that the Wiener filter is made for, unless told otherwise."""
+"""Default ratio of amplitude to noise for the Wiener filter."""
 
 SUPPORT = 2.0
 """Smoothed samples above this many standard deviations of their noise may hold signal."""
 
 FLOOR = 0.1
-"""Deconvolved samples below this share of the least signal, spread over the pulse, count as zero."""
+"""Deconvolved samples below this share of the least signal, spread over the pulse, are set to zero."""
 
 BACKGROUND = 3.0
-"""Added to waveform and model of the Richardson-Lucy iteration, in standard deviations of the noise."""
+"""Level added to waveform and model of the Richardson-Lucy iteration, which needs positive values [noise std]."""
 
 TOLERANCE = 2.5
-"""Distance in time between a return's location and the signal that it belongs to [ns], beyond half a sample."""
+"""Largest distance between the location of a return and its signal [ns], beyond half a sample."""
 
 AT_A_TIME = 1024
-"""Waveforms whose arrays stay in the cache together."""
+"""Waveforms deconvolved together: few enough for the cache."""
 
 _REACH = 4.0
-"""Half of a pulse that was not learned, and what is looked at beside signal, in widths of the system pulse."""
+"""Half length of a Gaussian pulse, and margin around signal, in widths of the system pulse."""
 
 
 @dataclass(frozen=True, slots=True)
 class Deconvolution:
-    """How waveforms are deconvolved, and what of the result is taken for noise."""
+    """How waveforms are deconvolved, and how much signal counts as noise."""
 
     method: str = "richardson_lucy"
     iterations: int | None = None
+    """None: ITERATIONS of the method."""
     snr: float | None = None
+    """For wiener; None: SNR."""
     threshold: float = 4.27
-    """Least sum of a run of signal, in standard deviations that an echo would have if it were alone."""
+    """Least sum of a run of signal, in standard deviations of the amplitude of a lone echo."""
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ConfigError(f"method {self.method!r} is unknown; choose {', '.join(METHODS)}")
         if self.iterations is not None and (self.method not in ITERATIONS or not 1 <= self.iterations <= 10_000):
-            raise ConfigError("iterations are those of richardson_lucy or gold, 1 to 10000")
+            raise ConfigError("iterations are for methods richardson_lucy and gold, 1 to 10000")
         if self.snr is not None and (self.method != "wiener" or not 0 < self.snr < 1e9):
-            raise ConfigError("the signal-to-noise ratio is that of method wiener, above 0")
+            raise ConfigError("the signal-to-noise ratio is for method wiener, above 0")
         if not 0 <= self.threshold < 1e9:
             raise ConfigError("the threshold must not be below 0")
 
@@ -77,18 +83,18 @@ class Deconvolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profiles:
-    """What the n waveforms of a block say along their rays."""
+    """Signal of n waveforms along their rays."""
 
     value: np.ndarray
-    """Height of the system pulses, one at every sample, that make up the waveform, f8 (n, s) [count]; 0 is none."""
+    """Heights of system pulses, one at every sample, whose sum is the waveform, f8 (n, s) [count]; 0: no signal."""
     area: float
     """Integral of a system pulse of height 1 [ns]."""
     seen: np.ndarray
     """Waveforms with any signal, bool (n,)."""
     offset: np.ndarray
-    """How far the signal lies behind the known returns of its packet, f8 (n,) [ns]."""
+    """Delay of the signal after the returns of its packet, f8 (n,) [ns]; 0 where unknown."""
     anchored: np.ndarray
-    """Whether that is known, bool (n,); else it is 0."""
+    """Waveforms with a known offset, bool (n,)."""
     clipped: np.ndarray
     """Waveforms with samples at the digitizer's limit, bool (n,)."""
 
@@ -96,8 +102,7 @@ class Profiles:
 def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvolution) -> Profiles:
     """Profiles of a block: waveforms without baseline and noise, deconvolved with the system pulse.
 
-    Where nothing rises above the noise there is nothing: runs of samples whose sum is less than `threshold` standard
-    deviations of a lone echo's amplitude are dropped. Each waveform is treated on its own.
+    Runs of samples whose sum is less than `threshold` standard deviations of a lone echo's amplitude are dropped.
     """
     system = system.of(block)
     taps, area = _pulse_taps(system, block.spacing)
@@ -117,7 +122,7 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         profile = _deconvolve(part, taps, noise.std[rows], options)
         near = np.ascontiguousarray(support[place, rows].T)
         kept, seen[rows] = keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
-        if options.method != "richardson_lucy":  # whose iteration keeps the energy
+        if options.method != "richardson_lucy":  # that iteration keeps the energy, the others do not
             kept = fit_height(kept, part, taps, near)
         value[rows[:, None], place.T] = kept
     offset, anchored = _find_offsets(block, value)
@@ -126,7 +131,7 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
 
 
 def _group_rows(length: np.ndarray) -> Iterator[np.ndarray]:
-    """Waveforms with windows of one length, some at a time; those without signal are left out."""
+    """Rows of waveforms with windows of equal length, AT_A_TIME at most; those without signal are left out."""
     order = np.argsort(length, kind="stable")
     edges = np.append(np.flatnonzero(np.diff(length[order], prepend=0)), len(order))
     for low, high in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
@@ -135,9 +140,9 @@ def _group_rows(length: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _lone_error(taps: np.ndarray, width: float, options: Deconvolution) -> float:
-    """Standard deviation of the sum of a lone echo's profile, in that of a sample.
+    """Standard deviation of the sum of a lone echo's profile, in units of that of a sample.
 
-    The iterations come near the matched filter's; what the linear filter lets through is summed over the pulse.
+    That of the iterations is near the matched filter's; that of the linear filter follows from its taps.
     """
     if options.method != "wiener":
         return float(1.0 / np.sqrt(np.sum(taps**2)))
@@ -155,10 +160,9 @@ def _deconvolve(signal: np.ndarray, taps: np.ndarray, std: np.ndarray, options: 
 
 
 def _pulse_taps(system: SystemPulse, spacing: float) -> tuple[np.ndarray, float]:
-    """Samples of the system pulse of height 1, its tail and after-pulses too, and its integral [ns].
+    """Samples of the system pulse of height 1, with tail and after-pulses, and its integral [ns].
 
-    A learned pulse is cut where the echoes that it was learned from were: what its Gaussians say beyond is nothing
-    that anybody measured.
+    A learned pulse is cut where the echoes it was learned from were cut: beyond, its Gaussians are extrapolated.
     """
     if not system.components:
         taps = reference_pulse(system, spacing, "system", _REACH).taps

@@ -1,4 +1,7 @@
-"""The rays of a block: where they begin and end, and what comes back along them, as sums over time."""
+"""The rays of a block in space: where they begin and end, and the running sum of their signal.
+
+`strip.voxelize_strip` traces the profiles of every block and adds the rays to the grid.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +15,23 @@ from wavebatch.kernels.physics import radiometry
 from wavebatch.tools.voxels.profile import Profiles
 
 MOST_SECTION = 2.0**14
-"""A larger cross section of a ray is nonsense, and unknown [m2]."""
+"""Larger cross sections of a ray count as unknown: no target has them [m2]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayTable:
-    """n rays; times are those after sample 0 [ns]."""
+    """n rays; times are in ns after sample 0."""
 
     start: np.ndarray
     """Position at time 0, f8 (n, 3) [m]."""
     step: np.ndarray
-    """f8 (n, 3) [m/ns]."""
+    """Direction away from the sensor, f8 (n, 3) [m/ns]."""
     begin: np.ndarray
+    """Time at which the ray begins, f8 (n,) [ns]."""
     end: np.ndarray
+    """Time at which it ends, f8 (n,) [ns]."""
     energy: np.ndarray
-    """Up to the end of each sample, f8 (n, s + 1) [DN ns]."""
+    """Energy up to the end of each sample, f8 (n, s + 1) [DN ns]."""
     section: np.ndarray
     """Cross section up to the end of each sample, f8 (n, s + 1) [m2]; (n, 0) without calibration."""
     unknown: np.ndarray
@@ -40,17 +45,17 @@ class RayTable:
 def trace_profiles(
     block: WaveformBlock, profiles: Profiles, *, headroom: np.ndarray | float = 0.0, system: SystemPulse | None = None
 ) -> RayTable:
-    """The rays of a block with what their profiles say.
+    """The rays of a block with the signal of their profiles.
 
-    A ray begins half a sample before its first one, or `headroom` [m] (n,) earlier, and ends behind its last signal:
-    what lies behind that got no light that is known of. Rays without any signal end with their waveform.
+    A ray begins half a sample before sample 0, or `headroom` [m] (n,) earlier, and ends after its last signal, because
+    no light is known to have gone further. Rays without any signal end with their waveform.
     system: calibrated, for cross sections; None: without them.
     """
     n, s = profiles.value.shape
     start = block.origin - block.direction * profiles.offset[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         begin = -0.5 * block.spacing - headroom / measure_lengths(block.direction)
-    behind = s - np.argmax(profiles.value[:, ::-1] > 0, axis=1)
+    last = s - np.argmax(profiles.value[:, ::-1] > 0, axis=1)
     section, unknown = np.empty((n, 0)), np.zeros(n, bool)
     if system is not None:
         section, unknown = _measure_sections(block, profiles, system, start)
@@ -59,7 +64,7 @@ def trace_profiles(
         start=start,
         step=block.direction,
         begin=begin,
-        end=(np.where(profiles.seen, behind, s) - 0.5) * block.spacing,
+        end=(np.where(profiles.seen, last, s) - 0.5) * block.spacing,
         energy=accumulate_profile(profiles.value * profiles.area),
         section=section,
         unknown=unknown,
@@ -76,9 +81,9 @@ def measure_lengths(vectors: np.ndarray) -> np.ndarray:
 def _measure_sections(
     block: WaveformBlock, profiles: Profiles, system: SystemPulse, start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cross section that each sample stands for, f8 (n, s) [m2], and waveforms of which it is unknown, bool (n,).
+    """Cross section of each sample, f8 (n, s) [m2], and waveforms where it is unknown, bool (n,).
 
-    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (ALGORITHMS 5).
+    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (docs/algorithms.md 5).
     """
     section = np.zeros(profiles.value.shape)
     if block.sensor is None:
@@ -91,7 +96,7 @@ def _measure_sections(
             system.calibration, distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
         )
         value = radiometry.cross_section(gamma, distance, 1e-3 * system.divergence)
-    # A sample without range makes its ray's sum no number: it compares as too large.
+    # A sample without range makes the sum of its ray NaN, which the comparison counts as unknown.
     with np.errstate(invalid="ignore", over="ignore"):
         unknown = ~(np.bincount(row, value, minlength=len(section)) <= MOST_SECTION)
     section[row, sample] = np.where(unknown[row], 0.0, value)

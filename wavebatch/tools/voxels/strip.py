@@ -1,4 +1,8 @@
-"""A strip to voxels: block after block deconvolved and summed, then written in order; memory does not grow."""
+"""A strip to voxels: every block is deconvolved and added to the grid, then the grid is written in order.
+
+`wavebatch voxelize` calls `voxelize_strip`. Memory does not grow with the strip: sums beyond a limit lie on disk. The
+output must not depend on block size, so nothing here may mix waveforms of a block.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +23,23 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import read_sample, survey_sample
-from wavebatch.surveying.sensor import NOBODY, SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
-from wavebatch.tools.voxels.output import VoxelSpace, check_target, open_voxels
+from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.rays import trace_profiles
 
 BLOCK_SAMPLES = 1 << 20
-"""Samples that are deconvolved together, unless told otherwise."""
+"""Samples read at a time."""
 
 _SAMPLED = 2048
+"""Waveforms from which the middle and the extent of the strip are found."""
 _LARGEST = 1e6
+"""Largest voxel [m]."""
 _MOST_FITTING = 0.9
-"""Share of the sampled rays that must fit the grid: the others are damage, or the voxels are too small."""
+"""Share of the sampled rays that must fit the grid; fewer mean damaged coordinates or too small voxels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +47,12 @@ class VoxelOptions:
     """How a strip becomes voxels."""
 
     size: float
-    """Of a voxel [m]."""
+    """Edge of a voxel [m]."""
     deconvolution: Deconvolution = field(default_factory=Deconvolution)
     headroom: float | None = None
-    """Way before the first sample of every waveform on which its ray counts too [m]; None: up to the highest return
-    near it."""
+    """Length before the first sample over which every ray counts too [m]; None: up to the highest return near it."""
     all_crossed: bool = False
-    """Voxels that rays crossed without any signal are written too."""
+    """Write voxels that rays crossed without any signal, too."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= _LARGEST:
@@ -58,7 +63,7 @@ class VoxelOptions:
 
 @dataclass(frozen=True, slots=True)
 class VoxelSummary:
-    """What was put into voxels."""
+    """Counts and facts of a voxelized strip."""
 
     strip: str
     output: str
@@ -71,27 +76,27 @@ class VoxelSummary:
     waveforms: int
     with_signal: int
     anchored: int
-    """Waveforms with signal placed by a return of their packet, the others by the raw location."""
+    """Waveforms with signal placed by a return of their packet; the others are placed by the raw location."""
     clipped: int
     """Waveforms with samples at the digitizer's limit: their energy is too low."""
     outside: int
-    """Waveforms left out: their position is no number, or too far from all others."""
+    """Waveforms left out: their position is not a number, or too far from all others."""
     energy: float
     """[DN ns]."""
     method: str
     pulse_fwhm: float
     """Full width at half maximum of the Gaussian that is as wide as the system pulse [ns]."""
     noise: float
-    """Of a sample [DN]."""
+    """Noise of a sample [DN]."""
     sensor: str | None = None
-    """Where its positions come from; None without calibration."""
+    """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
     """Waveforms with signal of unknown cross section."""
 
 
 @dataclass(slots=True)
 class _Counts:
-    """Waveforms so far."""
+    """Counts of waveforms, see VoxelSummary."""
 
     waveforms: int = 0
     with_signal: int = 0
@@ -114,11 +119,11 @@ def voxelize_strip(
     block_size: int | None = None,
     held: int = HELD,
 ) -> VoxelSummary:
-    """Deconvolves the waveforms of a strip and writes what came back from every voxel; the target's suffix says how.
+    """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
-    system: a saved survey in place of one of the strip. calibration: for cross sections; it, or the survey, must know
-    the beam's divergence. progress: called with the number of waveforms done since the last call, and of all.
-    block_size, held: waveforms at a time, and sums in memory; the output does not depend on them.
+    system: a saved survey, instead of a survey of this strip. calibration: for cross sections; it or the survey must
+    have the divergence of the beam. progress: called with the number of waveforms done since the last call, and the
+    total. block_size, held: waveforms at a time, and sums in memory; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
@@ -127,7 +132,7 @@ def voxelize_strip(
         refuse_existing(target)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         pulse = _find_pulse(reader, scan, system, calibration)
-        source = NOBODY if calibration is None else _find_sensor(reader, scan, sensor)
+        source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
         middle = _find_middle(reader, scan, options)
         ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
         with _open_grid(reader, middle, options, calibration is not None, held) as grid:
@@ -140,36 +145,29 @@ def voxelize_strip(
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             return VoxelSummary(
                 **asdict(counts),
-                **_summarise(grid, options, pulse),
                 strip=str(strip),
                 output=str(target),
-                voxels=_write(grid, target, space, overwrite),
+                voxels=write_voxels(target, space, grid.pieces(), overwrite=overwrite),
+                size=grid.size,
+                shape=tuple(grid.shape.tolist()),
+                origin=tuple((grid.low * grid.size).tolist()),
+                outside=grid.outside,
+                energy=grid.energy,
+                unknown=grid.unknown,
+                method=options.deconvolution.method,
+                pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
+                noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
             )
-
-
-def _summarise(grid: VoxelGrid, options: VoxelOptions, pulse: SystemPulse) -> dict[str, Any]:
-    """What the grid says of itself when all is added, and how it was filled."""
-    return {
-        "size": grid.size,
-        "shape": tuple(grid.shape.tolist()),
-        "origin": tuple((grid.low * grid.size).tolist()),
-        "outside": grid.outside,
-        "energy": grid.energy,
-        "unknown": grid.unknown,
-        "method": options.deconvolution.method,
-        "pulse_fwhm": pulse.sigma_ref * FWHM_PER_SIGMA,
-        "noise": pulse.noise_std,
-    }
 
 
 def _find_pulse(
     reader: StripReader, scan: StripScan, saved: SavedSurvey | None, calibration: Calibration | None
 ) -> SystemPulse:
-    """The pulse, saved or learned from the strip, with the calibration."""
+    """The system pulse, saved or learned from the strip, with the calibration."""
     path = reader.facts.path
     if not scan.packets:
-        raise InputError(f"{path}: holds no waveform to put into voxels; `wavebatch check` says what it holds")
+        raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
     system = survey_sample(read_sample(reader, scan)).system if saved is None else saved.survey.system
     if calibration is None:
         return system
@@ -186,18 +184,18 @@ def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | 
     source = find_sensor(reader, scan, request or SensorRequest())
     if source.kind == "none":
         raise InputError(
-            f"{reader.facts.path}: nobody knows where the sensor was, without which there are no cross sections: give "
-            "--trajectory or --flight-height, or leave --calibration out"
+            f"{reader.facts.path}: where the sensor was is unknown, but cross sections need it: give --trajectory or "
+            "--flight-height, or leave --calibration out"
         )
     return source
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
-    """A place in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
+    """A position in the middle of the strip, f8 (3,) [m]; ConfigError where the voxels are too small for the strip."""
     path, size = reader.facts.path, options.size
-    for said in reader.facts.units:
-        if not said.is_metric:
-            raise InputError(f"{path}: coordinates are {said.describe()}; voxels need metres: project the strip")
+    for unit in reader.facts.units:
+        if not unit.is_metric:
+            raise InputError(f"{path}: coordinates are {unit.describe()}; voxels need metres: project the strip")
     blocks = list(reader.sample_blocks(scan, _SAMPLED))
     start = np.concatenate([block.origin for block in blocks])
     step = np.concatenate([block.direction for block in blocks])
@@ -209,16 +207,14 @@ def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) ->
         size *= 2
         if size > _LARGEST:
             raise InputError(
-                f"{path}: its coordinates are spread over more than a grid can hold; see what `wavebatch check` says"
+                f"{path}: its coordinates are spread over more than a grid can hold; see `wavebatch check`"
             )
     if size > options.size:
         raise ConfigError(f"--size {options.size:g}: too small for the extent of this strip; take {size:g} m or more")
     return middle
 
 
-def _open_grid(
-    reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, held: int
-) -> VoxelGrid:
+def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, sections: bool, held: int) -> VoxelGrid:
     digitizers = reader.facts.digitizers.values()
     return VoxelGrid(
         options.size,
@@ -261,21 +257,10 @@ def _add_block(
     counts.clipped += int(profiles.clipped.sum())
 
 
-def _write(grid: VoxelGrid, target: Path, space: VoxelSpace, overwrite: bool) -> int:
-    """Writes the voxels; their number."""
-    number = 0
-    with open_voxels(target, space, overwrite=overwrite) as writer:
-        for index, columns in grid.pieces():
-            writer.write(index, columns)
-            number += len(index)
-        writer.commit()
-    return number
-
-
 def _describe(
     strip: Path, options: VoxelOptions, pulse: SystemPulse, calibration: Calibration | None
 ) -> dict[str, Any]:
-    """How the voxels were made; the same for every run."""
+    """How the voxels were made; goes into the file, so it holds no time of day."""
     deconvolution = options.deconvolution
     return {
         "wavebatch": __version__,

@@ -31,7 +31,7 @@ class Pulse:
     acceptance: float
     """Least fall of chi2 for one more echo."""
     digitizers: int
-    """Digitizers with a pulse or noise of their own."""
+    """Digitizers with another pulse or noise than the main one."""
 
     @classmethod
     def of(cls, solver: Solver) -> Pulse:

@@ -84,7 +84,7 @@ def measure_real(
     waveforms : how many to read, spread over the strip; None: twice as many as a survey looks at.
     stability : also survey halves, tiles and shuffled waveforms, which takes seven more surveys.
     survey_of : makes a survey from a list of blocks: another one than the program's, for experiments.
-    solver : survey and chain to use in place of the strip's own.
+    solver : survey and chain to use in place of those that the strip gives.
     say : gets a line for each step.
 
     Raises

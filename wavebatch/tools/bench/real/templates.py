@@ -1,4 +1,4 @@
-"""Pulses of a strip's own clear echoes: many echoes of like width, aligned by their fits, make a smooth curve.
+"""Pulses of a strip's clear echoes: many echoes of like width, aligned by their fits, make a smooth curve.
 
 Averaging takes the noise of the single echoes away ("optimal subtraction"), and a spline through samples of all
 sub-sample phases can be shifted by any delay without interpolation errors.

@@ -1,21 +1,24 @@
-"""The stiff and extreme cases H1 to H16 of ALGORITHMS.md 3 that can be simulated, each at stated values."""
+"""The stiff cases: the hazards H1 to H16 of docs/algorithms.md 3 that can be simulated, each at fixed values.
+
+`stability` runs every chain on them. tools.simulate.hazards draws at random values instead, for the scene `stiff`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 from wavebatch.tools.simulate import PulseModel, Recording, Scene
-from wavebatch.tools.simulate.draws import Drawn
-from wavebatch.tools.simulate.hazards import draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
+from wavebatch.tools.simulate.draws import Drawn, tabulate_echoes
+from wavebatch.tools.simulate.hazards import Draw, draw_broad, draw_constant, draw_contrast, draw_crowd, draw_huge
 
 SIGMA = 2.0
 """Width of the system pulse in all cases [ns]."""
-
-Draw = Callable[[np.random.Generator, int, Recording], Drawn]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,35 +51,30 @@ def make_scene(case: Case) -> CaseScene:
 def draw_echoes(
     rng: np.random.Generator, n: int, recording: Recording, *, heights: tuple[float, ...], gap: float = 0.0
 ) -> Drawn:
-    """Echoes of the system's width and the given heights [count], `gap` widths apart, somewhere in the middle."""
+    """Echoes of the system's width and the given heights [count], `gap` widths apart, away from the ends."""
     s, k = recording.pulse.sigma, len(heights)
     middle = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
     time = middle + gap * s * (np.arange(k) - 0.5 * (k - 1))
-    return _flatten(time, np.broadcast_to(np.array(heights, np.float64), (n, k)), s)
+    return tabulate_echoes(time, np.array(heights, np.float64), s)
 
 
 def draw_between(rng: np.random.Generator, n: int, recording: Recording, *, low: float, high: float) -> Drawn:
     """One echo of the system's width between two heights [count], evenly over their logarithm."""
     s = recording.pulse.sigma
     time = rng.uniform(12 * s, recording.duration - 12 * s, (n, 1))
-    return _flatten(time, np.exp(rng.uniform(np.log(low), np.log(high), (n, 1))), s)
+    return tabulate_echoes(time, np.exp(rng.uniform(np.log(low), np.log(high), (n, 1))), s)
 
 
 def draw_at_edge(rng: np.random.Generator, n: int, recording: Recording, *, inside: float) -> Drawn:
-    """One echo of 100 counts whose centre lies `inside` widths, give or take half a sample, from an end."""
+    """One echo of 100 counts whose centre lies `inside` widths, plus or minus half a sample, from an end."""
     distance = inside * recording.pulse.sigma + rng.uniform(-0.5, 0.5, (n, 1)) * recording.spacing
     time = np.where(rng.random((n, 1)) < 0.5, distance, recording.duration - distance)
-    return _flatten(time, np.full((n, 1), 100.0), recording.pulse.sigma)
+    return tabulate_echoes(time, 100.0, recording.pulse.sigma)
 
 
 def draw_clipped(rng: np.random.Generator, n: int, recording: Recording, *, level: float) -> Drawn:
-    """One echo of which the receiver records the lowest `level` of its height."""
+    """One echo of which the receiver records only the share `level` of its height."""
     return draw_echoes(rng, n, recording, heights=((recording.clip - recording.baseline) / level,))
-
-
-def _flatten(time: np.ndarray, amplitude: np.ndarray, sigma: float) -> Drawn:
-    n, k = time.shape
-    return Drawn(np.repeat(np.arange(n), k), time.ravel(), amplitude.ravel().copy(), np.full(n * k, sigma))
 
 
 def _list_cases() -> tuple[Case, ...]:
@@ -135,4 +133,13 @@ def _list_cases() -> tuple[Case, ...]:
 
 
 CASES: tuple[Case, ...] = _list_cases()
-"""Every case, in the order of the hazards. H13 to H15 are no matter of waveforms but of range and angle."""
+"""Every case, in the order of the hazards. H13 to H15 concern range and angle, not waveforms."""
+
+
+def list_cases(hazards: Sequence[str]) -> tuple[Case, ...]:
+    """The cases of the given hazards, all where none is given; raises ConfigError for a hazard without cases."""
+    known = list(dict.fromkeys(case.hazard for case in CASES))
+    for name in hazards:
+        if name not in known:
+            raise ConfigError(f"hazard {name!r} cannot be simulated; {nearest(name, known)}")
+    return tuple(case for case in CASES if not hazards or case.hazard in hazards)

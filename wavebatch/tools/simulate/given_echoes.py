@@ -1,4 +1,7 @@
-"""Waveforms that hold exactly the echoes that are asked for, and what a survey without error would say of them."""
+"""A block of waveforms with exactly the echoes that the caller gives, and its noise and system pulse without error.
+
+Tests and examples/papers use it where a scene is too random. `known_noise` and `known_system` stand in for a survey.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ def simulate_echoes(
     """A block of n waveforms without geometry that hold the given echoes, and its truth.
 
     time: peaks (n, k) [ns after sample 0], NaN where a waveform has fewer than k; amplitude [count] and sigma of the
-    main lobe [ns]: of the same shape, or what spreads to it. rng draws the noise.
+    main lobe [ns]: of the same shape, or broadcast to it. rng draws the noise.
     """
     drawn = tabulate_echoes(np.asarray(time, np.float64), amplitude, sigma)
     signal = paint_echoes(recording, len(time), drawn.waveform, drawn.time, drawn.amplitude, drawn.sigma)
@@ -35,28 +38,21 @@ def fine_recording(
 ) -> Recording:
     """A receiver of 16 bits with FINE counts per unit of amplitude, so that rounding and clipping do not matter.
 
-    noise_std: in units of amplitude, so that the echoes must be given FINE times theirs; sigma [ns] and kappa: of the
-    pulse.
+    noise_std: in units of amplitude; echoes must be given with FINE times their amplitude. sigma [ns] and kappa: width
+    and skew of the pulse.
     """
-    return Recording(
-        n_samples=n_samples,
-        spacing=spacing,
-        bits=16,
-        baseline=5000.0,
-        baseline_spread=0.0,
-        noise_std=FINE * noise_std,
-        pulse=PulseModel(sigma, kappa),
-    )
+    pulse = PulseModel(sigma, kappa)
+    return Recording(n_samples, spacing, 16, 5000.0, baseline_spread=0.0, noise_std=FINE * noise_std, pulse=pulse)
 
 
 def known_noise(recording: Recording, n: int, least: float = 0.0) -> Noise:
-    """The noise of n waveforms as it is; least: smallest standard deviation to state [count]."""
+    """The true noise of n waveforms; least: smallest standard deviation to return [count]."""
     std = max(recording.recorded_noise, least)
     return Noise(np.full(n, recording.baseline, np.float32), np.full(n, std, np.float32))
 
 
 def known_system(recording: Recording) -> SystemPulse:
-    """What a survey without error would say of the recording; lobes of the pulse are left out."""
+    """The result of a survey without error; lobes of the pulse are left out."""
     return SystemPulse(
         sigma_ref=recording.pulse.sigma,
         baseline=recording.baseline,

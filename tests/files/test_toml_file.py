@@ -1,0 +1,178 @@
+"""TOML writer and checked reader: round trips through tomllib, and one clear line for each wrong input."""
+
+import datetime
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.toml_file import (
+    LARGEST_INTEGER,
+    MOST_BYTES,
+    TomlTable,
+    check_number,
+    check_type,
+    format_toml,
+    parse_toml,
+    read_toml_text,
+    shorten,
+)
+
+PLAIN = (
+    st.text()
+    | st.booleans()
+    | st.integers(-(1 << 63), (1 << 63) - 1)
+    | st.floats(allow_nan=False)
+    | st.dates()
+    | st.datetimes()
+)
+VALUES = st.recursive(
+    PLAIN, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4), max_leaves=15
+)
+
+
+@given(st.dictionaries(st.text(), VALUES, max_size=6))
+def test_round_trip(document):
+    text = format_toml(document, heading="any\ntext", comments=dict.fromkeys(document, "any\nremark"))
+    assert tomllib.loads(text) == document
+    assert format_toml(tomllib.loads(text)) == format_toml(document)
+
+
+@pytest.mark.parametrize("value", ["\U0001d538\U0010ffff", 'a"\\\x00\x1f\x7f\x85\n\r\t', "\ufeff", "ä", "'''", ""])
+def test_strings_that_need_care(value):
+    text = format_toml({value: value, "t": {value: [value]}})
+    assert tomllib.loads(text) == {value: value, "t": {value: [value]}}
+
+
+def test_astral_characters_are_not_escaped():
+    assert format_toml({"a": "\U0001d538"}) == 'a = "\U0001d538"\n'
+
+
+def test_bytes_that_are_no_text_become_question_marks():
+    assert tomllib.loads(format_toml({"strip": "a\udcff.las"}))["strip"] == "a?.las"
+
+
+def test_numbers():
+    text = format_toml({"a": math.inf, "b": -math.inf, "c": 1e-5, "d": 1e300, "e": -0.0, "f": np.float32(0.5)})
+    assert text == "a = inf\nb = -inf\nc = 1e-05\nd = 1e+300\ne = -0.0\nf = 0.5\n"
+    assert math.isnan(tomllib.loads(format_toml({"a": math.nan}))["a"])
+    scalars = {"a": np.float64(0.1), "b": np.int64(3), "c": np.bool_(True)}
+    assert tomllib.loads(format_toml(scalars)) == {"a": 0.1, "b": 3, "c": True}
+
+
+def test_layout_with_comments():
+    document = {
+        "last": {"x": 1, "rows": [[1.0, 2]], "deep": {}},
+        "first": True,
+        "none": None,
+        "many": [{"x": 1}, {"x": 2, "y": {"z": "s"}}],
+    }
+    comments = {"last": "a table", "last.x": "a value", "last.rows": "an array", "many": "each", "many.x": "of each"}
+    assert format_toml(document, heading="head", comments=comments) == (
+        "# head\nfirst = true\n\n# a table\n[last]\nx = 1  # a value\n# an array\nrows = [[1.0, 2]]\n\n[last.deep]\n"
+        '\n# each\n[[many]]\nx = 1  # of each\n\n# each\n[[many]]\nx = 2  # of each\n\n[many.y]\nz = "s"\n'
+    )
+
+
+def test_inline_tables_in_mixed_lists():
+    document = {"a": [1, {"b": 2, "c d": []}], "e": [[{"f": "g"}]]}
+    assert tomllib.loads(format_toml(document)) == document
+
+
+def test_dates_keep_their_offset():
+    when = datetime.datetime(2020, 1, 2, 3, 4, 5, tzinfo=datetime.UTC)
+    assert tomllib.loads(format_toml({"a": when, "b": when.time()})) == {"a": when, "b": when.time()}
+
+
+@pytest.mark.parametrize("value", [object(), [None], b"bytes", {1, 2}, 1j])
+def test_other_types_are_refused(value):
+    with pytest.raises(TypeError, match="TOML cannot hold"):
+        format_toml({"a": value})
+
+
+def test_reading_is_bounded(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"#" * MOST_BYTES)
+    assert len(read_toml_text(path, "chain file")) == MOST_BYTES
+    path.write_bytes(b"#" * (MOST_BYTES + 1))
+    with pytest.raises(ConfigError, match="a.toml: chain file is larger than 4 MiB"):
+        read_toml_text(path, "chain file")
+    path.write_bytes(b"a = '\xff'")
+    with pytest.raises(ConfigError, match=r"a.toml: chain file is not UTF-8 text \(byte 5\)"):
+        read_toml_text(path, "chain file")
+    with pytest.raises(ConfigError, match="none.toml: chain file cannot be read: No such file"):
+        read_toml_text(tmp_path / "none.toml", "chain file")
+
+
+@pytest.mark.parametrize("text", ["a", "a = 1\na = 2", "a = " + "[" * 10_000, "a = " + "9" * 5000, 'a = "\\ud835"'])
+def test_text_that_is_not_toml(text):
+    with pytest.raises(ConfigError, match="x.toml: not valid TOML: "):
+        parse_toml(text, "x.toml")
+
+
+TABLE = parse_toml(
+    'text = "s"\nyes = true\nwhole = 3\nhalf = 0.5\nbad = nan\nhuge = 0x1'
+    + "0" * 5000
+    + "\n[t]\na = 1\n[[r]]\nb = 2\n",
+    "x.toml",
+)
+
+
+def test_typed_keys():
+    assert (TABLE.get("text", str), TABLE.get("yes", bool), TABLE.get("whole", int)) == ("s", True, 3)
+    assert (TABLE.number("half"), TABLE.number("whole", 0, 3), TABLE.integer("whole", 3, 3)) == (0.5, 3.0, 3)
+    assert type(TABLE.number("whole")) is float
+    assert (TABLE.get("none", str, ""), TABLE.number("none", 1, 2, default=None)) == ("", None)
+    assert TABLE.integer("none", 1, 2, default=0) == 0
+    assert TABLE.table("t") == TomlTable({"a": 1}, "x.toml: [t]")
+    assert TABLE.tables("r") == [TomlTable({"b": 2}, "x.toml: [[r]] 1")] and TABLE.tables("none") == []
+    TABLE.check_keys(TABLE.values, ["text"])
+
+
+@pytest.mark.parametrize(
+    ("check", "message"),
+    [
+        (lambda: TABLE.get("text", int), "x.toml: text must be an integer, it is 's'"),
+        (lambda: TABLE.get("yes", int), "x.toml: yes must be an integer, it is True"),
+        (lambda: TABLE.get("whole", bool), "x.toml: whole must be true or false, it is 3"),
+        (lambda: TABLE.get("none", str), "x.toml: key 'none' is missing"),
+        (lambda: TABLE.number("none", meaning="counts"), "x.toml: key 'none' is missing: counts"),
+        (lambda: TABLE.number("yes"), "x.toml: yes must be a number, it is True"),
+        (lambda: TABLE.number("bad"), "x.toml: bad must be a finite number, it is nan"),
+        (lambda: TABLE.number("huge"), "x.toml: huge must be a finite number, it is a very large number"),
+        (lambda: TABLE.get("huge", str), "x.toml: huge must be a string, it is a very large number"),
+        (lambda: TABLE.number("half", 1, 2), "x.toml: half must lie between 1 and 2, it is 0.5"),
+        (lambda: TABLE.integer("whole", 4, 5), "x.toml: whole must lie between 4 and 5, it is 3"),
+        (lambda: TABLE.integer("huge", 4, 5), "x.toml: huge must lie between 4 and 5, it is a very large number"),
+        (lambda: TABLE.table("text"), "x.toml: text must be a table, it is 's'"),
+        (lambda: TABLE.tables("t", "u.t"), "x.toml: t must be written as [[u.t]] tables"),
+        (lambda: TABLE.check_keys(["text", "whale"]), "x.toml: unknown key 'yes'; known are text, whale"),
+        (lambda: TABLE.table("t").check_keys("ab", "b", "add it"), "x.toml: [t]: key 'b' is missing; add it"),
+        (
+            lambda: TABLE.check_schema("s/1", "survey again"),
+            "x.toml: schema is None, this version reads 's/1'; survey again",
+        ),
+        (lambda: check_type("s", (int, type(None)), "here"), "here must be an integer, it is 's'"),
+        (lambda: check_type("s", (int, bool), "here"), "here must be an integer or true or false, it is 's'"),
+        (
+            lambda: check_number(LARGEST_INTEGER + 1, 0, math.inf, "here"),
+            "here must be a finite number, it is 9007199254740993",
+        ),
+    ],
+)
+def test_messages(check, message):
+    with pytest.raises(ConfigError) as caught:
+        check()
+    assert str(caught.value) == message
+
+
+def test_integers_stay_where_they_are_allowed():
+    assert type(check_type(3, (int, float), "")) is int
+
+
+def test_shorten():
+    assert shorten("a" * 100) == "'" + "a" * 56 + "..." and shorten({"a": "b"}) == "{'a': 'b'}"

@@ -1,0 +1,147 @@
+"""Normal equations of many small least-squares problems: products, solutions and parameter errors.
+
+Used by every fit here. Equations are in units in which each basis function has the same scale, so that the condition
+number is that of the overlap alone: float32 products are then exact enough, float64 solves are needed
+(docs/algorithms.md H2). Each reduction stays within one problem, so that results do not depend on the batch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+RIDGE = 1e-9
+"""Added to the diagonal of the scaled equations: an echo outside its window must not make them singular."""
+
+STEEP = 1e3
+"""Variance inflation by overlap from which products are taken in float64 (docs/algorithms.md H2)."""
+
+
+def gram_matrix(rows: np.ndarray) -> np.ndarray:
+    """Inner products of the rows of each problem.
+
+    Parameters
+    ----------
+    rows : float32 (m, p, L)
+        Rows of `evaluate_model`.
+
+    Returns
+    -------
+    float64 (m, p, p)
+        Products summed in float32.
+    """
+    return (rows @ rows.transpose(0, 2, 1)).astype(np.float64)
+
+
+def parameter_units(parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """What one unit of each row's coefficient means: 1 for amplitude, width / amplitude for time and width.
+
+    Parameters
+    ----------
+    parameters : float64 (m, 3, k)
+        Amplitude, time, width.
+    std : float64 (m,), count
+        Noise; amplitudes below half of it count as that.
+
+    Returns
+    -------
+    float64 (m, 3, k)
+    """
+    units = np.ones(parameters.shape)
+    units[:, 1] = units[:, 2] = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
+    return units
+
+
+def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray) -> np.ndarray:
+    """One standard deviation of each parameter, from the normal equations.
+
+    Where echoes overlap so much that float32 products are not exact enough, they are taken again in float64.
+
+    Parameters
+    ----------
+    parameters : float64 (m, 3, k)
+        Amplitude [count], time and width [samples].
+    std : float64 (m,), count
+        Noise of one sample.
+    rows : float32 (m, 3 k + 1, L)
+        Rows of `evaluate_model` at the parameters.
+    gram : float64 (m, 3 k + 1, 3 k + 1)
+        Their products.
+
+    Returns
+    -------
+    float64 (m, 3, k)
+        In the units of the parameters.
+    """
+    functions = gram[:, :-1, :-1]
+    variance = invert_diagonal(add_ridge(functions.copy()))
+    if parameters.shape[2] > 1:
+        inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
+        steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
+        if len(steep):
+            exact = rows[steep, :-1].astype(np.float64)
+            variance[steep] = invert_diagonal(add_ridge(exact @ exact.transpose(0, 2, 1)))
+    error = np.sqrt(np.maximum(variance, 0)).reshape(parameters.shape)
+    return error * parameter_units(parameters, std) * std[:, None, None]
+
+
+def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions of symmetric systems; by cofactors for p = 3, where problems are many and well conditioned.
+
+    Parameters
+    ----------
+    matrix : float64 (m, p, p)
+        Symmetric matrices.
+    right : float64 (m, p)
+        Right-hand sides.
+
+    Returns
+    -------
+    float64 (m, p)
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A matrix is singular (p other than 3); see `add_ridge`.
+    """
+    if matrix.shape[1] != 3:
+        return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+    cofactors, determinant = _cofactors(matrix)
+    xx, xy, xz, yy, yz, zz = cofactors
+    a, b, c = right.T
+    solution = np.empty_like(right)
+    solution[:, 0] = xx * a + xy * b + xz * c
+    solution[:, 1] = xy * a + yy * b + yz * c
+    solution[:, 2] = xz * a + yz * b + zz * c
+    solution /= determinant[:, None]
+    return solution
+
+
+def invert_diagonal(matrix: np.ndarray) -> np.ndarray:
+    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p), float64."""
+    if matrix.shape[1] != 3:
+        return np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2).copy()
+    (xx, _, _, yy, _, zz), determinant = _cofactors(matrix)
+    return np.stack([xx, yy, zz], axis=1) / determinant[:, None]
+
+
+def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Cofactors xx, xy, xz, yy, yz, zz and determinants of symmetric matrices (m, 3, 3)."""
+    xx, xy, xz, yy, yz, zz = np.ascontiguousarray(matrix.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]])
+    cofactors = (
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    )
+    determinant = xx * cofactors[0] + xy * cofactors[1] + xz * cofactors[2]
+    return cofactors, np.where(np.abs(determinant) > 1e-300, determinant, 1e-300)
+
+
+def add_ridge(gram: np.ndarray) -> np.ndarray:
+    """The matrices (m, p, p) with a ridge on the diagonal, so that no overlap makes them singular; changed in place."""
+    diagonal = np.einsum("mpp->mp", gram)
+    diagonal *= 1 + RIDGE
+    diagonal += RIDGE
+    return gram
