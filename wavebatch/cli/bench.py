@@ -52,7 +52,7 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
     survey of it. Without STRIP, named scenes are simulated (default: mixed). The table has one row per chain and the
     standard error of each figure.
 
-    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to other waveforms of it.
+    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
     The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
 
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.

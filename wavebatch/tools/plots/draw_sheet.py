@@ -49,8 +49,8 @@ def draw_sheet(
 ) -> None:
     """Writes a contact sheet, row by row in the order of `views`.
 
-    Each picture is scaled to its samples; its title gives packet, strongest amplitude and flags. times: the part to show
-    of all [ns]; None: each is cut to its echoes and returns. Raises as figure_file.open_picture does.
+    Each picture is scaled to its samples; its title gives packet, strongest amplitude and flags. times: part to show
+    in all [ns]; None: each is cut to its echoes and returns. Raises as figure_file.open_picture does.
     """
     columns = math.ceil(math.sqrt(len(views)))
     rows = -(-len(views) // columns)
