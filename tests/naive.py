@@ -87,7 +87,7 @@ def match_returns(echo_waveform, echo_time, return_waveform, return_time, tolera
 
 
 def pulse(x, t, s, kappa=0.0, components=()):
-    """Unit pulse of ALGORITHMS.md 0 and R1 in float64: Gaussian, skewed, or with further components."""
+    """Unit pulse of docs/algorithms.md 0 and R1 in float64: Gaussian, skewed, or with further components."""
     if abs(kappa) > 0:
         u = 1 + kappa * (x - t) / s
         level = np.log(np.where(u > 0, u, 1.0)) / kappa

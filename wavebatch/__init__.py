@@ -1,3 +1,96 @@
-"""wavebatch: decomposes full-waveform lidar strips and gives the point cloud back with what the waveform knows."""
+"""Decompose full-waveform lidar strips into point clouds with the physical attributes of every echo.
+
+The names below are the public API. Each is imported when it is first used, so that `import wavebatch` takes
+milliseconds.
+
+Examples
+--------
+>>> import wavebatch as wb
+>>> with wb.open_strip("strip.las") as strip:  # doctest: +SKIP
+...     survey = wb.survey(strip)
+...     chain = wb.load_chain("accurate")
+...     for block in strip.blocks():
+...         echoes = chain.run(block, survey.system)
+>>> result = wb.run(["a.las", "b.las"], "clouds", jobs=4)  # doctest: +SKIP
+>>> cloud = wb.read_cloud("clouds/a.laz")  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wavebatch.batch.run import BatchResult, Outcome
+    from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
+    from wavebatch.core.errors import ConfigError, InputError, StageError
+    from wavebatch.core.waveforms import Digitizer, Noise, ReturnTable, SystemPulse, WaveformBlock
+    from wavebatch.stages.chain import Chain, Range, Step, stage
+    from wavebatch.surveying.sensor import SensorRequest
+    from wavebatch.surveying.survey import Decision, Survey
+    from wavebatch.tools.api.chain import auto_chain, load_chain
+    from wavebatch.tools.api.cloud import read_cloud
+    from wavebatch.tools.api.run import run
+    from wavebatch.tools.api.strip import Strip, open_strip, survey
 
 __version__ = "0.1.0"
+
+_MODULES = {
+    "batch.run": ("BatchResult", "Outcome"),
+    "core.echoes": ("COLUMNS", "Column", "EchoFlag", "EchoTable"),
+    "core.errors": ("ConfigError", "InputError", "StageError"),
+    "core.waveforms": ("Digitizer", "Noise", "ReturnTable", "SystemPulse", "WaveformBlock"),
+    "stages.chain": ("Chain", "Range", "Step", "stage"),
+    "surveying.sensor": ("SensorRequest",),
+    "surveying.survey": ("Decision", "Survey"),
+    "tools.api.chain": ("auto_chain", "load_chain"),
+    "tools.api.cloud": ("read_cloud",),
+    "tools.api.run": ("run",),
+    "tools.api.strip": ("Strip", "open_strip", "survey"),
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [
+    "COLUMNS",
+    "BatchResult",
+    "Chain",
+    "Column",
+    "ConfigError",
+    "Decision",
+    "Digitizer",
+    "EchoFlag",
+    "EchoTable",
+    "InputError",
+    "Noise",
+    "Outcome",
+    "Range",
+    "ReturnTable",
+    "SensorRequest",
+    "StageError",
+    "Step",
+    "Strip",
+    "Survey",
+    "SystemPulse",
+    "WaveformBlock",
+    "__version__",
+    "auto_chain",
+    "load_chain",
+    "open_strip",
+    "read_cloud",
+    "run",
+    "stage",
+    "survey",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,13 +1,15 @@
 """Stages and chains: what the decorator refuses, the order of kinds, needs and makes, and a stage that fails."""
 
+from typing import Annotated
+
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages import chain as chain_module
-from wavebatch.stages.chain import KINDS, STAGES, Chain, Step, stage
+from wavebatch.stages.chain import KINDS, STAGES, Chain, Range, Step, stage
 from wavebatch.stages.chain_file import list_profiles, load_profile
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, noise_std=1.0)
@@ -15,8 +17,12 @@ SYSTEM = SystemPulse(2.0, baseline=12.0, noise_std=1.0)
 
 @pytest.fixture(autouse=True)
 def own_stages(monkeypatch):
-    """Stages that a test registers are gone after it."""
+    """Stages and columns that a test registers are gone after it."""
     monkeypatch.setattr(chain_module, "STAGES", dict(STAGES))
+    known = set(COLUMNS)
+    yield
+    for name in COLUMNS.keys() - known:
+        del COLUMNS[name]
 
 
 def block(n=3):
@@ -33,11 +39,22 @@ BASE = ("noise.pooled", "detect.maximum", "decompose.gaussian")
 
 def test_a_stage_is_known_by_kind_and_name_with_its_schema():
     @stage("detect")
-    def invented(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 3.0) -> EchoTable:
+    def invented(
+        block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: Annotated[float, Range(1, 9)] = 3.0
+    ) -> EchoTable:
         """Echoes of a test.
 
-        level: least height,
+        They are invented.
+
+        Parameters
+        ----------
+        level : float
+            Least height,
             in noise standard deviations.
+
+        References
+        ----------
+        None.
         """
         return EchoTable.empty()
 
@@ -47,19 +64,47 @@ def test_a_stage_is_known_by_kind_and_name_with_its_schema():
     parameter = made.parameters["level"]
     assert parameter.default == 3.0
     assert parameter.types == (float,)
-    assert parameter.meaning == "least height, in noise standard deviations."
+    assert parameter.range == (1, 9)
+    assert parameter.meaning == "Least height, in noise standard deviations."
+    assert made.text == "Echoes of a test.\n\nThey are invented.\n\nReferences: None."
     assert made.function is invented
 
 
 def no_default(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float) -> EchoTable:
     """Echoes.
 
-    level: least height.
+    Parameters
+    ----------
+    level : float
+        Least height.
     """
 
 
 def no_meaning(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 1.0) -> EchoTable:
     """Echoes."""
+
+
+def other_parameter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 1.0) -> EchoTable:
+    """Echoes.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    levels : float
+        Least height.
+
+    level: least height.
+    """
+
+
+def empty_entry(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 1.0) -> EchoTable:
+    """Echoes.
+
+    Parameters
+    ----------
+    level : float
+    """
 
 
 def wrong_data(block: WaveformBlock, system: SystemPulse) -> EchoTable:
@@ -82,7 +127,9 @@ def no_return(block: WaveformBlock, noise: Noise, system: SystemPulse):
     ("function", "words"),
     [
         (no_default, "parameter level needs a default"),
-        (no_meaning, "a line in the docstring"),
+        (no_meaning, "an entry under Parameters"),
+        (other_parameter, "parameter level needs a default and an entry"),
+        (empty_entry, "parameter level needs a default and an entry"),
         (wrong_data, "a detect stage takes"),
         (wrong_order, "a detect stage takes"),
         (wrong_return, "annotated to return EchoTable"),
@@ -161,6 +208,44 @@ def test_a_stage_that_needs_a_column_comes_after_the_one_that_makes_it(dependent
     for wrong in ((second,), (second, first)):
         with pytest.raises(ConfigError, match="attribute.second needs energy; put the stage that makes it before"):
             Chain((*steps(*BASE), *wrong))
+
+
+@pytest.mark.parametrize("first", ["attribute.incidence_angle_normals", "attribute.of_neighbours"])
+def test_two_stages_with_a_second_pass_are_refused(first):
+    """Only the last of them ran; the other's column was no-data without a word."""
+
+    @stage("attribute", makes=("energy",), second_pass=lambda *_, **__: None)
+    def of_neighbours(
+        block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *, radius: float = 1.0
+    ) -> EchoTable:
+        """A column.
+
+        Parameters
+        ----------
+        radius : float
+            Of the neighbourhood [m].
+        """
+
+    both = (first, "attribute.incidence_angle_normals")
+    names = (*BASE, "attribute.position", *both)
+    with pytest.raises(ConfigError, match=f"{both[0]} and {both[1]} both need a second pass .* keep one of them"):
+        Chain(tuple(Step(chain_module.STAGES[name]) for name in names), "mine.toml")
+    one = Chain(tuple(Step(chain_module.STAGES[name]) for name in names[:-1]))
+    assert one.second_step.stage.name == first
+
+
+def test_a_stage_can_declare_a_new_column():
+    roughness = Column("roughness", "f4", "m", "of the surface")
+
+    def rough(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+        """A column."""
+
+    stage("attribute", makes=(roughness,))(rough)
+    assert chain_module.STAGES["attribute.rough"].makes == ("roughness",)
+    assert COLUMNS["roughness"] is roughness
+    rough.__name__ = "rougher"
+    with pytest.raises(StageError, match="attribute.rougher declares column roughness, which there is already"):
+        stage("attribute", makes=(roughness,))(rough)
 
 
 def test_parameters_reach_the_stage_and_the_effective_ones_name_all():

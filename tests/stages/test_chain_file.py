@@ -137,10 +137,13 @@ def test_choices_are_checked(monkeypatch):
     def pick(block: WaveformBlock, system: SystemPulse, *, kind: Literal["a", "b"] = "a") -> Noise:
         """Noise.
 
-        kind: which.
+        Parameters
+        ----------
+        kind : {"a", "b"}
+            Which.
         """
 
     chain_module.stage("noise")(pick)
-    monkeypatch.setattr("wavebatch.stages.chain_file.STAGES", chain_module.STAGES)
+    monkeypatch.setattr("wavebatch.stages.plugins.STAGES", chain_module.STAGES)
     with pytest.raises(ConfigError, match='kind must be one of "a", "b", it is "c"'):
         parse_chain('[[chain]]\nstage = "noise.pick"\nkind = "c"\n', "x")

@@ -1,4 +1,4 @@
-"""Other pulse models and undamped steps: the tables of ALGORITHMS.md 1.2 and 1.3 (T7, T8), plain twins."""
+"""Other pulse models and undamped steps: the tables of docs/algorithms.md 1.2 and 1.3 (T7, T8), plain twins."""
 
 import naive
 import numpy as np
@@ -185,7 +185,7 @@ def test_undamped_steps_equal_the_plain_ones():
 @pytest.mark.parametrize(("off", "least", "most"), [(0.5, 1, 1), (1.0, 1, 1), (2.0, 0, 0)])
 @pytest.mark.parametrize("width", [0.8, 2.0, 3.0])
 def test_basin_of_undamped_steps(off, width, least, most):
-    """s = 2, SNR 100: from up to one sigma off every fit converges, from two none (ALGORITHMS 1.3)."""
+    """s = 2, SNR 100: from up to one sigma off every fit converges, from two none (docs/algorithms.md 1.3)."""
     n, x = 100, np.arange(60.0)
     y = 100 * np.exp(-0.5 * ((x - 30) / 2) ** 2) + np.random.default_rng(3).standard_normal((n, 60))
     windows = Windows(y.astype(np.float32), np.tile(x, (n, 1)).astype(np.float32), np.ones(n))

@@ -1,4 +1,4 @@
-"""Correlation and average square differences: test vectors and tables of ALGORITHMS.md 1.1 (T6)."""
+"""Correlation and average square differences: test vectors and tables of docs/algorithms.md 1.1 (T6)."""
 
 import naive
 import numpy as np

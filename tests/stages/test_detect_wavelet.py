@@ -1,4 +1,4 @@
-"""Wavelets and deconvolution: Wang's cases (T7), the numbers of ALGORITHMS.md 1.2 and 2.5, plain twins."""
+"""Wavelets and deconvolution: Wang's cases (T7), the numbers of docs/algorithms.md 1.2 and 2.5, plain twins."""
 
 import naive
 import numpy as np

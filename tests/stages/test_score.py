@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.fit.bounds import crlb
-from wavebatch.stages.score import ErrorStats, Scorer, find_isolated, list_pairs, match_echoes, score
+from wavebatch.stages.score import ErrorStats, find_isolated, list_pairs, match_echoes, score
 
 
 def match_naively(found, truth, tolerance):
@@ -152,31 +152,12 @@ def test_isolated_means_alone_inside_and_not_clipped():
     assert find_isolated(wide).tolist() == [False, False, False, False, True]
 
 
-def test_blocks_add_up_to_the_whole():
-    scene = make_scene("forest")
-    block, truth = make_block(scene, 600)
-    found = perturbed(truth, 1.0, 1.0, np.random.default_rng(5))
-    found = found.take(np.flatnonzero(np.random.default_rng(6).random(len(found)) < 0.8))
-    whole = score(found, truth, 600, noise_std=1.0)
-    scorer = Scorer(1.0)
-    for start in range(0, 600, 170):
-        stop = min(start + 170, 600)
-        parts = []
-        for echoes in (found, truth):
-            a, b = np.searchsorted(echoes.waveform, [start, stop])
-            part = echoes.take(np.arange(a, b))
-            parts.append(replace(part, waveform=part.waveform - np.int32(start)))
-        scorer.add(*parts, stop - start)
-    assert repr(scorer.result()) == repr(whole)  # NaN differs from itself
-
-
 def test_scores_of_nothing_are_not_numbers_and_no_warnings():
     result = score(EchoTable.empty(), EchoTable.empty(), 3, noise_std=1.0)
     assert result.exact_count == 1.0
     assert result.false_alarms == 0.0
     assert np.isnan(result.completeness)
     assert np.isnan(result.correctness)
-    assert Scorer(1.0).result().waveforms == 0
 
 
 def test_statistics_of_known_errors():

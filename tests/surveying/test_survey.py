@@ -90,7 +90,7 @@ def _survey_file(path):
 
 
 def test_riegl_is_what_is_known_of_it(riegl):
-    """R1, R3 and R4 of ALGORITHMS 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns, noise .97 to 1.31 DN."""
+    """R1, R3 and R4 of docs/algorithms.md 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns, noise .97 to 1.31 DN."""
     survey = _survey_file(riegl)
     system = survey.system
     assert len(system.components) >= 3 and system.kappa == 0

@@ -39,7 +39,7 @@ def call(*arguments, code=0):
 
 
 def wagner_waveforms(n, seed):
-    """The waveforms of the reproduction in ALGORITHMS.md 1.1."""
+    """The waveforms of the reproduction in docs/algorithms.md 1.1."""
     rng, x = np.random.default_rng(seed), np.arange(120.0)
     y = np.zeros((n, 120))
     for w, k in enumerate(1 + rng.choice(5, n, p=[0.58, 0.30, 0.09, 0.025, 0.005])):

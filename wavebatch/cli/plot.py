@@ -101,13 +101,13 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any], str]:
     """The waveforms that are wanted, and the name of the chain that they were run through."""
-    from wavebatch.cli.run import choose_chain
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
+    from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
     from wavebatch.tools.plots.waveform import read_views
 
-    chain, request = choose_chain({**options, "tolerance": None})
+    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan() as scan:
         choice = make_choice(reader, scan, chain, request)

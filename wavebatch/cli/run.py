@@ -10,7 +10,6 @@ import os
 import re
 import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -130,80 +129,29 @@ def _check_options(options: dict[str, Any]) -> None:
         raise ConfigError("--report - and --progress json would both write to stdout; give the report a file")
 
 
+_PASSED_ON = (
+    "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless", "scheduler", "memory",
+    "block_size", "overwrite", "resume",
+)  # fmt: skip
+"""Options that `plan_run` takes under the same names."""
+
+
 def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
     """Jobs and options of the batch; raises ConfigError for whatever is wrong with them."""
-    from wavebatch.batch.preflight import check_outputs, plan_memory
-    from wavebatch.batch.strip_task import BatchOptions
-    from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
-    from wavebatch.files.inputs import find_strips
-    from wavebatch.surveying.calibration import load_calibration
+    from wavebatch.tools.api.run import plan_run
 
-    chain, request = choose_chain(options)
-    calibration = load_calibration(options["calibration_file"]) if options["calibration_file"] else None
-    sensor = read_sensor(options)
-    template = StripJob(Path(), chain, RunOptions(), request, sensor, calibration)
-    chain = chain if options["chain_file"] else template.extend(chain)
-    _check_use(chain, options)
-    run_options = RunOptions(
-        direction=options["direction"],
-        headerless=options["headerless"],
-        points=options["points"],
-        format=options["file_format"],
-        point_format=options["point_format"],
-        names=options["names"],
-        columns=choose_columns(chain, options["columns"]),
-        keep_packets=options["keep_packets"],
-    )
-    strips = find_strips(options["strips"])
-    wanted = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
-    processes, block_size = plan_memory(wanted, options["memory"])
-    batch_options = BatchOptions(
-        folder=options["output"],
-        jobs=processes,
-        scheduler=options["scheduler"],
-        block_size=options["block_size"] or block_size,
-        overwrite=options["overwrite"],
-        resume=options["resume"],
-    )
-    jobs = [replace(template, path=path, chain=chain, options=run_options) for path in strips]
-    check_outputs(jobs, batch_options)
-    return jobs, batch_options
-
-
-def choose_chain(options: dict[str, Any]) -> tuple[Any, Any]:
-    """The chain, or the widest one that a strip's survey may choose, and the request that goes with it.
-
-    options: chain_file, profile, tolerance and system_file, each None where it was not given.
-    """
-    from wavebatch.core.suggest import nearest
-    from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-    from wavebatch.surveying.choose_chain import Request, widest
-    from wavebatch.surveying.system_file import load_survey
-
-    profile = options["profile"] or "auto"
-    request = Request(
-        auto=profile == "auto" and not options["chain_file"] and not options["tolerance"],
+    return plan_run(
+        options["strips"],
+        options["output"],
+        chain=options["chain_file"] or options["profile"],
         tolerance=_read_tolerance(options["tolerance"]),
-        system=load_survey(options["system_file"]) if options["system_file"] else None,
+        system=options["system_file"],
+        sensor=read_sensor(options),
+        calibration=options["calibration_file"],
+        format=options["file_format"],
+        jobs=1 if options["jobs"] is None else options["jobs"],
+        **{name: options[name] for name in _PASSED_ON},
     )
-    if options["chain_file"]:
-        return load_chain(options["chain_file"]), request
-    if request.auto or request.tolerance is not None:
-        return widest(request), request
-    if profile not in list_profiles():
-        raise ConfigError(f"profile {profile!r} does not exist; {nearest(profile, ['auto', *list_profiles()])}")
-    return load_profile(profile), request
-
-
-def _check_use(chain: Any, options: dict[str, Any]) -> None:
-    """Raises ConfigError for options that the chain would ignore."""
-    from wavebatch.surveying.calibration import needs_sensor
-
-    given = [name for name in ("trajectory", "flight_height", "calibration_file") if options[name] is not None]
-    if given and not needs_sensor(chain):
-        option = f"--{given[0].removesuffix('_file').replace('_', '-')}"
-        stage = "attribute.backscatter_coefficient" if given[0] == "calibration_file" else "attribute.range"
-        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
 
 
 def _read_tolerance(text: str | None) -> float | None:

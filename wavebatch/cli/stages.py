@@ -5,12 +5,11 @@ The texts come from the docstrings of the stages and from `wavebatch.stages.chai
 
 from __future__ import annotations
 
-import inspect
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import print_result
+from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.options import common_options
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
@@ -30,7 +29,10 @@ def stages(name: str | None, as_json: bool, debug: bool) -> None:
     Exit code: 0 done, 2 no stage has this name.
     """
     from wavebatch.stages.chain import KINDS, STAGES
+    from wavebatch.stages.plugins import load_plugins
 
+    for line in load_plugins() if name not in STAGES else ():
+        talk(f"warning: {line}")
     if name is not None and name not in STAGES:
         hint = nearest(name, STAGES)
         raise ConfigError(f"no stage {name!r}; {hint if '?' in hint else '`wavebatch stages` lists them'}")
@@ -59,20 +61,12 @@ def _describe(stage: Stage) -> dict[str, Any]:
     return {
         "name": stage.name,
         "kind": stage.kind,
-        "text": _prose(stage),
+        "text": stage.text,
         "makes": list(stage.makes),
         "needs": list(stage.needs),
         "parameters": parameters,
         "example": format_step(stage.name, {name: one["default"] for name, one in parameters.items()}),
     }
-
-
-def _prose(stage: Stage) -> str:
-    """The docstring without the parameters."""
-    lines = (inspect.getdoc(stage.function) or "").splitlines()
-    heads = tuple(f"{name}:" for name in stage.parameters)
-    end = next((i for i, line in enumerate(lines) if heads and line.startswith(heads)), len(lines))
-    return "\n".join(lines[:end]).strip()
 
 
 def _explain(stage: Stage) -> str:

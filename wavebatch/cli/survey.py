@@ -6,7 +6,6 @@ Calls the survey and prints it; the measurements are in `wavebatch.surveying`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,6 @@ from wavebatch.cli.options import common_options, output_option, strip_argument,
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
-    from wavebatch.files.strip.reader import StripReader, StripScan
     from wavebatch.surveying.system_file import SavedSurvey
 
 
@@ -51,7 +49,6 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
         if target is not None and not overwrite:
             refuse_existing(target)
     saved, facts = _survey(strip, options)
-    saved = replace(saved, survey=replace(saved.survey, decisions=tuple(_decisions(saved))))
     if output is not None:
         write_survey(output, saved, overwrite=overwrite)
     if chain_file is not None:
@@ -63,43 +60,23 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
 
 
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
-    """The survey, and what else is told about the strip."""
-    from wavebatch.core.errors import InputError
+    """The survey, and what else is shown of the strip."""
     from wavebatch.files.disk.fingerprint import take_fingerprint
-    from wavebatch.files.strip.reader import StripReader
-    from wavebatch.surveying.angle_limits import survey_angles
-    from wavebatch.surveying.choose_chain import read_sample, survey_sample
     from wavebatch.surveying.system_file import SavedSurvey
+    from wavebatch.tools.api.strip import open_strip
+    from wavebatch.tools.api.strip import survey as survey_strip
 
-    with StripReader(strip, direction=options["direction"], headerless=options["headerless"]) as reader:
-        with reader.scan() as scan:
-            sample = read_sample(reader, scan, options["waveforms"])
-            facts = _describe_strip(reader, scan)
-            if not sample:
-                raise InputError(f"{strip}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-            found = survey_sample(sample)
-            if options["divergence"] is not None:
-                found = survey_angles(reader, scan, found, options["divergence"])
-        packet_file = reader.facts.packet_file
+    with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
+        found = survey_strip(opened, waveforms=options["waveforms"], divergence=options["divergence"])
+        scan = opened.scan
+        facts = {
+            "strip": str(opened.facts.path),
+            "points": scan.points,
+            "packets": scan.packets,
+            "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
+        }
+        packet_file = opened.facts.packet_file
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
-
-
-def _describe_strip(reader: StripReader, scan: StripScan) -> dict[str, Any]:
-    return {
-        "strip": str(reader.facts.path),
-        "points": scan.points,
-        "packets": scan.packets,
-        "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
-    }
-
-
-def _decisions(saved: SavedSurvey) -> list[Any]:
-    """Those of the chosen chain, then what the scene would need that no chain has without further files."""
-    from wavebatch.surveying.auto_chain import decide
-
-    chosen = decide(saved.survey)
-    parts = {decision.part for decision in chosen}
-    return [*chosen, *(decision for decision in saved.survey.decisions if decision.part not in parts)]
 
 
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:

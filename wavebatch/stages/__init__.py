@@ -1,21 +1,6 @@
-"""The algorithms: every stage is a plain function, registered in `wavebatch.stages.chain.STAGES` by this import."""
+"""The algorithms: every stage is a plain function. Importing this package registers all of them in `chain.STAGES`."""
 
-from wavebatch.stages import noise
-from wavebatch.stages.attribute import basic, normal_angle, radiometry, width_angle
-from wavebatch.stages.decompose import fit, loops, models
-from wavebatch.stages.detect import classic, correlation, maximum, wavelet
-
-__all__ = [
-    "basic",
-    "classic",
-    "correlation",
-    "fit",
-    "loops",
-    "maximum",
-    "models",
-    "noise",
-    "normal_angle",
-    "radiometry",
-    "wavelet",
-    "width_angle",
-]
+from wavebatch.stages import noise  # noqa: F401
+from wavebatch.stages.attribute import basic, normal_angle, radiometry, width_angle  # noqa: F401
+from wavebatch.stages.decompose import fit, loops, models  # noqa: F401
+from wavebatch.stages.detect import classic, correlation, maximum, wavelet  # noqa: F401

@@ -1,18 +1,23 @@
-"""Stages and chains: a stage is a plain function, a chain is the ordered list of stages that a block runs through."""
+"""Stages and chains: a stage is a plain function, a chain is the ordered list of stages that a block runs through.
+
+The decorator `stage` registers functions; chain files name them. The signature of a stage is its schema in the chain
+file: every keyword argument is a key, its annotation gives type and range, its default the value when left out.
+"""
 
 from __future__ import annotations
 
 import inspect
+import re
 import time
 import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 
@@ -24,39 +29,28 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
 }
 """Per kind of stage: its data arguments, in order, and what it returns. Chains hold the kinds in this order."""
 
+_SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
+_ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
+"""Heading of a section of a numpydoc docstring, and of a parameter in it."""
 
-_MANY = 1e6
-RANGES: dict[str, tuple[float, float]] = {
-    **dict.fromkeys(("threshold", "t_diff", "significance", "acceptance"), (0.0, _MANY)),
-    **dict.fromkeys(("gate_residual", "gate_hermite", "tolerance"), (0.0, _MANY)),
-    **dict.fromkeys(("fraction", "similarity", "reference_error"), (0.0, 1.0)),
-    **dict.fromkeys(("max_iterations", "max_echoes"), (1, 1000)),
-    **dict.fromkeys(("scale", "width_prior", "guard", "duration"), (0.0, 100.0)),
-    **dict.fromkeys(("level", "limit"), (0.1, _MANY)),
-    "iterations": (1, 10_000),
-    "steps": (0, 100),
-    "reach": (0.5, 20.0),
-    "kappa": (-1.0, 1.0),
-    "samples": (2, 65_535),
-    "divergence": (0.0, 100.0),
-    "max_error": (1e-3, 180.0),
-    "radius": (1e-3, 1000.0),
-    "min_points": (4, 10_000),
-}
-"""Least and largest value of numeric parameters by name, which means the same in every stage."""
+
+class Range(NamedTuple):
+    """Least and largest value of a number, as in `threshold: Annotated[float, Range(0, 1e6)] = 4.0`."""
+
+    low: float
+    high: float
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One keyword argument of a stage: its key in the chain file."""
+    """One keyword argument of a stage: a key of its table in the chain file."""
 
     name: str
     types: tuple[type, ...]
     default: Any
     meaning: str
     choices: tuple[Any, ...] | None = None
-    range: tuple[float, float] | None = None
-    """Least and largest value; None where it is no number."""
+    range: Range | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,32 +65,62 @@ class Stage:
     makes: tuple[str, ...] = ()
     """Names of the attribute columns that the stage adds."""
     needs: tuple[str, ...] = ()
-    """Names of the attribute columns that must be there before."""
+    """Names of the attribute columns that earlier stages must have added."""
     second_pass: Callable[..., Any] | None = None
-    """Kernel that fills the stage's columns once all points of the strip are there; the stage itself, which sees one
-    block only, makes no-data and the columns `ray_x`, `ray_y`, `ray_z`.
+    """Kernel that computes the stage's columns from all points of the strip. The stage sees one block only, so it fills
+    its columns with no-data and adds `ray_x`, `ray_y`, `ray_z`.
 
-    It is called with points (n, 3) [m], rays (n, 3), kernels.normals.Surroundings and the stage's parameters, of which
-    `radius` [m] is how far away points matter; it returns values of the columns, and a kernels.normals.Gap each."""
+    The kernel gets points (n, 3) [m], rays (n, 3), kernels.geometry.normals.Surroundings and the stage's parameters,
+    of which `radius` [m] is the largest distance at which a point matters. It returns the columns' values and a
+    kernels.geometry.normals.Gap for each point."""
 
     @property
     def summary(self) -> str:
-        """First line of the docstring: what comes out."""
-        return (inspect.getdoc(self.function) or "").splitlines()[0]
+        """First line of the docstring."""
+        return self.text.splitlines()[0]
+
+    @property
+    def text(self) -> str:
+        """The docstring without its parameters; further sections follow as `Title: text`."""
+        prose, sections = _split_docstring(self.function)
+        rest = [f"{title}: {body}" for title, body in sections.items() if title not in ("Parameters", "Returns")]
+        return "\n\n".join([prose, *rest])
 
 
 STAGES: dict[str, Stage] = {}
-"""Every registered stage by name; filled when `wavebatch.stages` is imported."""
+"""Every registered stage by name; filled when `wavebatch.stages` is imported, and by plugins."""
 
 
 def stage(
     kind: str,
     *,
-    makes: tuple[str, ...] = (),
+    makes: tuple[str | Column, ...] = (),
     needs: tuple[str, ...] = (),
     second_pass: Callable[..., Any] | None = None,
-) -> Callable:
-    """Decorator that registers a function as stage `kind.<function name>` and checks its signature."""
+) -> Callable[[Callable], Callable]:
+    """Register the decorated function as stage `kind.<function name>`.
+
+    Parameters
+    ----------
+    kind : {"noise", "detect", "decompose", "attribute"}
+        Decides the data arguments and the result: see KINDS.
+    makes : tuple of str or Column
+        Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
+    needs : tuple of str
+        Attribute columns that earlier stages must have added.
+    second_pass : callable, optional
+        See `Stage.second_pass`.
+
+    Returns
+    -------
+    callable
+        A decorator that returns the function unchanged.
+
+    Raises
+    ------
+    StageError
+        For a wrong signature, a parameter without default or description, and a name that is taken.
+    """
     if kind not in KINDS:
         raise StageError(f"stage kind {kind!r} is not one of {', '.join(KINDS)}")
 
@@ -107,7 +131,12 @@ def stage(
         parameters = _read_parameters(name, kind, function)
         if second_pass is not None and "radius" not in parameters:
             raise StageError(f"stage {name} has a second pass, but no parameter radius")
-        STAGES[name] = Stage(name, kind, function, parameters, makes, needs, second_pass)
+        new = {column.name: column for column in makes if isinstance(column, Column)}
+        if taken := new.keys() & COLUMNS.keys():
+            raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
+        COLUMNS.update(new)
+        names = tuple(column.name if isinstance(column, Column) else column for column in makes)
+        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass)
         return function
 
     return register
@@ -115,55 +144,46 @@ def stage(
 
 def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Parameter]:
     signature = inspect.signature(function)
-    hints = typing.get_type_hints(function)
+    hints = typing.get_type_hints(function, include_extras=True)
     data = tuple(p.name for p in signature.parameters.values() if p.kind is not p.KEYWORD_ONLY)
     if data != KINDS[kind][0]:
         raise StageError(f"stage {name} takes {data}, a {kind} stage takes {KINDS[kind][0]}")
     if hints.get("return") is not KINDS[kind][1]:
         raise StageError(f"stage {name} must be annotated to return {KINDS[kind][1].__name__}")
-    meanings = _read_meanings(inspect.getdoc(function) or "")
+    _, *entries = _ENTRY.split(_split_docstring(function)[1].get("Parameters", ""))
+    meanings = {head: " ".join(text.split()) for head, text in zip(entries[::2], entries[1::2], strict=True)}
     parameters = {}
-    for parameter in signature.parameters.values():
+    for key, parameter in signature.parameters.items():
         if parameter.kind is not parameter.KEYWORD_ONLY:
             continue
-        if parameter.default is parameter.empty or parameter.name not in meanings:
-            raise StageError(f"stage {name}: parameter {parameter.name} needs a default and a line in the docstring")
-        kinds, choices = _read_hint(hints[parameter.name])
-        limits = RANGES.get(parameter.name) if {int, float} & set(kinds) and choices is None else None
-        parameters[parameter.name] = Parameter(
-            parameter.name, kinds, parameter.default, meanings[parameter.name], choices, limits
-        )
+        if parameter.default is parameter.empty or not meanings.get(key):
+            raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
+        kinds, choices, limits = _read_hint(hints[key])
+        parameters[key] = Parameter(key, kinds, parameter.default, meanings[key], choices, limits)
     return parameters
 
 
-def _read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None]:
+def _read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Range | None]:
+    """Types, choices and range that an annotation allows."""
+    if typing.get_origin(hint) is typing.Annotated:
+        hint, *notes = typing.get_args(hint)
+        limits = next((note for note in notes if isinstance(note, Range)), None)
+        return (*_read_hint(hint)[:2], limits)
     if typing.get_origin(hint) is typing.Literal:
         choices = typing.get_args(hint)
-        return tuple({type(choice) for choice in choices}), choices
-    if isinstance(hint, types.UnionType):
-        return tuple(typing.get_args(hint)), None
-    return (hint,), None
+        return tuple({type(choice) for choice in choices}), choices, None
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,), None, None
 
 
-def _read_meanings(docstring: str) -> dict[str, str]:
-    """`name: meaning` paragraphs of a docstring; a meaning runs until a blank line or the next name."""
-    meanings: dict[str, str] = {}
-    current = None
-    for line in docstring.splitlines()[1:]:
-        head, colon, rest = line.partition(":")
-        if colon and head.isidentifier():
-            current = head
-            meanings[current] = rest.strip()
-        elif not line.strip():
-            current = None
-        elif current:
-            meanings[current] += " " + line.strip()
-    return meanings
+def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:
+    """Text before the first section of a numpydoc docstring, and the text of each section."""
+    prose, *rest = _SECTION.split(inspect.getdoc(function) or "")
+    return prose.strip(), {title: body.strip("\n") for title, body in zip(rest[::2], rest[1::2], strict=True)}
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One stage of a chain with its parameters; those not named keep the stage's defaults."""
+    """One stage of a chain with the parameters that the chain sets; all others keep their defaults."""
 
     stage: Stage
     parameters: Mapping[str, Any] = field(default_factory=dict)
@@ -181,11 +201,18 @@ class Chain:
     name: str = ""
 
     def __post_init__(self) -> None:
+        """Check the order of the stages and the columns that they need."""
         kinds = [step.stage.kind for step in self.steps]
         if kinds[:3] != ["noise", "detect", "decompose"] or any(kind != "attribute" for kind in kinds[3:]):
             raise ConfigError(
                 f"chain {self.name or '(unnamed)'}: needs one noise, one detect and one decompose stage, then "
                 f"attribute stages, in this order; it has {', '.join(kinds) or 'nothing'}"
+            )
+        second = [step.stage.name for step in self.steps if step.stage.second_pass is not None]
+        if len(second) > 1:
+            raise ConfigError(
+                f"chain {self.name or '(unnamed)'}: {' and '.join(second)} both need a second pass over the points, a "
+                "run makes only one; keep one of them"
             )
         have: set[str] = set()
         for step in self.steps:
@@ -204,13 +231,33 @@ class Chain:
 
     @property
     def second_step(self) -> Step | None:
-        """The last step that needs a second pass over the strip's points; None where no step does."""
-        return next((step for step in reversed(self.steps) if step.stage.second_pass is not None), None)
+        """The step that needs a second pass over the strip's points; None where no step does."""
+        return next((step for step in self.steps if step.stage.second_pass is not None), None)
 
-    def run(
-        self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None
-    ) -> EchoTable:
-        """Echoes of the block; seconds spent in each stage are added to `timing`."""
+    def run(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> EchoTable:
+        """Find and describe the echoes of a block.
+
+        Parameters
+        ----------
+        block : WaveformBlock
+            n waveforms of one digitizer and one length.
+        system : SystemPulse
+            Pulse and noise of the strip, from its survey.
+        timing : dict, optional
+            Seconds spent in each stage are added here, by the stage's name.
+
+        Returns
+        -------
+        EchoTable
+            Echoes sorted by waveform, then time, with the columns of the attribute stages.
+
+        Raises
+        ------
+        ConfigError
+            Where a stage refuses a parameter's value.
+        StageError
+            Where a stage fails: a bug.
+        """
         data: dict[str, Any] = {"block": block, "system": system.of(block)}
         slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
         for step in self.steps:

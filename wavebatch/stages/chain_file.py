@@ -18,28 +18,79 @@ from wavebatch.files.toml_file import (
     parse_toml,
     read_toml_text,
 )
-from wavebatch.stages.chain import STAGES, Chain, Stage, Step
+from wavebatch.stages.chain import Chain, Stage, Step
+from wavebatch.stages.plugins import find_stage
 
 
 def list_profiles() -> list[str]:
-    """Names of the shipped chains."""
+    """Return the names of the shipped chains, sorted."""
     return sorted(file.name.removesuffix(".toml") for file in _shipped().iterdir() if file.name.endswith(".toml"))
 
 
 def load_profile(name: str) -> Chain:
-    """The shipped chain of that name; raises ConfigError where there is none."""
+    """Load a shipped chain.
+
+    Parameters
+    ----------
+    name : str
+        A name of `list_profiles`.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown name.
+    """
     if name not in list_profiles():
         raise ConfigError(f"profile {name!r} does not exist; {nearest(name, list_profiles())}")
     return parse_chain((_shipped() / f"{name}.toml").read_text("utf-8"), f"profile {name}")
 
 
 def load_chain(path: Path | str) -> Chain:
-    """The chain of a TOML file; raises ConfigError that names file, table, key and the nearest known word."""
+    """Load the chain of a TOML file.
+
+    Parameters
+    ----------
+    path : path or str
+        The file.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        Where the file or the chain is wrong; names file, table, key and the nearest known word.
+    """
     return parse_chain(read_toml_text(path, "chain file"), str(path))
 
 
 def parse_chain(text: str, name: str) -> Chain:
-    """The chain that TOML text describes; `name` stands in front of every error message."""
+    """Read a chain from TOML text.
+
+    Parameters
+    ----------
+    text : str
+        [[chain]] tables.
+    name : str
+        Name of the chain; every error message starts with it.
+
+    Returns
+    -------
+    Chain
+        The checked chain.
+
+    Raises
+    ------
+    ConfigError
+        Where the chain is wrong.
+    """
     document = parse_toml(text, name)
     document.check_keys(["chain"])
     steps = tuple(map(_read_step, document.tables("chain")))
@@ -47,12 +98,36 @@ def parse_chain(text: str, name: str) -> Chain:
 
 
 def effective(chain: Chain) -> str:
-    """TOML text of the chain with every parameter as it will be used; `parse_chain` gives the same chain again."""
+    """Write a chain as TOML text with every parameter as it will be used; `parse_chain` reads it back.
+
+    Parameters
+    ----------
+    chain : Chain
+        Any chain.
+
+    Returns
+    -------
+    str
+        [[chain]] tables.
+    """
     return "\n".join(format_step(step.stage.name, step.effective()) for step in chain.steps)
 
 
 def format_step(stage: str, parameters: Mapping[str, Any]) -> str:
-    """One [[chain]] table as TOML text; parameters that are None are left out."""
+    """Write one [[chain]] table as TOML text; parameters that are None are left out.
+
+    Parameters
+    ----------
+    stage : str
+        Name of the stage.
+    parameters : mapping
+        Values by name.
+
+    Returns
+    -------
+    str
+        The table.
+    """
     return format_toml({"chain": [{"stage": stage, **parameters}]}).lstrip()
 
 
@@ -63,9 +138,7 @@ def _shipped() -> Any:
 def _read_step(table: TomlTable) -> Step:
     table.check_keys(table.values, ["stage"], 'name one, for example stage = "detect.maximum"')
     name = table.get("stage", str)
-    if name not in STAGES:
-        raise ConfigError(f"{table.where}: unknown stage {name!r}; {nearest(name, STAGES)}")
-    stage, where = STAGES[name], f"{table.where} ({name})"
+    stage, where = find_stage(name, table.where), f"{table.where} ({name})"
     TomlTable(table.values, where).check_keys(["stage", *stage.parameters])
     keys = (key for key in table.values if key != "stage")
     return Step(stage, {key: _read_value(stage, key, table.values[key], f"{where}: {key}") for key in keys})

@@ -1,4 +1,4 @@
-"""What is known to be wrong or doubtful about echoes, from the table and the samples alone."""
+"""Flags of echoes that need no fit: weak, cut, narrow, ringing, saturated. Every decomposer sets them at its end."""
 
 from __future__ import annotations
 
@@ -11,23 +11,40 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
 
 NEIGHBOURS = 5
-"""Echoes before and behind that one is compared with."""
+"""Each echo is compared with this many echoes before and after it."""
 
 RINGING_REACH = 12.0
-"""Widths of the system pulse behind an echo in which its ringing is looked for (H7)."""
+"""Ringing is looked for up to this many system widths after an echo (docs/algorithms.md H7)."""
 
 RINGING_FACTOR = 1.2
-"""Echoes up to this many times the strip's ringing may be ringing (H7)."""
+"""Echoes up to this many times the strip's ringing may be ringing (docs/algorithms.md H7)."""
 
 LEAST_RATIO = 0.02
-"""Share of a stronger echo beside it that an echo must exceed: no learned pulse is known better (R3)."""
+"""Share of a stronger neighbour that an echo must exceed: no learned pulse is better known (docs/algorithms.md R3)."""
 
 UNRELIABLE_BELOW = 0.15
-"""Share of an echo's height below the digitizer's limit under which its amplitude is a guess (H6)."""
+"""Below this share of an echo under the digitizer's limit its amplitude is a guess (docs/algorithms.md H6)."""
 
 
 def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: EchoTable) -> EchoTable:
-    """The table with the flags that need no fit: weak, near an edge, narrow, ringing suspect, saturated."""
+    """Set the flags WEAK, NEAR_EDGE, NARROW, RINGING_SUSPECT, SATURATED and AMPLITUDE_UNRELIABLE.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    noise : Noise
+        Their baselines and noise.
+    system : SystemPulse
+        Pulse, ringing and saturation level of the strip.
+    table : EchoTable
+        Echoes of the block.
+
+    Returns
+    -------
+    EchoTable
+        The same echoes with these flags.
+    """
     last = (block.samples.shape[1] - 1) * block.spacing
     table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
     edge = np.minimum(table.time, last - table.time) < table.sigma
@@ -42,14 +59,38 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
 
 
 def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
-    """The table without echoes so faint beside a stronger one that an error of the learned pulse explains them."""
+    """Drop echoes that are so faint next to a stronger one that an error of the learned pulse explains them.
+
+    Parameters
+    ----------
+    table : EchoTable
+        Fitted echoes.
+    system : SystemPulse
+        With the components of the learned pulse.
+
+    Returns
+    -------
+    EchoTable
+        The remaining echoes.
+    """
     delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
     reach = max([4 * system.sigma_ref, *delays])
     return table.take(np.flatnonzero(~_faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)))
 
 
 def clear_lone(table: EchoTable) -> EchoTable:
-    """The table without OVERLAPPED where no other echo of the waveform has it: what they were fitted with is gone."""
+    """Clear OVERLAPPED where no other echo of the waveform has it: its partners in the fit were dropped.
+
+    Parameters
+    ----------
+    table : EchoTable
+        Fitted echoes.
+
+    Returns
+    -------
+    EchoTable
+        The same echoes.
+    """
     overlapped = (table.flags & np.uint16(EchoFlag.OVERLAPPED)) != 0
     merged = (table.flags & np.uint16(EchoFlag.MERGED)) != 0
     number = np.bincount(table.waveform[overlapped], minlength=int(table.waveform.max(initial=0)) + 1)
@@ -58,9 +99,9 @@ def clear_lone(table: EchoTable) -> EchoTable:
 
 
 def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: float, *, before: bool) -> np.ndarray:
-    """True (m,) for echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
+    """Find echoes below `ratio` of an echo of their waveform that lies nearest..furthest ns before them.
 
-    before: also of one that lies behind them.
+    before: also of an echo that follows within this distance.
     """
     faint = np.zeros(len(table), bool)
     waveform, time, amplitude = table.waveform, table.time, table.amplitude
@@ -74,8 +115,8 @@ def _faint_beside(table: EchoTable, ratio: float, nearest: float, furthest: floa
 
 
 def _flag_saturated(block: WaveformBlock, noise: Noise, level: float, table: EchoTable) -> EchoTable:
-    """Echoes with clipped samples within 1.5 widths of their centre; amplitudes that are guesses (H6)."""
-    rows = np.flatnonzero((block.samples >= level).any(axis=1)[table.waveform])
+    """Flag echoes with clipped samples within 1.5 widths of their centre, and amplitudes that are guesses."""
+    rows = np.flatnonzero(np.any(block.samples >= level, axis=1)[table.waveform])
     if not len(rows):
         return table
     sample = np.arange(block.samples.shape[1]) * block.spacing

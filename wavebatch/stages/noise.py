@@ -1,6 +1,8 @@
-"""Noise stages: the level without signal, and its spread, of every waveform."""
+"""Noise stages: baseline and noise of every waveform. The first stage of a chain."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import numpy as np
 
@@ -9,20 +11,35 @@ from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 
 
 @stage("noise")
-def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, limit: float = 3.5) -> Noise:
+def pooled(
+    block: WaveformBlock,
+    system: SystemPulse,
+    *,
+    guard: Annotated[float, Range(0.0, 100.0)] = 3.0,
+    limit: Annotated[float, Range(0.1, 1e6)] = 3.5,
+) -> Noise:
     """Baseline of each waveform from its quiet samples, drawn towards the strip's; standard deviation of the strip.
 
-    The standard deviation is that of the pooled quiet samples of the whole strip (survey): of a single waveform
-    rounded to whole counts it could not be estimated (H10). The baseline is the best linear estimate from the mean
-    of the waveform's own quiet samples and the strip's baseline, given how much baselines scatter between waveforms.
-    Where they scatter by more than the noise, what is quiet is found from each waveform alone.
+    The standard deviation is that of all quiet samples of the strip, from its survey: a single waveform, rounded to
+    whole counts, is too short to estimate it. The baseline is the best linear estimate from two values: the mean of the
+    waveform's quiet samples, and the strip's baseline. The more baselines scatter between waveforms, the more weight
+    the first has. Where they scatter by more than the noise, the quiet samples are found from each waveform alone.
 
-    guard: samples next to a signal are not quiet; how far, in widths of the system pulse.
-    limit: a smoothed sample further from the strip's baseline than this is signal, in noise standard deviations.
+    Parameters
+    ----------
+    guard : float
+        Samples this close to a signal are not quiet [widths of the system pulse].
+    limit : float
+        A smoothed sample that differs from the strip's baseline by more than this is signal [noise standard
+        deviations].
+
+    References
+    ----------
+    docs/algorithms.md H10.
     """
     n = len(block)
     std = max(system.noise_std, QUANTISATION_STD)
@@ -41,13 +58,16 @@ def pooled(block: WaveformBlock, system: SystemPulse, *, guard: float = 3.0, lim
 
 
 @stage("noise")
-def tail(block: WaveformBlock, system: SystemPulse, *, samples: int = 16) -> Noise:
+def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, Range(2, 65_535)] = 16) -> Noise:
     """Baseline and standard deviation of each waveform from its last samples.
 
-    For sensors whose baseline drifts and whose waveforms end in silence. The standard deviation is never less than the
-    strip's.
+    For sensors whose baseline drifts and whose waveforms end without signal. The standard deviation is never less than
+    the strip's.
 
-    samples: how many samples at the end are taken for noise.
+    Parameters
+    ----------
+    samples : int
+        Number of samples at the end that are taken for noise.
     """
     if samples < 2:
         raise ConfigError(f"samples must be at least 2, got {samples}")

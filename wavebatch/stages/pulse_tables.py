@@ -1,4 +1,7 @@
-"""The strip's pulse as the kernels want it: in samples, with tables of what a fitted width means."""
+"""The strip's pulse in samples, as kernels need it, with tables that turn fitted widths into echo widths.
+
+A learned pulse is a sum of Gaussians: kernels fit its main component, echo tables describe the whole pulse.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,20 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, NO_SKEW, PulseMeasures, 
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
-    """The strip's pulse in samples: learned, skewed or Gaussian, whichever the survey set."""
+    """Return the strip's pulse in samples: learned, skewed or Gaussian, whichever the survey set.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+
+    Returns
+    -------
+    PulseShape
+        Pulse for the kernels.
+    """
     if len(system.components) > 1:
         weight, delay, sigma = system.components[0]
         rest = tuple(
@@ -25,24 +41,52 @@ def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
 
 
 def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
-    """Count at which samples are clipped: what the survey found, or the largest count of the digitizer.
+    """Return the count at which samples are clipped: the survey's, or the largest count of the digitizer.
 
-    A survey looks at a sample of the strip: the few clipped echoes of a strip may lie outside it.
+    A survey looks at a sample of the strip only and may miss its few clipped echoes.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        With its digitizer.
+    system : SystemPulse
+        Result of the survey.
+
+    Returns
+    -------
+    float
+        Level [count].
     """
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
 
 
 class ShapeLimits(NamedTuple):
-    """Widths of a pulse model's main part [samples]."""
+    """Width of the system pulse and limits of fitted widths, of a pulse model's main component [samples]."""
 
     ref: float
-    """That of the system pulse."""
     low: float
     high: float
 
 
 def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
-    """Allowed widths: 0.7 to 4 of the system's (H3), and every component of a learned pulse with a width of its own."""
+    """Return the allowed widths: 0.7 to 4 times the system's, and positive for every component of a learned pulse.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+
+    Returns
+    -------
+    ShapeLimits
+        Widths in samples.
+
+    References
+    ----------
+    docs/algorithms.md H3.
+    """
     shape = pulse_shape(system, spacing)
     ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
     narrowest = min((extra for _, _, extra in shape.components), default=0.0)
@@ -51,17 +95,44 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
 
 @lru_cache(maxsize=8)
 def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
-    """Peak, delay and full width at half maximum by fitted width; kept, since a strip asks for every block."""
+    """Tabulate peak, delay and full width at half maximum by fitted width; cached, since each block needs it.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        A pulse.
+    limits : ShapeLimits
+        Range of the table.
+
+    Returns
+    -------
+    PulseMeasures
+        The table.
+    """
     return measure_pulse(shape, limits.low, limits.high)
 
 
 def describe_echoes(
     shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Amplitude, time and sigma (m, 3) of whole echoes, and their errors, from those of a learned pulse's main part.
+    """Turn fitted parameters of a learned pulse's main component into amplitude, time and sigma of the whole pulse.
 
-    The amplitude is the pulse's peak, the time that of the peak, sigma the full width at half maximum of the main lobe
-    over 2.354820, so that they mean the same for every model. Other pulses are returned as they are.
+    The amplitude is the height of the pulse's peak, the time that of the peak, sigma the full width at half maximum of
+    the main lobe over 2.354820, so that they mean the same for every model. Other pulses need no change.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        The fitted pulse.
+    limits : ShapeLimits
+        Its widths.
+    parameters, errors : float64 array, shape (m, 3)
+        Amplitude [count], time [samples] and width [samples], and their standard deviations.
+
+    Returns
+    -------
+    parameters, errors : float64 array, shape (m, 3)
+        The same of the whole pulse.
     """
     if not shape.components:
         return parameters, errors
@@ -75,7 +146,22 @@ def describe_echoes(
 
 
 def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:
-    """Inverse of `describe_echoes`: amplitude, time and width (m, 3) of the main part."""
+    """Invert `describe_echoes`: amplitude, time and width of the main component.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        The fitted pulse.
+    limits : ShapeLimits
+        Its widths.
+    echoes : float64 array, shape (m, 3)
+        Amplitude [count], time [samples] and sigma [samples].
+
+    Returns
+    -------
+    float64 array, shape (m, 3)
+        Parameters for the kernels.
+    """
     if not shape.components:
         return echoes
     table = pulse_measures(shape, limits)

@@ -1,4 +1,4 @@
-"""Reference pulses that detectors look for: sampled, of unit height, with the place of their peak."""
+"""Reference pulses that detectors and decomposers compare waveforms with: samples of unit height and their peak."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ReferenceKind = Literal["gaussian", "system", "given"]
 
 
 class Reference(NamedTuple):
-    """Samples of a pulse."""
+    """Samples of a reference pulse."""
 
     taps: np.ndarray
     """float64 (k,), k odd; peak about 1."""
     peak: float
-    """Where the pulse's peak lies among them: the datum of all times."""
+    """Place of the peak among the samples; times of echoes refer to it."""
 
     @property
     def middle(self) -> int:
@@ -33,10 +33,30 @@ class Reference(NamedTuple):
 def reference_pulse(
     system: SystemPulse, spacing: float, kind: ReferenceKind, reach: float = 5.0, pulse: str = ""
 ) -> Reference:
-    """The reference: a Gaussian of the system's width, the pulse that the survey found, or the one that is given.
+    """Sample the reference pulse: a Gaussian of the system's width, the pulse of the survey, or a given one.
 
-    reach: half of its length, in system widths; pulse: samples of the given one, separated by spaces. Raises
-    ConfigError where these are no pulse.
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    kind : {"gaussian", "system", "given"}
+        Which pulse.
+    reach : float
+        Half of its length, in widths of the system pulse.
+    pulse : str
+        Samples of the given pulse, separated by spaces.
+
+    Returns
+    -------
+    Reference
+        Samples and peak.
+
+    Raises
+    ------
+    ConfigError
+        Where the given samples are no pulse.
     """
     if kind == "given":
         return _read_pulse(pulse)

@@ -1,8 +1,11 @@
-"""Found echoes against true ones: one-to-one matching, completeness, correctness, errors in units of the bound."""
+"""Score of found echoes against true ones: completeness, correctness, and errors in units of the Cramer-Rao bound.
+
+Called by `bench`, `compare --truth` and the accuracy tests. Found and true echoes are matched one to one.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +22,13 @@ ISOLATED = 6.0
 
 QUANTITIES = ("time", "amplitude", "sigma")
 
+_CLASS_FLAGS = {
+    "overlapped": EchoFlag.OVERLAPPED,
+    "edge": EchoFlag.NEAR_EDGE,
+    "saturated": EchoFlag.SATURATED,
+    "weak": EchoFlag.WEAK,
+}
+
 
 class Match(NamedTuple):
     """Pairs of found and true echoes, one to one, sorted by the true ones."""
@@ -30,7 +40,20 @@ class Match(NamedTuple):
 
 
 def match_echoes(found: EchoTable, truth: EchoTable, tolerance_ns: float = TOLERANCE_NS) -> Match:
-    """Pairs of the same waveform at most `tolerance_ns` apart: the closest pair first, each echo once."""
+    """Match found and true echoes of the same waveform one to one, the closest pair first.
+
+    Parameters
+    ----------
+    found, truth : EchoTable
+        Echoes of the same waveforms.
+    tolerance_ns : float
+        Largest distance in time of a pair [ns].
+
+    Returns
+    -------
+    Match
+        Rows of both tables, sorted by the true ones.
+    """
     left, right = list_pairs(found.waveform, found.time, truth.waveform, truth.time, tolerance_ns)
     distance = np.abs(found.time[left] - truth.time[right])
     kept = pair_nearest(left, right, distance, len(found), len(truth))
@@ -41,9 +64,21 @@ def match_echoes(found: EchoTable, truth: EchoTable, tolerance_ns: float = TOLER
 def list_pairs(
     group_a: np.ndarray, value_a: np.ndarray, group_b: np.ndarray, value_b: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every pair (row of a, row of b) of one group whose values differ by at most `tolerance`.
+    """List every pair (row of a, row of b) of one group whose values differ by at most `tolerance`.
 
-    group_a, group_b: whole numbers; value_a, value_b: finite. Neither needs to be sorted.
+    Parameters
+    ----------
+    group_a, group_b : int array, shape (m,) and (k,)
+        Groups, in any order.
+    value_a, value_b : float array, shape (m,) and (k,)
+        Finite values.
+    tolerance : float
+        Largest difference.
+
+    Returns
+    -------
+    left, right : int64 array
+        Rows of a and rows of b.
     """
     none = np.empty(0, np.int64)
     if not len(group_a) or not len(group_b):
@@ -54,7 +89,7 @@ def list_pairs(
     key_b = group_b * span + (value_b - low)
     order = np.argsort(key_a, kind="stable")
     ordered = key_a[order]
-    # A little more than the tolerance, because keys are rounded; the exact test follows.
+    # Keys are rounded, so the search reaches a little further; the exact test follows.
     reach = tolerance + 1e-9 * max(abs(ordered[0]), abs(ordered[-1]), 1.0)
     start = np.searchsorted(ordered, key_b - reach, side="left")
     number = np.searchsorted(ordered, key_b + reach, side="right") - start
@@ -66,10 +101,26 @@ def list_pairs(
 
 
 def pair_nearest(left: np.ndarray, right: np.ndarray, distance: np.ndarray, n_left: int, n_right: int) -> np.ndarray:
-    """Indices of the pairs that a greedy matching keeps: by distance, then right, then left; each row once.
+    """Choose pairs greedily by distance, then right row, then left row, so that each row is used once.
 
-    In every round the pairs that are the best of both their rows are kept, and the others of these rows leave:
-    the same result as going through all pairs in order, without a loop over them.
+    Parameters
+    ----------
+    left, right : int array, shape (k,)
+        Rows of each pair.
+    distance : float array, shape (k,)
+        Distance of each pair.
+    n_left, n_right : int
+        Number of rows on each side.
+
+    Returns
+    -------
+    int64 array
+        Indices of the chosen pairs.
+
+    Notes
+    -----
+    Each round keeps the pairs that are the best of both their rows and drops all other pairs of these rows. This
+    gives the same result as a loop over all pairs in order.
     """
     order = np.lexsort((left, right, distance))
     kept = []
@@ -77,7 +128,7 @@ def pair_nearest(left: np.ndarray, right: np.ndarray, distance: np.ndarray, n_le
         place = np.arange(len(order))
         best_left = np.full(n_left, len(order))
         best_right = np.full(n_right, len(order))
-        # Written in reverse, so that the first of a row is what remains.
+        # Reversed, so that the first pair of each row is written last and stays.
         best_left[left[order][::-1]] = place[::-1]
         best_right[right[order][::-1]] = place[::-1]
         chosen = (best_left[left[order]] == place) & (best_right[right[order]] == place)
@@ -93,7 +144,7 @@ def pair_nearest(left: np.ndarray, right: np.ndarray, distance: np.ndarray, n_le
 
 @dataclass(frozen=True, slots=True)
 class ErrorStats:
-    """Errors of one quantity over matched echoes, in its unit; NaN where there is nothing to say."""
+    """Errors of one quantity over matched echoes, in its unit; NaN without echoes."""
 
     number: int
     bias: float
@@ -110,7 +161,7 @@ class ErrorStats:
 
     @classmethod
     def compute(cls, error: np.ndarray, bound: np.ndarray, reported: np.ndarray) -> ErrorStats:
-        """Statistics of errors (k,) with their bounds and reported standard deviations (NaN: none)."""
+        """Compute statistics of errors (k,) with their bounds and reported standard deviations (NaN: none)."""
         known = np.isfinite(reported) & (reported > 0)
         scaled = error[known] / reported[known]
         return cls(
@@ -149,78 +200,8 @@ class Score:
     """Per class (all, isolated, overlapped) and quantity (time [ns], amplitude [count], sigma [ns])."""
 
     def to_json(self) -> dict:
-        """Plain numbers, lists and dictionaries for JSON."""
+        """Return plain numbers, lists and dictionaries for JSON."""
         return asdict(self)
-
-
-@dataclass(slots=True)
-class Scorer:
-    """Collects blocks of found and true echoes; `result` is the Score of all of them."""
-
-    noise_std: float
-    """Standard deviation of one recorded sample [count]; sets the bounds."""
-    spacing: float = 1.0
-    tolerance_ns: float = TOLERANCE_NS
-    _waveforms: int = 0
-    _found: int = 0
-    _tallies: np.ndarray = field(default_factory=lambda: np.zeros(5, np.int64))
-    _parts: list[dict[str, np.ndarray]] = field(default_factory=list)
-
-    def add(self, found: EchoTable, truth: EchoTable, n: int) -> Match:
-        """Take in a block of n waveforms; returns its match."""
-        match = match_echoes(found, truth, self.tolerance_ns)
-        count_found, count_true = found.count(n), truth.count(n)
-        one, none = count_true == 1, count_true == 0
-        self._tallies += [
-            (count_found == count_true).sum(),
-            one.sum(),
-            (one & (count_found > 1)).sum(),
-            none.sum(),
-            (none & (count_found > 0)).sum(),
-        ]
-        self._waveforms += n
-        self._found += len(found)
-        self._parts.append(self._collect(found, truth, match))
-        return match
-
-    def _collect(self, found: EchoTable, truth: EchoTable, match: Match) -> dict[str, np.ndarray]:
-        bounds = crlb(truth.amplitude, truth.sigma.astype(np.float64), self.noise_std, self.spacing)
-        part = {"matched": np.zeros(len(truth), bool), "flags": truth.flags, "isolated": find_isolated(truth)}
-        part["matched"][match.truth] = True
-        for name, bound in zip(QUANTITIES, bounds, strict=True):
-            true = getattr(truth, name)[match.truth].astype(np.float64)
-            part[name] = getattr(found, name)[match.found] - true
-            part[f"{name}_bound"] = bound[match.truth]
-            part[f"{name}_err"] = getattr(found, f"{name}_err")[match.found].astype(np.float64)
-        return part
-
-    def result(self) -> Score:
-        """The Score of all that was added."""
-        names = self._parts[0] if self._parts else {}
-        data = {name: np.concatenate([part[name] for part in self._parts]) for name in names}
-        matched = data.get("matched", np.zeros(0, bool))
-        classes = _classify(data) if data else {}
-        exact, one, split, none, alarm = self._tallies.tolist()
-        hits = int(matched.sum())
-        return Score(
-            waveforms=self._waveforms,
-            true=len(matched),
-            found=self._found,
-            matched=hits,
-            completeness=_share(hits, len(matched)),
-            correctness=_share(hits, self._found),
-            exact_count=_share(exact, self._waveforms),
-            false_splits=_share(split, one),
-            false_alarms=_share(alarm, none),
-            completeness_by_class={
-                name: _share(int((matched & rows).sum()), int(rows.sum())) for name, rows in classes.items()
-            },
-            errors={
-                name: {quantity: _measure(data, classes[name][matched], quantity) for quantity in QUANTITIES}
-                for name in ("all", "isolated", "overlapped")
-                if name in classes
-            },
-        )
 
 
 def score(
@@ -232,18 +213,69 @@ def score(
     spacing: float = 1.0,
     tolerance_ns: float = TOLERANCE_NS,
 ) -> Score:
-    """Completeness, correctness and errors of the echoes found in n waveforms.
+    """Measure completeness, correctness and errors of the echoes found in n waveforms.
 
-    noise_std: standard deviation of one recorded sample [count] (Recording.recorded_noise); spacing [ns].
-    truth.flags as simulate sets them: OVERLAPPED, NEAR_EDGE and SATURATED echoes are not isolated.
+    Parameters
+    ----------
+    found, truth : EchoTable
+        Found and true echoes. OVERLAPPED, NEAR_EDGE and SATURATED true echoes do not count as isolated.
+    n : int
+        Number of waveforms.
+    noise_std : float
+        Standard deviation of one recorded sample [count]; sets the bounds.
+    spacing : float
+        Time between two samples [ns].
+    tolerance_ns : float
+        Largest distance of a found from a true echo [ns].
+
+    Returns
+    -------
+    Score
+        Shares and errors, in all and by class.
     """
-    scorer = Scorer(noise_std, spacing, tolerance_ns)
-    scorer.add(found, truth, n)
-    return scorer.result()
+    match = match_echoes(found, truth, tolerance_ns)
+    matched, right = np.zeros(len(truth), bool), np.zeros(len(found), bool)
+    matched[match.truth] = True
+    right[match.found] = True
+    count_found, count_true = found.count(n), truth.count(n)
+    one, none = count_true == 1, count_true == 0
+    classes = _classify(truth)
+    errors: dict[str, dict[str, ErrorStats]] = {name: {} for name in ("all", "isolated", "overlapped")}
+    bounds = crlb(truth.amplitude, truth.sigma.astype(np.float64), noise_std, spacing)
+    for quantity, bound in zip(QUANTITIES, bounds, strict=True):
+        error = getattr(found, quantity)[match.found] - getattr(truth, quantity)[match.truth].astype(np.float64)
+        reported = getattr(found, f"{quantity}_err")[match.found].astype(np.float64)
+        for name, stats in errors.items():
+            rows = classes[name][matched]
+            stats[quantity] = ErrorStats.compute(error[rows], bound[match.truth][rows], reported[rows])
+    return Score(
+        waveforms=n,
+        true=len(truth),
+        found=len(found),
+        matched=len(match.truth),
+        completeness=_share(matched),
+        correctness=_share(right),
+        exact_count=_share(count_found == count_true),
+        false_splits=_share(count_found[one] > 1),
+        false_alarms=_share(count_found[none] > 0),
+        completeness_by_class={name: _share(matched[rows]) for name, rows in classes.items()},
+        errors=errors,
+    )
 
 
 def find_isolated(truth: EchoTable) -> np.ndarray:
-    """True for echoes whose errors the closed bounds describe: alone, inside the window, not clipped; bool (m,)."""
+    """Find echoes to which the closed bounds apply: alone, inside the window, not clipped.
+
+    Parameters
+    ----------
+    truth : EchoTable
+        True echoes, m of them.
+
+    Returns
+    -------
+    bool array, shape (m,)
+        True for isolated echoes.
+    """
     sigma = truth.sigma.astype(np.float64)
     close = np.diff(truth.time) < ISOLATED * np.maximum(sigma[1:], sigma[:-1])
     close &= np.diff(truth.waveform) == 0
@@ -253,26 +285,16 @@ def find_isolated(truth: EchoTable) -> np.ndarray:
     return ~bad
 
 
-def _classify(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    def has(flag: EchoFlag) -> np.ndarray:
-        return (data["flags"] & np.uint16(flag)) != 0
-
+def _classify(truth: EchoTable) -> dict[str, np.ndarray]:
     return {
-        "all": np.ones(len(data["flags"]), bool),
-        "isolated": data["isolated"],
-        "overlapped": has(EchoFlag.OVERLAPPED),
-        "edge": has(EchoFlag.NEAR_EDGE),
-        "saturated": has(EchoFlag.SATURATED),
-        "weak": has(EchoFlag.WEAK),
+        "all": np.ones(len(truth), bool),
+        "isolated": find_isolated(truth),
+        **{name: (truth.flags & np.uint16(flag)) != 0 for name, flag in _CLASS_FLAGS.items()},
     }
 
 
-def _measure(data: dict[str, np.ndarray], rows: np.ndarray, quantity: str) -> ErrorStats:
-    return ErrorStats.compute(data[quantity][rows], data[f"{quantity}_bound"][rows], data[f"{quantity}_err"][rows])
-
-
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else float("nan")
+def _share(hits: np.ndarray) -> float:
+    return int(hits.sum()) / len(hits) if len(hits) else float("nan")
 
 
 def _rms(values: np.ndarray) -> float:

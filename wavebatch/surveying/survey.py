@@ -237,7 +237,7 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
 
 
 def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -> tuple[Decision, ...]:
-    """The table of ALGORITHMS 4.4: what this scene needs, and the reason for each part left out."""
+    """The table of docs/algorithms.md 4.4: what this scene needs, and the reason for each part left out."""
     width = system.sigma_ref / spacing
     share = figures["overlapped_share"]
     strongest = figures["amplitude_99"]

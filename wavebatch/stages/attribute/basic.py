@@ -1,8 +1,9 @@
-"""Attributes: what a fitted echo says about its target."""
+"""Attributes that need nothing but the fit: amplitude, width, energy, shape of the pulse, position."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 
@@ -27,14 +28,15 @@ def amplitude(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
 def echo_width(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Full width at half maximum of each echo [ns], and its error.
 
-    2.354820 sigma; of a skewed pulse 2 sinh(1.17741 kappa)/kappa sigma; of a learned pulse that of its main lobe.
+    2.354820 sigma of a Gaussian, 2 sinh(1.17741 kappa) / kappa sigma of a skewed pulse. Of a learned pulse it is the
+    width of the main lobe.
     """
     factor = np.float32(_width_factor(system.kappa))
     return echoes.with_attributes(echo_width=echoes.sigma * factor, echo_width_err=echoes.sigma_err * factor)
 
 
 def _width_factor(kappa: float) -> float:
-    """Full width at half maximum per sigma of a skewed pulse (section 0); 2.354820 without skew."""
+    """Full width at half maximum per sigma of a skewed pulse (docs/algorithms.md 0); 2.354820 without skew."""
     half = FWHM_PER_SIGMA / 2
     return FWHM_PER_SIGMA if abs(kappa) < 1e-6 else float(2 * np.sinh(half * kappa) / kappa)
 
@@ -50,8 +52,12 @@ def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Echo
 def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Deviation of each echo from the fitted pulse: sqrt(h3^2 + h4^2) of its residual, per unit of A/std sqrt(s/T).
 
-    The Gauss-Hermite moments h3 (skew) and h4 (peakedness) of a right fit are standard normal, so that noise leaves
-    about 1.25 std/A sqrt(T/s) here; merged echoes and sloping targets leave more. Source: ALGORITHMS 4.2.
+    The Gauss-Hermite moments h3 (skew) and h4 (peakedness) of a right fit are standard normal numbers, so noise alone
+    gives about 1.25 std/A sqrt(T/s). Merged echoes and sloping targets give more.
+
+    References
+    ----------
+    docs/algorithms.md 4.2.
     """
     s, spacing = block.samples.shape[1], block.spacing
     time, sigma = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
@@ -68,18 +74,18 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     return echoes.with_attributes(pulse_deviation=(np.hypot(h3, h4) / np.maximum(unit, 1e-6)).astype(np.float32))
 
 
-_Read = Callable[[np.ndarray, np.ndarray], np.ndarray]
+_Read = Callable[[np.ndarray | slice, np.ndarray], np.ndarray]
 
 
 def _read_single(
     block: WaveformBlock, noise: Noise, shape: PulseShape, waveform: np.ndarray, model: np.ndarray
 ) -> _Read:
-    """Reads residuals of echoes (k,) that are alone in their waveforms: the pulse is painted where it is asked for."""
+    """Reader of residuals of echoes (k,) that are alone in their waveforms; the pulse is computed where it is read."""
     samples, s = block.samples.ravel(), block.samples.shape[1]
     first = waveform.astype(np.int64)[:, None] * s
     amplitude, time, width = model.astype(np.float32).T[..., None]
 
-    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         values = samples[first[part] + at].astype(np.float32)
         values -= noise.baseline[waveform[part], None]
         values -= amplitude[part] * evaluate_pulse(shape, at.astype(np.float32), time[part], width[part])[0]
@@ -91,12 +97,12 @@ def _read_single(
 def _read_several(
     block: WaveformBlock, noise: Noise, shape: PulseShape, waveform: np.ndarray, model: np.ndarray
 ) -> _Read:
-    """Reads residuals of echoes (k,) that share their waveforms, which are painted whole."""
+    """Reader of residuals of echoes (k,) that share their waveforms: the model is computed for the whole waveform."""
     rows, place = np.unique(waveform, return_inverse=True)
     residual = block.samples[rows] - noise.baseline[rows, None]
     residual -= render_echoes(shape, len(rows), block.samples.shape[1], place, model[:, 1], model[:, 0], model[:, 2])
 
-    def read(part: np.ndarray, at: np.ndarray) -> np.ndarray:
+    def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         return residual[place[part][:, None], at].astype(np.float32)
 
     return read
@@ -104,15 +110,23 @@ def _read_several(
 
 @stage("attribute", makes=("x", "y", "z", "point", "range_err"))
 def position(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *, tolerance: float = 2.5
-) -> EchoTable:
-    """Coordinates of each echo along its ray [m], relative to the returns of its packet; the return it is matched with.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 2.5,
+) -> EchoTable:  # fmt: skip
+    """Coordinates of each echo along its ray [m], relative to the returns of its packet, and the return it matches.
 
-    Return locations are offset from the fit by an amount that the returns of a packet share (the outgoing pulse's
-    phase, a leading-edge detector): the offset is measured on the matched returns and taken off. Packets in which no
-    return is matched keep the raw location and are flagged. Source: LAS-WAVEFORMS 8.
+    Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a
+    detector of leading edges). The offset is measured on the matched returns and subtracted. Packets without a matched
+    return keep the raw location and are flagged.
 
-    tolerance: largest distance in time between an echo and the return it is matched with [ns], beyond half a sample.
+    Parameters
+    ----------
+    tolerance : float
+        Largest distance in time between an echo and its return, in addition to half a sample [ns].
+
+    References
+    ----------
+    docs/las-waveforms.md 8.
     """
     waveform = echoes.waveform
     offset = np.zeros(len(block))
@@ -121,16 +135,15 @@ def position(
     returns = block.returns
     if returns is not None and len(returns):
         reach = tolerance + 0.5 * block.spacing
-        match = match_returns(waveform, echoes.time, returns.waveform, returns.time, reach)
-        offset, known = _shared_offset(len(block), echoes, match, returns.time)
-        shifted = returns.time + offset[returns.waveform]
-        match = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
-        offset, known = _shared_offset(len(block), echoes, match, returns.time)
+        for _ in range(2):  # the second time with the offset that the first one found
+            shifted = returns.time + offset[returns.waveform]
+            match = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
+            offset, known = _shared_offset(len(block), echoes, match, returns.time)
         point = np.where(match >= 0, returns.point[match], -1)
     along = echoes.time - offset[waveform]
     xyz = block.origin[waveform] + block.direction[waveform] * along[:, None]
     speed = np.sqrt(np.sum(block.direction**2, axis=1))
-    # Vectors of strips in feet or degrees are no speeds in metres; the error is in metres whatever the strip is in.
+    # In strips in feet or degrees the vectors are no speeds in m/ns, but the error is always in metres.
     speed = np.where(np.abs(speed / HALF_C - 1.0) < 0.5, speed, HALF_C)
     echoes = echoes.with_attributes(
         x=xyz[:, 0],

@@ -1,6 +1,8 @@
-"""Angle between ray and surface from the points around an echo: what angles from widths are to be compared with."""
+"""Incidence angles from the points around an echo: the check for angles from echo widths."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import numpy as np
 
@@ -8,7 +10,7 @@ from wavebatch.core.echoes import RAY, EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.geometry.normals import measure_normals
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 
 
 @stage(
@@ -18,29 +20,32 @@ from wavebatch.stages.chain import stage
     second_pass=measure_normals,
 )
 def incidence_angle_normals(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    radius: float = 1.5,
-    min_points: int = 8,
-    max_error: float = 5.0,
-) -> EchoTable:
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    radius: Annotated[float, Range(1e-3, 1000.0)] = 1.5,
+    min_points: Annotated[int, Range(4, 10_000)] = 8,
+    max_error: Annotated[float, Range(1e-3, 180.0)] = 5.0,
+) -> EchoTable:  # fmt: skip
     """Angle between the packet's ray and the normal of the plane of the points around each echo [deg]; its error.
 
-    `run` fills it in a second pass, when all points of the strip are there; the echoes of a block alone have no-data.
-    The plane is fitted to all points within the radius that are not outliers. No-data where there are fewer than
-    min_points, where they are no plane (plants, ridges: less than 60 % of them in it, thicker than a fifth of its
-    width, or the echo not in it), where the angle is beyond 80 degrees (plants struck by one sweep of the scanner make
-    a plane that its rays lie in), and where it is more uncertain than max_error. It needs neither sensor nor
-    divergence. Source: the comparison of Rhomberg-Kauert et al. 2024, Fig. 6; ALGORITHMS 1.4.
+    `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
+    is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
 
-    radius: of the neighbourhood [m], in all directions; three times the distance between points is a good start.
+    No-data where there are fewer than min_points; where the points are no plane (plants, ridges: less than 60 % of them
+    in it, thicker than a fifth of its width, or the echo not in it); where the angle exceeds 80 degrees (one sweep of
+    the scanner over plants makes a plane that contains its rays); and where its error exceeds max_error.
 
-    min_points: least number of points in the neighbourhood, and in the plane.
+    Parameters
+    ----------
+    radius : float
+        Radius of the neighbourhood [m]; three times the distance between points is a good start.
+    min_points : int
+        Least number of points in the neighbourhood, and in the plane.
+    max_error : float
+        Largest standard deviation of an angle that is written [deg].
 
-    max_error: largest standard deviation of an angle that is written [deg].
+    References
+    ----------
+    Rhomberg-Kauert et al. (2024), comparison of Fig. 6; docs/algorithms.md 1.4.
     """
     if not 1e-3 <= radius <= 1e3 or min_points < 4 or not max_error > 0:
         raise ConfigError("radius must lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")

@@ -1,9 +1,9 @@
-"""Attributes that mean something outside the file: range and backscatter; NaN where it cannot be known, and the reason.
+"""Physical attributes: range and backscatter. NaN where a value cannot be known, with the reason.
 
-They need the sensor's position (`--trajectory`, or the packets' own vectors), the calibration (`--calibration`) and the
-beam's divergence (SYSTEM.toml); without what they need they are no-data, never a guess. What is only relative is called
-so, and made by stages of its own. Source: ALGORITHMS 5. LAS packets have no place for the emitted pulse, so that its
-energy, which varies from shot to shot, cannot be divided out.
+They need the sensor's position (`--trajectory`, or the packets' vectors), the calibration (`--calibration`) and the
+beam's divergence (SYSTEM.toml). Without these a value is no-data, never a guess; relative quantities have stages of
+their own. LAS packets have no place for the emitted pulse, so its energy, which varies from shot to shot, cannot be
+divided out. Source: docs/algorithms.md 5.
 """
 
 from __future__ import annotations
@@ -33,8 +33,12 @@ def range(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoT
 def backscatter_coefficient(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Cross section of each echo per illuminated area (gamma), and its error; no-data without sensor or calibration.
 
-    C' R^2 A sigma / eta(R). Echoes that share a pulse share its light: of those only the sum over the pulse is a gamma.
-    Amplitudes that are guesses (saturated) give no-data.
+    gamma = C' R^2 A sigma / eta(R). Echoes of one pulse share its light: only the sum over the pulse is then a gamma.
+    Unreliable (saturated) amplitudes give no-data.
+
+    References
+    ----------
+    docs/algorithms.md 5.
     """
     light = _measure_light(block, system, echoes, 2)
     return _finish(echoes, "backscatter_coefficient", light.gamma, light.relative_error, *light.cases)
@@ -45,6 +49,10 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
     """Backscatter cross section of each echo [m2], and its error; no-data without sensor, calibration or divergence.
 
     C' pi divergence^2 / 4 R^4 A sigma / eta(R): an error of the range counts four times.
+
+    References
+    ----------
+    docs/algorithms.md 5.
     """
     light = _measure_light(block, system, echoes, 4)
     divergence = np.nan if system.divergence is None else 1e-3 * system.divergence
@@ -55,28 +63,31 @@ def cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoe
 
 @stage("attribute", makes=("reflectance", "reflectance_err"), needs=_POSITION)
 def reflectance(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["level", "echo", "facing"] = "level",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Diffuse reflectance of each echo that is alone in its waveform, and its error; no-data for all others.
 
     gamma / (4 cos(alpha)): only a target that fills the beam has a reflectance.
 
-    surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
+    Parameters
+    ----------
+    surface : {"level", "echo", "facing"}
+        Where alpha comes from: level ground, the column incidence_angle of an earlier stage (no-data where it has
         none), or every surface taken as facing the sensor.
+
+    References
+    ----------
+    docs/algorithms.md 5.
     """
     return _reflectance(block, echoes, "reflectance", _measure_light(block, system, echoes, 2), surface)
 
 
 @stage("attribute", makes=("relative_backscatter", "relative_backscatter_err"), needs=_POSITION)
 def relative_backscatter(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Backscatter of each echo in units of its own strip [DN ns m2], and its error: for strips without calibration.
+    """Backscatter of each echo in units of its strip [DN ns m2], and its error: for strips without calibration.
 
-    R^2 A sigma / eta(R): gamma without the constant C', so that echoes compare with each other, with nothing else.
+    R^2 A sigma / eta(R): gamma without the constant C'. Echoes of one strip compare with each other only.
     """
     light = _measure_light(block, _relative(system), echoes, 2)
     return _finish(echoes, "relative_backscatter", light.gamma, light.relative_error, *light.cases)
@@ -84,7 +95,7 @@ def relative_backscatter(block: WaveformBlock, noise: Noise, system: SystemPulse
 
 @stage("attribute", makes=("relative_cross_section", "relative_cross_section_err"), needs=_POSITION)
 def relative_cross_section(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Cross section of each echo in units of its own strip [DN ns m4], and its error: for strips without calibration.
+    """Cross section of each echo in units of its strip [DN ns m4], and its error: for strips without calibration.
 
     R^4 A sigma / eta(R): the cross section without C' pi divergence^2 / 4.
     """
@@ -95,18 +106,17 @@ def relative_cross_section(block: WaveformBlock, noise: Noise, system: SystemPul
 
 @stage("attribute", makes=("relative_reflectance", "relative_reflectance_err"), needs=_POSITION)
 def relative_reflectance(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     surface: Literal["level", "echo", "facing"] = "level",
-) -> EchoTable:
-    """Reflectance of each echo alone in its waveform, in units of its own strip [DN ns m2], and its error.
+) -> EchoTable:  # fmt: skip
+    """Reflectance of each echo that is alone in its waveform, in units of its strip [DN ns m2], and its error.
 
     R^2 A sigma / (4 cos(alpha) eta(R)): the reflectance without the constant C', for strips without calibration.
 
-    surface: where alpha comes from: level ground, the column incidence_angle of a stage before (no-data where there is
+    Parameters
+    ----------
+    surface : {"level", "echo", "facing"}
+        Where alpha comes from: level ground, the column incidence_angle of an earlier stage (no-data where it has
         none), or every surface taken as facing the sensor.
     """
     light = _measure_light(block, _relative(system), echoes, 2)
@@ -114,7 +124,20 @@ def relative_reflectance(
 
 
 def sensor_distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Sensor to echo [m], f8 (m,); NaN where it is not known."""
+    """Measure the distance from the sensor to each echo.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        With the sensor's positions, where they are known.
+    echoes : EchoTable
+        With columns x, y and z; m echoes.
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        Distance [m]; NaN where it is not known.
+    """
     if block.sensor is None:
         return np.full(len(echoes), np.nan)
     sensor = block.sensor[echoes.waveform]
@@ -127,18 +150,31 @@ def sensor_distance(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
 
 
 def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
-    """Whether an echo is the only one of its waveform, bool (m,)."""
+    """Find echoes that are the only one of their waveform.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        n waveforms.
+    echoes : EchoTable
+        m echoes.
+
+    Returns
+    -------
+    bool array, shape (m,)
+        True for single echoes.
+    """
     return echoes.count(len(block))[echoes.waveform] == 1
 
 
 class _Light(NamedTuple):
-    """What echoes of a block return, f8 (m,) each."""
+    """What m echoes of a block return; arrays (m,)."""
 
     distance: np.ndarray
     """[m]."""
     gamma: np.ndarray
     relative_error: np.ndarray
-    """Of what goes with R^power."""
+    """Of a quantity that grows with R^power."""
     cases: tuple[tuple[NoData, np.ndarray | bool], ...]
     """Why gamma may be missing."""
 
@@ -159,7 +195,7 @@ def _measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable,
 
 
 def _relative(system: SystemPulse) -> SystemPulse:
-    """The system with a constant of 1, exactly."""
+    """Replace the calibration by a constant of exactly 1."""
     return replace(system, calibration=1.0, calibration_err=0.0, channels={})
 
 
@@ -180,7 +216,7 @@ def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: _Lig
 def _finish(
     echoes: EchoTable, name: str, values: np.ndarray, relative: np.ndarray, *cases: tuple[NoData, np.ndarray | bool]
 ) -> EchoTable:
-    """The echoes with a column, its error, and why it is missing where it is."""
+    """Add a column, its error, and the reason where it is no-data."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = (np.abs(values) * relative).astype(np.float32)
         echoes = echoes.with_attributes(**{name: values.astype(np.float32), f"{name}_err": error})
@@ -205,7 +241,18 @@ def _surface_angle(block: WaveformBlock, echoes: EchoTable, surface: str) -> tup
 
 
 def level_angle(block: WaveformBlock) -> np.ndarray:
-    """Angle at which each ray strikes level ground [rad], f8 (n,)."""
+    """Compute the angle at which each ray strikes level ground.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        n waveforms with directions.
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        Angle [rad].
+    """
     x, y, z = block.direction.T
     with np.errstate(divide="ignore", invalid="ignore"):
         down = -z / np.sqrt(x * x + y * y + z * z)

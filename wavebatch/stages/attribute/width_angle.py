@@ -1,8 +1,8 @@
-"""Angle between ray and surface from an echo's width, with its error; NaN where widths do not tell (ALGORITHMS 1.4)."""
+"""Incidence angles from echo widths, with their errors; NaN where widths cannot tell (docs/algorithms.md 1.4)."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -18,14 +18,14 @@ from wavebatch.kernels.physics.incidence import (
     spread_variance,
 )
 from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
 NARROW_ERRORS = 3.0
-"""Errors by which the variance must be negative for an echo to be flagged as narrower than the system pulse."""
+"""An echo whose variance is negative by so many errors is flagged as narrower than the system pulse."""
 
 CLEAR_ERRORS = 4.0
-"""Errors by which the variance must be positive for an echo to be sure to come from a slope."""
+"""An echo whose variance is positive by so many errors certainly comes from a slope."""
 
 _UNCLEAN = {
     NoData.OVERLAPPED: EchoFlag.OVERLAPPED | EchoFlag.MERGED,
@@ -33,43 +33,47 @@ _UNCLEAN = {
     NoData.CUT: EchoFlag.NEAR_EDGE,
     NoData.UNSETTLED: EchoFlag.NOT_CONVERGED | EchoFlag.AT_BOUND,
 }
-"""Flags of echoes whose widths say nothing about a surface."""
+"""Echoes with these flags have widths that do not depend on the surface alone."""
 
 _REASON = f"incidence_angle{SUFFIX}"
 
 
 @stage("attribute", makes=("incidence_angle", "incidence_angle_err"), needs=("x", "y", "z"))
 def incidence_angle(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["system", "pulse", "paper"] = "system",
-    divergence: float = 0.0,
-    max_error: float = 10.0,
-    reference_error: float = 0.003,
+    divergence: Annotated[float, Range(0.0, 100.0)] = 0.0,
+    max_error: Annotated[float, Range(1e-3, 180.0)] = 10.0,
+    reference_error: Annotated[float, Range(0.0, 1.0)] = 0.003,
     alone: bool = True,
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Angle between ray and surface normal of each echo [deg], from its width beyond the system pulse's; its error.
 
-    A plane spreads the pulse by R divergence tan(alpha) / (2 c). No-data where the system pulse is shorter than 0.85
-    samples, where sensor or divergence are not known, and where the angle is more uncertain than max_error: with a
-    narrow beam and a long pulse that is everywhere. Rough ground and plants widen echoes too, and read as slopes.
-    Echoes narrower than the system pulse have angle 0, and the flag NARROW where that is more than noise: three errors.
-    Source: Rhomberg-Kauert et al. 2024 as corrected by ALGORITHMS 1.4.
+    A plane spreads the pulse by R divergence tan(alpha) / (2 c). Rough ground and plants widen echoes too and look like
+    slopes. Echoes narrower than the system pulse have angle 0; where they are narrower by more than three errors they
+    have the flag NARROW.
 
-    mode: system takes the pulse that the strip was fitted with; pulse a Gaussian fitted to t^2 exp(-t / tau) at the
-        file's sampling; paper the printed formulas, which read angles too high.
+    No-data where the system pulse is shorter than 0.85 samples, where sensor or divergence are not known, and where the
+    error exceeds max_error: with a narrow beam and a long pulse that is everywhere.
 
-    divergence: full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
+    Parameters
+    ----------
+    mode : {"system", "pulse", "paper"}
+        `system` takes the pulse that the strip was fitted with, `pulse` a Gaussian fitted to t^2 exp(-t / tau) at the
+        sampling of the file, `paper` the printed formulas, whose angles are too large.
+    divergence : float
+        Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
+    max_error : float
+        Largest standard deviation of an angle that is written [deg]. An echo that is not wider than the system pulse by
+        four errors must meet it even as a surface that faces the sensor, where angles are least certain.
+    reference_error : float
+        Standard deviation of the system pulse's width, relative.
+    alone : bool
+        Only echoes that are alone in their waveform; others fill an unknown part of the beam.
 
-    max_error: largest standard deviation of an angle that is written [deg]; an echo that is not wider than the system
-        pulse by four errors must meet it even if its surface faces the sensor, where angles are least certain.
-
-    reference_error: standard deviation of the system pulse's width, relative.
-
-    alone: only echoes that are alone in their waveform; others fill a part of the beam, whose size nobody knows.
+    References
+    ----------
+    Rhomberg-Kauert et al. (2024), as corrected by docs/algorithms.md 1.4.
     """
     beam = divergence or system.divergence
     short = system.sigma_ref < LEAST_PULSE_WIDTH * block.spacing
@@ -79,7 +83,7 @@ def incidence_angle(
     steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
     flat_error = angle_of_spread(np.sqrt(variance_err), distance, 1e-3 * beam if beam else np.nan)
     with np.errstate(invalid="ignore"):
-        # Were each echo judged by its own error alone, those that noise has widened would pass and its peers would not.
+        # With the error of each echo alone, echoes that noise has widened would pass and equal ones would not.
         decisive = np.where(variance > CLEAR_ERRORS * variance_err, error, np.maximum(error, flat_error))
         uncertain = ~(decisive <= np.radians(max_error))
         narrow = variance < -NARROW_ERRORS * variance_err
@@ -93,9 +97,7 @@ def incidence_angle(
         (NoData.OTHER, np.isnan(error)),
         (NoData.UNCERTAIN, uncertain),
     )
-    bad = np.zeros(len(echoes), bool)
-    for _, where in cases:
-        bad |= where
+    bad = np.logical_or.reduce([np.broadcast_to(where, len(echoes)) for _, where in cases])
     angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))
     columns = {"incidence_angle": angle, "incidence_angle_err": error, _REASON: explain(angle, *cases)}
     return echoes.with_attributes(**columns).with_flags(EchoFlag.NARROW, narrow)
@@ -104,9 +106,23 @@ def incidence_angle(
 def added_variance(
     block: WaveformBlock, system: SystemPulse, echoes: EchoTable, mode: str, reference_error: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variance that the target adds to the pulse [ns2] and its standard deviation, f8 (m,).
+    """Compute the variance that the target adds to the pulse.
 
-    mode, reference_error: as those of stage incidence_angle.
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    system : SystemPulse
+        Result of the survey.
+    echoes : EchoTable
+        m fitted echoes.
+    mode, reference_error
+        As for `incidence_angle`.
+
+    Returns
+    -------
+    variance, error : float64 array, shape (m,)
+        Variance and its standard deviation [ns2].
     """
     width = echoes.sigma.astype(np.float64)
     error = np.hypot(echoes.sigma_err.astype(np.float64), system.width_scatter)
@@ -124,7 +140,7 @@ def added_variance(
 def _model_width(
     spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Width of the part of the fitted pulse that a target widens as a Gaussian does [ns], its error, the system's."""
+    """Width of the part of the fitted pulse that a target widens as a Gaussian [ns], its error, the system's width."""
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     if not shape.components:
         return sigma, error, system.sigma_ref

@@ -1,8 +1,13 @@
-"""Decomposers: what candidates become when a model of the waveform is fitted to it."""
+"""Decomposers that fit a pulse model to clusters of candidates, and the steps that all fitting decomposers share.
+
+Path of a block: candidates in ns, clusters in samples (`find_clusters`), fits (kernels), flagged table in ns
+(`describe_solutions`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -10,127 +15,124 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
+from wavebatch.kernels.fit.cluster import Clusters
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import WidthPrior
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, pulse_tail, tail_at, tail_reach
-from wavebatch.kernels.signal.signal import smooth_121, transpose_samples
-from wavebatch.stages.chain import stage
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.stages.chain import Range, stage
+from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
-from wavebatch.stages.pulse_tables import (
-    ShapeLimits,
-    clip_level,
-    describe_echoes,
-    model_parameters,
-    pulse_shape,
-    shape_limits,
-)
-
-MARGIN = 1.2
-"""Windows extend this many system widths beyond the signal above the noise."""
-
-REACH = 3.0
-"""Windows extend at least this many system widths beyond the outer candidates."""
-
-LEAST_PLATEAU = 2
-"""Clipped samples between two candidates from which they stand on one flat top ..."""
-
-PLATEAU_SLACK = 2
-"""... if no more samples than this between them are not clipped."""
-
-MOST_JOINED = 6
-"""Candidates on one run of signal beyond which it is fitted in parts."""
+from wavebatch.stages.pulse_tables import ShapeLimits, clip_level, describe_echoes, pulse_shape, shape_limits
 
 
 @stage("decompose")
 def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """The detector's echoes as they are, without a fit and without errors."""
+    """Echoes of the detector as they are, without a fit and without errors."""
     return flag_echoes(block, noise, system, echoes)
 
 
 @stage("decompose")
 def closed_form(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    fraction: float = 0.2,
-    steps: int = 2,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A Gaussian for every candidate on its own: a closed form and a few Gauss-Newton steps.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.2,
+    steps: Annotated[int, Range(0, 100)] = 2,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """One Gaussian for every candidate alone: a closed form and a few Gauss-Newton steps.
 
-    At the Cramer-Rao bound for isolated echoes; overlapping echoes are cut apart half-way between them and therefore
-    biased. Source: Guo (2011); ALGORITHMS 4.1.
+    Errors are at the Cramer-Rao bound for isolated echoes. Overlapping echoes are cut apart midway between them and are
+    therefore biased.
 
-    fraction: samples of at least this share of the peak enter the closed form.
-    steps: Gauss-Newton steps after it.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    fraction : float
+        Samples of at least this share of the peak enter the closed form.
+    steps : int
+        Gauss-Newton steps after it.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Guo (2011); docs/algorithms.md 4.1.
     """
     start = _start_closed_form(block, noise, system, echoes, fraction)
     settings = make_settings(block, system, GAUSSIAN, tolerance=0.1, max_iterations=steps + 1, grow=False)
-    return fit_candidates(block, noise, system, start, settings, most=1, significance=significance)
+    return fit_candidates(block, noise, system, start, settings, significance=significance, most=1)
 
 
 @stage("decompose")
 def gaussian(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
-    Batched Levenberg-Marquardt; widths within 0.7 and 4 system widths, times within the window; no echo is added.
-    Source: Wagner et al. (2007) eq. 3; ALGORITHMS 2.3.
+    Batched Levenberg-Marquardt. Widths stay within 0.7 and 4 system widths, times within the window. No echo is added.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
+    Parameters
+    ----------
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
         standard deviation of the minimum.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Wagner et al. (2007) eq. 3; docs/algorithms.md 2.3.
     """
     settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 @stage("decompose")
 def adaptive(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    acceptance: float = 0.0,
-    max_echoes: int = 6,
-    gate_residual: float = 4.2,
-    gate_hermite: float = 8.5,
-    width_prior: float = 0.1,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
-) -> EchoTable:
-    """As many echoes as the waveform asks for: fits grow only where a test of the residual says that they must.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    acceptance: Annotated[float, Range(0.0, 1e6)] = 0.0,
+    max_echoes: Annotated[int, Range(1, 1000)] = 6,
+    gate_residual: Annotated[float, Range(0.0, 1e6)] = 4.2,
+    gate_hermite: Annotated[float, Range(0.0, 1e6)] = 8.5,
+    width_prior: Annotated[float, Range(0.0, 100.0)] = 0.1,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 
     Each cluster of candidates is fitted with the strip's pulse. Where the smoothed residual or its Gauss-Hermite
-    moments leave the range of noise, a score test places one more echo, and the fit with it is kept if chi2 falls
-    enough and the echoes can be told apart. Source: ALGORITHMS 2.3, 4.2, H1, H3.
+    moments exceed what noise explains, a score test places one more echo. The larger fit is kept if chi2 falls enough
+    and the echoes are resolved.
 
-    acceptance: least fall of chi2 for which an echo is added; 0 takes the strip's own from the survey.
-    max_echoes: echoes per cluster up to which a fit grows.
-    gate_residual: largest smoothed residual of a complete fit, in standard deviations.
-    gate_hermite: largest h3^2 + h4^2 of a complete fit.
-    width_prior: how far overlapping echoes may be narrower than the system pulse, one standard deviation in its widths;
-        0 for no prior.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise: fits end within a few hundredths of a
+    Parameters
+    ----------
+    acceptance : float
+        Least fall of chi2 for which an echo is added; 0 takes the value of the survey.
+    max_echoes : int
+        Most echoes per cluster to which a fit grows.
+    gate_residual : float
+        Largest smoothed residual of a complete fit [standard deviations].
+    gate_hermite : float
+        Largest h3^2 + h4^2 of a complete fit.
+    width_prior : float
+        How far overlapping echoes may be narrower than the system pulse [one standard deviation, in system widths]; 0
+        for no prior.
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2; with 0.5 it is then within a few hundredths of a
         standard deviation of the minimum.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    docs/algorithms.md 2.3, 4.2, H1, H3.
     """
     shape = pulse_shape(system, block.spacing)
     ref = shape_limits(system, block.spacing).ref
@@ -148,11 +150,26 @@ def adaptive(
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
-def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options) -> Settings:
-    """What a decomposition with this pulse may do, with the strip's widths, digitizer and noise."""
+def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options: Any) -> Settings:
+    """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
+
+    Parameters
+    ----------
+    block, system
+        As for a stage.
+    shape : PulseShape
+        The pulse to fit.
+    **options
+        Further fields of Settings.
+
+    Returns
+    -------
+    Settings
+        For `fit_candidates`.
+    """
     limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
     return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
 
@@ -164,86 +181,30 @@ def fit_candidates(
     echoes: EchoTable,
     settings: Settings,
     *,
-    most: int,
     significance: float,
+    most: int = MOST_JOINED,
 ) -> EchoTable:
-    """Candidates in ns -> clusters -> fits -> flagged table in ns."""
+    """Run a decomposer: candidates in ns, clusters, fits, flagged table in ns.
+
+    Parameters
+    ----------
+    block, noise, system, echoes
+        As for a stage.
+    settings : Settings
+        Pulse, limits and options of the fit.
+    significance : float
+        Least energy of an echo [standard deviations].
+    most : int
+        Most candidates that are fitted together.
+
+    Returns
+    -------
+    EchoTable
+        Fitted echoes with errors and flags.
+    """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
     solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
     return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
-
-
-def find_clusters(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, settings: Settings, most: int
-) -> tuple[Candidates, Clusters]:
-    """Candidates in samples, as parameters of the pulse, and which of them are fitted together."""
-    limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
-    start = np.stack(
-        [np.maximum(echoes.amplitude, 0), echoes.time / block.spacing, echoes.sigma / block.spacing], axis=1
-    )
-    amplitude, time, width = model_parameters(settings.shape, limits, start.astype(np.float64)).T
-    candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
-    ref = system.sigma_ref / block.spacing
-    candidates = _join_plateaus(block, candidates, settings.clip)
-    candidates, tail = _explain_tails(candidates, noise, settings)
-    present, row = np.unique(candidates.waveform, return_inverse=True)
-    signal = transpose_samples(block.samples[present])
-    signal -= noise.baseline[present]
-    clusters = cluster_candidates(
-        candidates._replace(waveform=row),
-        smooth_121(signal),
-        noise.std[present],
-        margin=int(np.ceil(MARGIN * ref)),
-        reach=int(np.ceil(REACH * ref)),
-        most=most,
-        tail=tail,
-    )
-    return candidates, clusters._replace(waveform=present[clusters.waveform])
-
-
-def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float | None) -> Candidates:
-    """Candidates of which no two stand on one flat top: clipped samples between them are no sign of two echoes (H6)."""
-    waveform, time, amplitude, _ = candidates
-    if clip is None or len(waveform) < 2:
-        return candidates
-    pair = np.flatnonzero(waveform[1:] == waveform[:-1])
-    clipped = block.samples[waveform[pair]] >= clip
-    begin, end = np.rint(time[pair]).astype(np.int64), np.rint(time[pair + 1]).astype(np.int64)
-    last = block.samples.shape[1] - 1
-    count = np.cumsum(np.pad(clipped, ((0, 0), (1, 0))), axis=1, dtype=np.int32)
-    row = np.arange(len(pair))
-    between = count[row, np.clip(end, 0, last)] - count[row, np.clip(begin + 1, 0, last)]
-    flat = (between >= LEAST_PLATEAU) & (end - begin - 1 - between <= PLATEAU_SLACK)
-    if not flat.any():
-        return candidates
-    joined = np.zeros(len(waveform), bool)
-    joined[pair[flat] + 1] = True
-    first = np.flatnonzero(~joined)
-    number = np.diff(np.r_[first, len(waveform)])
-    middle = np.add.reduceat(time, first) / number
-    kept = Candidates(*(field[first] for field in candidates))
-    return kept._replace(time=np.where(number > 1, middle, kept.time), amplitude=np.maximum.reduceat(amplitude, first))
-
-
-def _explain_tails(candidates: Candidates, noise: Noise, settings: Settings) -> tuple[Candidates, np.ndarray | None]:
-    """Candidates that the after-pulses of stronger echoes before them do not explain, and how far tails reach (H7).
-
-    A candidate that is dropped here comes back by growth if the fit of the stronger echo leaves something there.
-    """
-    tail = pulse_tail(settings.shape, settings.width_ref)
-    if tail is None:
-        return candidates, None
-    waveform, time, amplitude, _ = candidates
-    expected = np.zeros(len(waveform))
-    for step in range(1, min(MOST_JOINED, len(waveform))):
-        same = waveform[step:] == waveform[:-step]
-        lag = time[step:] - time[:-step]
-        expected[step:] += np.where(same, amplitude[:-step] * tail_at(tail, lag), 0.0)
-        expected[:-step] += np.where(same, amplitude[step:] * tail_at(tail, -lag), 0.0)
-    std = noise.std[waveform]
-    keep = (expected <= 0) | (amplitude - expected > 2.2 * std + 0.5 * expected)
-    candidates = Candidates(*(field[keep] for field in candidates))
-    return candidates, tail_reach(tail, candidates.amplitude / std[keep])
 
 
 def describe_solutions(
@@ -255,7 +216,28 @@ def describe_solutions(
     settings: Settings,
     significance: float,
 ) -> EchoTable:
-    """Fits in samples as a flagged table in ns, without echoes that noise explains or that lie outside."""
+    """Turn fits in samples into a flagged table in ns.
+
+    Echoes that noise explains or that lie outside the waveform are dropped, unresolved ones are merged.
+
+    Parameters
+    ----------
+    block, noise, system
+        As for a stage.
+    clusters : Clusters
+        The fitted clusters.
+    solutions : list of Solution
+        Their fits.
+    settings : Settings
+        Pulse and limits of the fit.
+    significance : float
+        Least energy of an echo [standard deviations].
+
+    Returns
+    -------
+    EchoTable
+        Fitted echoes with errors and flags.
+    """
     if not solutions:
         return EchoTable.empty()
     flat = [_flatten(clusters, solution) for solution in solutions]
@@ -267,19 +249,13 @@ def describe_solutions(
     last = block.samples.shape[1] - 1
     keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
     keep &= np.isfinite(errors).all(axis=1)
-    waveform, time, amplitude, width = waveform[keep], time[keep], amplitude[keep], width[keep]
-    errors = errors[keep]
+    amplitude, time, width = parameters[keep].T
+    amplitude_err, time_err, width_err = errors[keep].T
+    spacing = block.spacing
     table = EchoTable.build(
-        waveform,
-        time * block.spacing,
-        amplitude,
-        width * block.spacing,
-        time_err=errors[:, 1] * block.spacing,
-        amplitude_err=errors[:, 0],
-        sigma_err=errors[:, 2] * block.spacing,
-        residual=misfit[keep],
-        flags=flags[keep],
-    )
+        waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
+        amplitude_err=amplitude_err, sigma_err=width_err * spacing, residual=misfit[keep], flags=flags[keep],
+    )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
         table = drop_unproven(table, system)
@@ -305,7 +281,7 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
 def _start_closed_form(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, fraction: float
 ) -> EchoTable:
-    """The candidates with amplitude, time and width from the closed form where it holds."""
+    """Candidates with amplitude, time and width of the closed form, where it is valid."""
     ref = system.sigma_ref / block.spacing
     waveform = echoes.waveform.astype(np.int64)
     s = block.samples.shape[1]

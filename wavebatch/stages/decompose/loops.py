@@ -1,9 +1,9 @@
-"""Decomposers that decide what is fitted: Wang's residual loop, and ASDF with a fit only where it is needed."""
+"""Decomposers that decide what is fitted: Wang's residual loop, and the ASDF with a fit only where it is needed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from wavebatch.kernels.fit.closed_form import estimate_starts, start_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.signal import smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
 from wavebatch.stages.detect.correlation import asdf
 from wavebatch.stages.flags import flag_echoes
@@ -23,63 +24,57 @@ from wavebatch.stages.flags import flag_echoes
 
 @stage("decompose")
 def residual_loop(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    t_diff: float = 4.0,
-    max_echoes: int = 6,
-    max_iterations: int = 40,
-    significance: float = 5.0,
-) -> EchoTable:
-    """Gaussians, one more at the largest residual of the waveform as long as that exceeds a threshold.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    max_echoes: Annotated[int, Range(1, 1000)] = 6,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Gaussians, with one more at the largest residual of the waveform while that exceeds a threshold.
 
-    Nothing proves the added echoes but their residual: on pulses that are not Gaussian they are many. Source: Wang,
-    Wang and Tseng; ALGORITHMS 1.2.
+    Only their residual supports the added echoes: on pulses that are not Gaussian there are many.
 
-    t_diff: largest residual that is left alone, in standard deviations of the noise.
-    max_echoes: echoes per waveform up to which they are added.
-    max_iterations: of each fit, after which an echo is flagged as not converged.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    t_diff : float
+        Largest residual that adds no echo [standard deviations of the noise].
+    max_echoes : int
+        Most echoes per waveform up to which echoes are added.
+    max_iterations : int
+        Of each fit; an echo that has not converged after so many is flagged.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
     varies = find_varying(block.samples)
-    parts: list[tuple[EchoTable, int]] = []
+    parts: list[EchoTable] = []
     while len(rows):
         found = gaussian(
             block, noise, system, echoes, max_iterations=max_iterations, tolerance=0.1, significance=significance
         )
-        sample, height = _largest_residuals(block, noise, found)
+        residual = _residual(block, noise, found)
+        height = residual.max(axis=1)
         number = found.count(len(rows))
         grows = (height > t_diff * noise.std) & (number < max_echoes) & (number > before) & varies
-        final = found.take(np.flatnonzero(~grows[found.waveform]))
-        parts.append((replace(final, waveform=rows[final.waveform].astype(np.int32)), 0))
-        at = np.flatnonzero(grows)
-        echoes = _add_echoes(
-            found.take(np.flatnonzero(grows[found.waveform])), at, sample[at], height[at], block, system
-        )
-        echoes = replace(echoes, waveform=np.searchsorted(at, echoes.waveform).astype(np.int32))
+        at, goes_on = np.flatnonzero(grows), grows[found.waveform]
+        final, kept = found.take(np.flatnonzero(~goes_on)), found.take(np.flatnonzero(goes_on))
+        parts.append(_renumber(final, rows[final.waveform]))
+        new = residual[at].argmax(axis=1) * block.spacing
+        added = EchoTable.build(at, new, height[at], np.full(len(at), system.sigma_ref))
+        echoes = join_tables(kept, added)
+        echoes = _renumber(echoes, np.searchsorted(at, echoes.waveform))
         rows, before, varies, block = rows[at], number[at], varies[at], block.rows(at)
         noise = Noise(noise.baseline[at], noise.std[at])
-    table = EchoTable.concatenate(parts)
-    return table.take(np.lexsort((table.time, table.waveform)))
+    return join_tables(*parts)
 
 
-def _add_echoes(
-    found: EchoTable,
-    waveform: np.ndarray,
-    sample: np.ndarray,
-    height: np.ndarray,
-    block: WaveformBlock,
-    system: SystemPulse,
-) -> EchoTable:
-    """The echoes found and one of the system's width at a sample of each of the given waveforms."""
-    ref = np.full(len(waveform), system.sigma_ref)
-    added = (waveform, sample * block.spacing, height, ref)
-    known = (found.waveform, found.time, found.amplitude, found.sigma)
-    return EchoTable.build(*(np.concatenate(pair) for pair in zip(known, added, strict=True)))
+def _renumber(table: EchoTable, waveform: np.ndarray) -> EchoTable:
+    return replace(table, waveform=waveform.astype(np.int32))
 
 
 def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarray:
@@ -91,33 +86,30 @@ def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarra
     return residual.astype(np.float32)
 
 
-def _largest_residuals(block: WaveformBlock, noise: Noise, table: EchoTable) -> tuple[np.ndarray, np.ndarray]:
-    """Sample and height of the largest residual of every waveform (n,)."""
-    residual = _residual(block, noise, table)
-    sample = np.argmax(residual, axis=1)
-    return sample, residual[np.arange(len(block)), sample]
-
-
 @stage("decompose")
 def asdf_only(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["shortcut", "mixed"] = "shortcut",
-    tolerance: float = 0.5,
-    threshold: float = 4.0,
-) -> EchoTable:
-    """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where it is needed.
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
+) -> EchoTable:  # fmt: skip
+    """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where needed.
 
     Mixed: waveforms in which the chain's detector and the ASDF disagree in the number or the times of the echoes are
     fitted with Gaussians, from the detector's candidates. Errors without a fit are those expected of isolated echoes.
-    Source: Wagner et al. (2007); ALGORITHMS 1.1.
 
-    mode: `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
-    tolerance: largest distance in time of echoes that agree, in widths of the system pulse.
-    threshold: of the ASDF, in standard deviations of the filtered noise.
+    Parameters
+    ----------
+    mode : {"shortcut", "mixed"}
+        `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
+    tolerance : float
+        Largest distance in time of echoes that agree [widths of the system pulse].
+    threshold : float
+        Of the ASDF [standard deviations of the filtered noise].
+
+    References
+    ----------
+    Wagner et al. (2007); docs/algorithms.md 1.1.
     """
     quick = _describe(block, noise, system, asdf(block, noise, system, threshold=threshold))
     if mode == "shortcut":
@@ -125,16 +117,14 @@ def asdf_only(
     differ = _disagree(len(block), echoes, quick, tolerance * system.sigma_ref)
     rows = np.flatnonzero(differ)
     chosen = echoes.take(np.flatnonzero(differ[echoes.waveform]))
-    chosen = replace(chosen, waveform=np.searchsorted(rows, chosen.waveform).astype(np.int32))
+    chosen = _renumber(chosen, np.searchsorted(rows, chosen.waveform))
     fitted = gaussian(block.rows(rows), Noise(noise.baseline[rows], noise.std[rows]), system, chosen)
-    fitted = replace(fitted, waveform=rows[fitted.waveform].astype(np.int32))
     agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
-    table = EchoTable.concatenate([(agreed, 0), (fitted, 0)])
-    return table.take(np.lexsort((table.time, table.waveform)))
+    return join_tables(agreed, _renumber(fitted, rows[fitted.waveform]))
 
 
 def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
-    """True (n,) for waveforms in which two tables have another number of echoes, or one at another time."""
+    """Find waveforms in which two tables have different numbers of echoes, or one at a different time."""
     differ = first.count(n) != second.count(n)
     a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
     differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
@@ -142,7 +132,7 @@ def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> 
 
 
 def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Detected echoes with amplitude and width by a log-parabola through five samples, expected errors and misfit."""
+    """Describe echoes by a log-parabola through five samples, with the expected errors and the misfit."""
     spacing, last = block.spacing, block.samples.shape[1] - 1
     sample = np.clip(np.rint(echoes.time / spacing), 0, last).astype(np.int64)
     waveform = echoes.waveform.astype(np.int64)
@@ -151,7 +141,7 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
     table = candidate_table(block, system, waveform, echoes.time / spacing, amplitude, width)
     std = noise.std[waveform]
     height, width = np.maximum(table.amplitude, std).astype(np.float64), table.sigma.astype(np.float64)
-    # A reference of another width than the echo's loses this much of the bound (Schwarz's inequality, of the slopes).
+    # A reference whose width is not the echo's loses this much of the bound (Schwarz's inequality of the slopes).
     loss = ((width * width + system.sigma_ref**2) / (2.0 * width * system.sigma_ref)) ** 1.5
     amplitude_err, width_err = start_errors(height, width / spacing, std)
     table = replace(
@@ -169,8 +159,8 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
 def _misfit(residual: np.ndarray, waveform: np.ndarray, sample: np.ndarray, reach: float) -> np.ndarray:
     """Root mean square of residuals (n, s) within `reach` of samples, float32 (m,)."""
     total, number = np.zeros(len(sample)), np.zeros(len(sample))
-    reach = min(int(np.ceil(reach)), residual.shape[1])
-    for lag in range(-reach, reach + 1):
+    most = min(int(np.ceil(reach)), residual.shape[1])
+    for lag in range(-most, most + 1):
         at = sample + lag
         inside = (at >= 0) & (at < residual.shape[1])
         total += np.where(inside, residual[waveform, np.clip(at, 0, residual.shape[1] - 1)], 0.0) ** 2

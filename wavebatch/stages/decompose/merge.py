@@ -1,4 +1,4 @@
-"""Echoes too close to be told apart become one (ALGORITHMS H1)."""
+"""Merges fitted echoes that are too close to be resolved (docs/algorithms.md H1). Called after every fit."""
 
 from __future__ import annotations
 
@@ -10,15 +10,26 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.kernels.fit.grow import UNRESOLVED
 
 OVERLAP = 2.0
-"""Widths of the narrower echo within which two may be one: further apart, a weak one's poor time says nothing."""
-
+"""Only echoes closer than this many widths of the narrower one are merged: a weak echo further away has a poor time,
+but is another echo."""
 
 TWINS = 0.1
-"""Distance in widths below which two echoes that were fitted on their own are one and the same."""
+"""Two echoes of separate fits that are closer than this many widths are the same echo."""
 
 
 def drop_twins(table: EchoTable) -> EchoTable:
-    """The table without the weaker of two neighbours that were fitted each on its own and ended in the same place."""
+    """Drop the weaker of two neighbours that were fitted separately and ended in the same place.
+
+    Parameters
+    ----------
+    table : EchoTable
+        Fitted echoes.
+
+    Returns
+    -------
+    EchoTable
+        The remaining echoes.
+    """
     if len(table) < 2:
         return table
     same = np.diff(table.waveform) == 0
@@ -34,11 +45,23 @@ def drop_twins(table: EchoTable) -> EchoTable:
 
 
 def merge_unresolved(table: EchoTable) -> EchoTable:
-    """The table with neighbours closer than a quarter of the error of their distance merged, one pair after the other.
+    """Merge neighbours that are closer than a quarter of the error of their distance, one pair after the other.
 
-    Only echoes that were fitted together: what a fit of its own puts on another echo's flank says nothing of that one.
-    Area, mean time and variance of the pair are kept; errors of time and width are those of the better echo, widened
-    by nothing: together the pair is as well determined as one echo. The result is flagged.
+    Only echoes that were fitted together are merged: a separate fit on another echo's flank is no evidence about that
+    echo.
+
+    The merged echo has the area, mean time and variance of the pair. Errors are copied from the better of the two
+    echoes: together the pair is as well determined as one echo. It has the flag MERGED.
+
+    Parameters
+    ----------
+    table : EchoTable
+        Fitted echoes.
+
+    Returns
+    -------
+    EchoTable
+        Resolved and merged echoes.
     """
     while True:
         first = _unresolved(table)
@@ -48,7 +71,7 @@ def merge_unresolved(table: EchoTable) -> EchoTable:
 
 
 def _unresolved(table: EchoTable) -> np.ndarray:
-    """Rows whose next row is of the same waveform and not resolved from it; no row takes part in two pairs."""
+    """Rows that are not resolved from the next row, of the same waveform; no row is in two pairs."""
     if len(table) < 2:
         return np.empty(0, np.int64)
     gap = np.diff(table.time)
@@ -84,19 +107,21 @@ def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
     keep = np.ones(len(table), bool)
     keep[first] = keep[first + 1] = False
     rest = table.take(np.flatnonzero(keep))
-    return EchoTable.build(
-        **{
-            name: np.concatenate([getattr(rest, name), getattr(merged, name)])
-            for name in (
-                "waveform",
-                "time",
-                "amplitude",
-                "sigma",
-                "time_err",
-                "amplitude_err",
-                "sigma_err",
-                "residual",
-                "flags",
-            )
-        }
-    )
+    return join_tables(rest, merged)
+
+
+def join_tables(*tables: EchoTable) -> EchoTable:
+    """Join echoes of the same block into one table, sorted by waveform, then time.
+
+    Parameters
+    ----------
+    *tables : EchoTable
+        With the same columns.
+
+    Returns
+    -------
+    EchoTable
+        All echoes.
+    """
+    joined = EchoTable.concatenate((table, 0) for table in tables)
+    return joined.take(np.lexsort((joined.time, joined.waveform)))

@@ -1,10 +1,10 @@
-"""Decomposers for comparison: other pulse models, and undamped Gauss-Newton steps."""
+"""Decomposers for comparison: other pulse models, and Gauss-Newton steps without damping."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -16,87 +16,122 @@ from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model
 from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
-from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse, tabulate_pulse
-from wavebatch.stages.chain import stage
-from wavebatch.stages.decompose.fit import MOST_JOINED, describe_solutions, find_clusters, fit_candidates, make_settings
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
+from wavebatch.stages.chain import Range, stage
+from wavebatch.stages.decompose.fit import describe_solutions, fit_candidates, make_settings
+from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
-"""Exponents of the generalized Gaussian that are tried for every cluster of echoes."""
-
-
-def _model_settings(
-    block: WaveformBlock, system: SystemPulse, shape: PulseShape, max_iterations: int, tolerance: float
-) -> Settings:
-    return make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+"""Exponents of the generalized Gaussian that are tried for every cluster."""
 
 
 @stage("decompose")
 def skewed(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    kappa: float = 0.0,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    kappa: Annotated[float, Range(-1.0, 1.0)] = 0.0,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
 
-    The time is that of the peak. Source: Wang, Wang and Tseng eq. 2; ALGORITHMS 0, 1.2.
+    The time is that of the peak.
 
-    kappa: skew; 0 takes the strip's own from the survey.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    kappa : float
+        Skew; 0 takes the value of the survey.
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
     """
-    settings = _model_settings(block, system, skewed_shape(system, kappa), max_iterations, tolerance)
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    shape = skewed_shape(system, kappa)
+    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
-    """The pulse that `skewed` fits."""
-    skew = kappa or system.kappa
-    return PulseShape(kappa=skew) if abs(skew) >= NO_SKEW else PulseShape()
+    """Return the pulse that `skewed` fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    kappa : float
+        Skew; 0 takes the value of the survey.
+
+    Returns
+    -------
+    PulseShape
+        Skewed, or Gaussian where the skew is negligible.
+    """
+    return pulse_shape(replace(system, components=(), kappa=kappa or system.kappa), 1.0)
 
 
 @stage("decompose")
 def reference(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
     pulse: str = "",
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
-    Time and amplitude are those of the pulse's peak, the width its full width at half maximum over 2.354820. Source:
-    ALGORITHMS R1; Mallet and Bretar (2009).
+    Time and amplitude are those of the pulse's peak, the width is its full width at half maximum over 2.354820.
 
-    model: `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in
-        time, `given` for the pulse below, stretched.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    model : {"broadened", "stretched", "given"}
+        `broadened` for the survey's pulse convolved with a Gaussian, `stretched` for it as a table stretched in time,
+        `given` for the pulse below, stretched.
+    pulse : str
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
-    settings = _model_settings(block, system, shape, max_iterations, tolerance)
+    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
     if model != "broadened":
         system = replace(system, components=())
-    return fit_candidates(block, noise, system, echoes, settings, most=MOST_JOINED, significance=significance)
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str) -> PulseShape:
-    """The pulse that `reference` fits."""
+    """Return the pulse that `reference` fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    model, pulse : str
+        As for `reference`.
+
+    Returns
+    -------
+    PulseShape
+        Pulse for the kernels.
+    """
     shape = pulse_shape(system, spacing)
     if model == "stretched":
         return _tabulate_system(system, shape, spacing)
@@ -107,7 +142,7 @@ def reference_shape(system: SystemPulse, spacing: float, model: str, pulse: str)
 
 
 def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> PulseShape:
-    """The survey's pulse as a table."""
+    """Tabulate the survey's pulse."""
     ref = shape_limits(system, spacing).ref
     ends = [-6 * ref, 6 * ref]
     for _, delay, extra in shape.components:
@@ -120,26 +155,31 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
 
 @stage("decompose")
 def generalized_gaussian(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    max_iterations: int = 40,
-    tolerance: float = 0.5,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A sum of generalized Gaussians exp(-|z|^p / 2) whose exponent each cluster of echoes chooses for itself.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    max_iterations: Annotated[int, Range(1, 1000)] = 40,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
     Exponents from 1.4 (peaked) over 2 (Gaussian) to 4 (flat) are tried, the least chi2 wins. The width is the full
-    width at half maximum over 2.354820. Source: Chauve et al. (2007), eq. 4.
+    width at half maximum over 2.354820.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Chauve et al. (2007), eq. 4.
     """
-    plain = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
-    candidates, clusters = find_clusters(block, noise, system, echoes, plain, MOST_JOINED)
+    plain = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    candidates, clusters = find_clusters(block, noise, system, echoes, plain)
     best = np.full(len(clusters.number), np.inf)
     chosen = np.zeros(len(best), np.int64)
     found: list[list[Solution]] = []
@@ -162,37 +202,53 @@ def generalized_gaussian(
 
 
 def half_width_factor(power: float) -> float:
-    """Full width at half maximum of exp(-|z|^p / 2) over 2.354820."""
+    """Return the full width at half maximum of exp(-|z|^p / 2) over 2.354820.
+
+    Parameters
+    ----------
+    power : float
+        Exponent p.
+
+    Returns
+    -------
+    float
+        1 for a Gaussian.
+    """
     return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
 @stage("decompose")
 def gauss_newton(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    echoes: EchoTable,
-    *,
-    max_iterations: int = 20,
-    tolerance: float = 0.01,
-    significance: float = 5.0,
-) -> EchoTable:
-    """A sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts further off than one sigma are lost.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    max_iterations: Annotated[int, Range(1, 1000)] = 20,
+    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
+    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+) -> EchoTable:  # fmt: skip
+    """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
-    A fit that is lost gives its start back, flagged as not converged. Source: Jutzi and Stilla (2005); ALGORITHMS 1.3.
+    A fit that is lost returns its start, flagged as not converged.
 
-    max_iterations: after which an echo is flagged as not converged.
-    tolerance: fall of chi2 that the last step, which is taken, may promise.
-    significance: least energy of an echo, in standard deviations of the noise's.
+    Parameters
+    ----------
+    max_iterations : int
+        An echo that has not converged after so many is flagged.
+    tolerance : float
+        A fit ends with the step that promises a smaller fall of chi2.
+    significance : float
+        Least energy of an echo [standard deviations of the noise's energy].
+
+    References
+    ----------
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
-    settings = _model_settings(block, system, PulseShape(), max_iterations, tolerance)
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings, MOST_JOINED)
+    settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    candidates, clusters = find_clusters(block, noise, system, echoes, settings)
     found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in _alike(clusters, block)]
     return describe_solutions(block, noise, system, clusters, found, settings, significance)
 
 
 def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
-    """Clusters with the same number of echoes and windows of about the same length, a batch at a time."""
+    """Batches of clusters with the same number of echoes and windows of about the same length."""
     length = np.minimum(-(-(clusters.high - clusters.low) // 8) * 8, block.samples.shape[1])
     kind = clusters.number * (1 << 32) + length
     order = np.argsort(kind, kind="stable")
@@ -202,12 +258,7 @@ def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
 
 
 def _solve_undamped(
-    block: WaveformBlock,
-    noise: Noise,
-    candidates: Candidates,
-    clusters: Clusters,
-    rows: np.ndarray,
-    settings: Settings,
+    block: WaveformBlock, noise: Noise, candidates: Candidates, clusters: Clusters, rows: np.ndarray, settings: Settings
 ) -> Solution:
     low, high = clusters.low[rows], clusters.high[rows]
     length = min(-(-int((high - low).max()) // 8) * 8, block.samples.shape[1])
@@ -232,6 +283,6 @@ def _solve_undamped(
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:
-    """The solution with widths multiplied by the factor."""
+    """Multiply the widths of a solution by the factor."""
     scale = np.array([1.0, 1.0, factor])[:, None]
     return solution._replace(parameters=solution.parameters * scale, errors=solution.errors * scale)

@@ -1,4 +1,4 @@
-"""What detectors share: the signal they look at and the table they make."""
+"""What all detectors share: the signal that they search and the table of candidates that they return."""
 
 from __future__ import annotations
 
@@ -10,7 +10,20 @@ from wavebatch.kernels.signal.signal import transpose_samples
 
 
 def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
-    """Signal above the baseline, float32 (s, n)."""
+    """Subtract the baseline of each waveform.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        n waveforms of s samples.
+    noise : Noise
+        Their baselines.
+
+    Returns
+    -------
+    float32 array, shape (s, n)
+        Signal above the baseline [count]; waveforms lie along the last axis, as kernels need it.
+    """
     signal = transpose_samples(block.samples)
     signal -= noise.baseline
     return signal
@@ -19,7 +32,28 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
 def make_table(
     block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
 ) -> EchoTable:
-    """Candidates in samples as a table in ns; a constant waveform has none, whatever filters make of its ends (H10)."""
+    """Turn candidates in samples into a table in ns; constant waveforms have none, whatever filters make of their ends.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    waveform : int array, shape (m,)
+        Row of the block.
+    time, width : float array, shape (m,)
+        Centre and standard deviation [samples].
+    amplitude : float array, shape (m,)
+        Height above the baseline [count].
+
+    Returns
+    -------
+    EchoTable
+        Candidates, sorted.
+
+    References
+    ----------
+    docs/algorithms.md H10.
+    """
     rows, row = np.unique(waveform, return_inverse=True)
     varies = find_varying(block.samples[rows])[row]
     columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
@@ -27,7 +61,18 @@ def make_table(
 
 
 def find_varying(samples: np.ndarray) -> np.ndarray:
-    """True (n,) for the waveforms of samples (n, s) that are not constant."""
+    """Find the waveforms that are not constant.
+
+    Parameters
+    ----------
+    samples : uint array, shape (n, s)
+        Raw counts.
+
+    Returns
+    -------
+    bool array, shape (n,)
+        True where samples differ.
+    """
     return (samples != samples[:, :1]).any(axis=1)
 
 
@@ -37,18 +82,35 @@ def candidate_table(
     waveform: np.ndarray,
     time: np.ndarray,
     amplitude: np.ndarray,
-    width: np.ndarray,
+    width: np.ndarray | None = None,
 ) -> EchoTable:
-    """Candidates in samples as a table in ns.
+    """Turn candidates in samples into a table in ns, with all values brought into their legal ranges.
 
-    Widths are brought within 0.7 and 4 system widths, times within the waveform, amplitudes to at least 0.
+    Widths are clipped to 0.7 to 4 system widths, times to the waveform, amplitudes to 0 and above.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        The waveforms.
+    system : SystemPulse
+        With the width of the system pulse.
+    waveform : int array, shape (m,)
+        Row of the block.
+    time : float array, shape (m,)
+        Centre [samples].
+    amplitude : float array, shape (m,)
+        Height above the baseline [count].
+    width : float array, shape (m,), optional
+        Standard deviation [samples]; the system's by default.
+
+    Returns
+    -------
+    EchoTable
+        Candidates, sorted.
     """
     ref = system.sigma_ref / block.spacing
     last = block.samples.shape[1] - 1
+    width = np.full(len(time), ref) if width is None else width
     return make_table(
-        block,
-        waveform,
-        np.clip(time, 0.0, last),
-        np.maximum(amplitude, 0.0),
-        np.clip(width, 0.7 * ref, 4.0 * ref),
+        block, waveform, np.clip(time, 0.0, last), np.maximum(amplitude, 0.0), np.clip(width, 0.7 * ref, 4.0 * ref)
     )

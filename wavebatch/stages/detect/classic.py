@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -21,29 +21,39 @@ from wavebatch.kernels.signal.filters import (
 )
 from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 
 
 def _smoothed_width(ref: float) -> float:
-    """Width of the system pulse behind the [1 2 1]/4 filter [samples]."""
+    """Width of the system pulse after the [1 2 1]/4 filter [samples]."""
     return float(np.sqrt(ref * ref + 0.5))
 
 
 @stage("detect")
 def threshold(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 4.0, correct_walk: bool = True
-) -> EchoTable:
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+    correct_walk: bool = True,
+) -> EchoTable:  # fmt: skip
     """One echo per run of smoothed signal above a level, timed at its leading edge.
 
-    The leading edge comes earlier the stronger the echo is. Source: Wagner et al. (2007), section 3.
+    The stronger the echo, the earlier its leading edge.
 
-    level: of the trigger, in standard deviations of the smoothed noise.
-    correct_walk: add the time that an echo of this amplitude and the system's width takes from the level to its peak;
-        without it, times are those of the edge itself.
+    Parameters
+    ----------
+    level : float
+        Level of the trigger [standard deviations of the smoothed noise].
+    correct_walk : bool
+        Add the time from the level to the peak of an echo of this amplitude and the system's width; without it, times
+        are those of the edge.
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     smoothed = smooth_121(signal_above(block, noise))
-    s, n = smoothed.shape
+    s = len(smoothed)
     limit = np.float32(level * SMOOTH_GAIN) * noise.std
     starts, ends = find_runs(smoothed, limit)
     waveform = starts // s
@@ -51,12 +61,11 @@ def threshold(
     ref = system.sigma_ref / block.spacing
     amplitude, _, width = estimate_starts(smoothed, waveform, peak, ref)
     first, trigger = starts - waveform * s, limit[waveform]
-    flat = smoothed.reshape(-1)
-    inside, outside = flat[first * n + waveform], flat[np.maximum(first - 1, 0) * n + waveform]
+    inside, outside = smoothed[first, waveform], smoothed[np.maximum(first - 1, 0), waveform]
     rise = np.where(first > 0, inside - outside, np.float32(np.inf))
     time = first - (inside - trigger) / rise
     if correct_walk:
-        top = flat[peak * n + waveform]
+        top = smoothed[peak, waveform]
         time += _smoothed_width(ref) * np.sqrt(2 * np.log(np.maximum(top / trigger, 1.0)))
         time = np.minimum(time, ends - waveform * s)
     return candidate_table(block, system, waveform, time, amplitude, width)
@@ -64,15 +73,25 @@ def threshold(
 
 @stage("detect")
 def sustained_threshold(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 3.0, duration: float = 1.0
-) -> EchoTable:
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    level: Annotated[float, Range(0.1, 1e6)] = 3.0,
+    duration: Annotated[float, Range(0.0, 100.0)] = 1.0,
+) -> EchoTable:  # fmt: skip
     """One echo per run of samples above a level that lasts as long as the system pulse, at its highest sample.
 
-    Finds half of the echoes of 5.5 standard deviations and all of 10; no false echo in 20,000 waveforms of noise.
-    Source: Jutzi and Stilla (2005); ALGORITHMS 1.3.
+    Finds half of the echoes of 5.5 noise standard deviations and all of 10. It made no false echo in 20,000 waveforms
+    of noise.
 
-    level: that every sample of the run exceeds, in standard deviations of the noise.
-    duration: least length of the run, in full widths at half maximum of the system pulse.
+    Parameters
+    ----------
+    level : float
+        Every sample of the run exceeds it [standard deviations of the noise].
+    duration : float
+        Least length of the run [full widths at half maximum of the system pulse].
+
+    References
+    ----------
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -88,45 +107,62 @@ def sustained_threshold(
 
 
 @stage("detect")
-def center_of_gravity(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float = 4.0) -> EchoTable:
+def center_of_gravity(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: Annotated[float, Range(0.1, 1e6)] = 4.0
+) -> EchoTable:
     """One echo per run of smoothed signal above a level, at the centre of gravity of its samples.
 
-    Insensitive to noise and to the shape of the pulse; overlapping echoes become one between them. The width is the
-    standard deviation of the samples in time. Source: Wagner et al. (2007), section 3.
+    Insensitive to noise and to the shape of the pulse; overlapping echoes become one echo between them. The width is
+    the standard deviation of the samples in time.
 
-    level: that the run exceeds, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    level : float
+        Every sample of the run exceeds it [standard deviations of the smoothed noise].
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
-    s, n = smoothed.shape
     starts, ends = find_runs(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
-    waveform = starts // s
+    waveform = starts // len(signal)
     peak = highest_samples(smoothed, starts, ends)
     time, width = run_moments(signal, starts, ends)
-    return candidate_table(block, system, waveform, time, smoothed.reshape(-1)[peak * n + waveform], width)
+    return candidate_table(block, system, waveform, time, smoothed[peak, waveform], width)
 
 
 @stage("detect")
 def constant_fraction(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, fraction: float = 0.5, level: float = 4.0
-) -> EchoTable:
-    """An echo per local maximum, timed where its leading edge reaches a fraction of its height.
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.5,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+) -> EchoTable:  # fmt: skip
+    """One echo per local maximum, timed where its leading edge reaches a fraction of its height.
 
-    The time does not depend on the amplitude; the lead of the edge of a system pulse is added, so that times are those
-    of the peak. Source: Wagner et al. (2007), section 3.
+    The time does not depend on the amplitude. The time from the edge to the peak of a system pulse is added, so times
+    are those of the peak.
 
-    fraction: of the height, above 0 and below 1.
-    level: least height above the baseline, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    fraction : float
+        Of the height, above 0 and below 1.
+    level : float
+        Least height above the baseline [standard deviations of the smoothed noise].
+
+    References
+    ----------
+    Wagner et al. (2007), section 3.
     """
     if not 0 < fraction < 1:
         raise ConfigError(f"fraction must lie between 0 and 1, got {fraction}")
     smoothed = smooth_121(signal_above(block, noise))
-    n = smoothed.shape[1]
     ref = system.sigma_ref / block.spacing
     waveform, sample = find_peaks(smoothed, np.float32(level * SMOOTH_GAIN) * noise.std)
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)
     height = np.maximum(amplitude / np.sqrt(1 + 0.5 / np.maximum(width, 0.3) ** 2), 0.0)
-    top = smoothed.reshape(-1)[sample * n + waveform]
+    top = smoothed[sample, waveform]
     height = np.clip(height, top, 1.2 * top)
     edge = walk_down(smoothed, waveform, sample, np.minimum(fraction * height, 0.999 * top), -1)
     time = edge + _smoothed_width(ref) * np.sqrt(-2 * np.log(fraction))
@@ -135,22 +171,28 @@ def constant_fraction(
 
 @stage("detect")
 def zero_crossing(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     derivative: Literal["first", "second"] = "first",
-    level: float = 4.0,
-    scale: float = 0.5,
-) -> EchoTable:
-    """Echoes where the first derivative falls through zero, or between two zeros of the second.
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.5,
+) -> EchoTable:  # fmt: skip
+    """Echoes where the first derivative falls through zero, or midway between two zeros of the second.
 
-    The zeros of the second derivative are the inflection points: an echo lies half-way between the two, and its width
-    is half of their distance. Source: Wagner et al. (2007), section 3; Hofton et al. (2000).
+    The zeros of the second derivative are the inflection points: an echo lies midway between two of them, and its width
+    is half of their distance.
 
-    derivative: of the waveform, `first` or `second`.
-    level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
-    scale: width of the Gaussian that the derivative is taken of, in widths of the system pulse.
+    Parameters
+    ----------
+    derivative : {"first", "second"}
+        Which derivative of the waveform.
+    level : float
+        Least height of the smoothed signal above the baseline [standard deviations of its noise].
+    scale : float
+        Width of the Gaussian that smooths before the derivative [widths of the system pulse].
+
+    References
+    ----------
+    Wagner et al. (2007), section 3; Hofton et al. (2000).
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -162,28 +204,26 @@ def zero_crossing(
     else:
         taps = curvature_taps(blur)
         waveform, time, width = _between_inflections(filter_symmetric(signal, taps), taps, noise, blur)
-    s, n = smoothed.shape
-    sample = np.clip(np.rint(time), 0, s - 1).astype(np.int64)
-    amplitude = smoothed.reshape(-1)[sample * n + waveform]
+    sample = np.clip(np.rint(time), 0, len(smoothed) - 1).astype(np.int64)
+    amplitude = smoothed[sample, waveform]
     high = amplitude > (level * SMOOTH_GAIN) * noise.std[waveform]
     return candidate_table(block, system, waveform[high], time[high], amplitude[high], width[high])
 
 
 def _falls_through_zero(slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Waveform and time (m,) of the places where slope (s, n) goes from positive to not positive."""
+    """Waveform and time (m,) of the places where slope (s, n) goes from positive to zero or below."""
     n = slope.shape[1]
     falling = slope[:-1] > 0
     falling &= slope[1:] <= 0
     sample, waveform = np.divmod(np.flatnonzero(falling), n) if n else (np.empty(0, np.int64),) * 2
-    flat = slope.reshape(-1)
-    before, after = flat[sample * n + waveform], flat[(sample + 1) * n + waveform]
+    before, after = slope[sample, waveform], slope[sample + 1, waveform]
     return waveform, sample + before / (before - after)
 
 
 def _between_inflections(
     curvature: np.ndarray, taps: np.ndarray, noise: Noise, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Waveform, time and width (m,) of the stretches of positive curvature; those that noise makes are left out."""
+    """Waveform, time and width (m,) of the stretches of positive curvature that exceed the noise."""
     waveform, sample = find_peaks(curvature, np.float32(2.0 * np.sqrt(filter_energy(taps))) * noise.std)
     zero = np.zeros(len(sample))
     left = walk_down(curvature, waveform, sample, zero, -1)

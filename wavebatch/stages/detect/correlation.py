@@ -1,8 +1,9 @@
-"""Detectors that compare the waveform with a reference pulse: correlation and average square differences."""
+"""Detectors that compare the waveform with a reference pulse: correlation and average square difference (ASDF)."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from wavebatch.kernels.signal.square_differences import (
     slide_taps,
     square_differences,
 )
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse
 
@@ -28,90 +29,101 @@ Candidates = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Waveform, time [samples], amplitude."""
 
 
-def _in_parts(signal: np.ndarray, std: np.ndarray, detect) -> Candidates:
-    """Candidates of the columns of signal (s, n), a few hundred at a time."""
-    found: list[Candidates] = []
+def _in_parts(signal: np.ndarray, std: np.ndarray, detect: Callable[..., Candidates]) -> Candidates:
+    """Candidates of the columns of signal (s, n), a few hundred at a time, so that arrays stay in the cache."""
+    found: list[Candidates] = [(np.empty(0, np.int64), np.empty(0), np.empty(0))]
     for begin in range(0, signal.shape[1], COLUMNS_AT_A_TIME):
         part = slice(begin, begin + COLUMNS_AT_A_TIME)
         waveform, time, amplitude = detect(np.ascontiguousarray(signal[:, part]), std[part])
         found.append((waveform + begin, time, amplitude))
-    if not found:
-        return (np.empty(0, np.int64), np.empty(0), np.empty(0))
-    return tuple(np.concatenate(fields) for fields in zip(*found, strict=True))
+    waveform, time, amplitude = (np.concatenate(fields) for fields in zip(*found, strict=True))
+    return waveform, time, amplitude
 
 
 @stage("detect")
 def correlation(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
-    threshold: float = 4.27,
-    similarity: float = 0.5,
-    reach: float = 3.0,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
+    similarity: Annotated[float, Range(0.0, 1.0)] = 0.5,
+    reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of the correlation with a reference pulse, where the waveform resembles it.
 
-    Sub-sample times by a parabola through the logarithms of three correlations. Source: Hofton and Blair (2002); Jutzi
-    and Stilla (2005); ALGORITHMS 1.3.
+    Times come from a parabola through the logarithms of three correlations.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    threshold: least correlation, in standard deviations of the filtered noise.
-    similarity: least correlation coefficient of waveform and reference, up to 1.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    threshold : float
+        Least correlation [standard deviations of the filtered noise].
+    similarity : float
+        Least correlation coefficient of waveform and reference, at most 1.
+    reach : float
+        Half of the reference's length [widths of the system pulse].
+    pulse : str
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
+
+    References
+    ----------
+    Hofton and Blair (2002); Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     energy = float(np.sum(given.taps**2))
 
     def detect(signal: np.ndarray, std: np.ndarray) -> Candidates:
-        s, n = signal.shape
         padded = pad_samples(signal, given.middle)
         correlations = slide_taps(padded, given.taps)
         waveform, sample = find_peaks(correlations, np.float32(threshold * np.sqrt(energy)) * std)
-        squares = slide_energy(padded, len(given.taps)).reshape(-1)[sample * n + waveform]
-        value = correlations.reshape(-1)[sample * n + waveform]
+        squares = slide_energy(padded, len(given.taps))[sample, waveform]
+        value = correlations[sample, waveform]
         alike = value >= similarity * np.sqrt(np.maximum(squares, 0) * np.float32(energy))
         waveform, sample = waveform[alike], sample[alike]
         time, height = refine_peaks(correlations, waveform, sample)
         return waveform, time + (given.peak - given.middle), height / energy
 
-    waveform, time, amplitude = _in_parts(signal_above(block, noise), noise.std, detect)
-    width = np.full(len(time), system.sigma_ref / block.spacing)
-    return candidate_table(block, system, waveform, time, amplitude, width)
+    return candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))
 
 
 @stage("detect")
 def asdf(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "gaussian",
     rule: Literal["absolute", "paper"] = "absolute",
-    fraction: float = 0.3,
-    threshold: float = 4.0,
+    fraction: Annotated[float, Range(0.0, 1.0)] = 0.3,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
     interpolation: Literal["log", "parabola"] = "log",
-    reach: float = 5.0,
+    reach: Annotated[float, Range(0.5, 20.0)] = 5.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the minima of the average square difference to a reference pulse as high as the waveform.
 
-    With the paper's rule, echoes below 30 % of the strongest are lost and noise alone has at least one echo; the
-    absolute rule asks for a minimum as deep as noise seldom makes it, at a maximum of the correlation. Source:
-    Wagner et al. (2007) eq. 6, 7; ALGORITHMS 1.1.
+    The paper's rule loses echoes below 30 % of the strongest and finds at least one echo in noise alone. The absolute
+    rule asks for a minimum that is deeper than noise makes it, at a maximum of the correlation.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    rule: `absolute` for a threshold in noise, `paper` for one relative to the waveform's largest and least difference.
-    fraction: of the range of differences that separates minima by the paper's rule.
-    threshold: of the absolute rule: least depth of a minimum and least correlation at it, in standard deviations of
-        the filtered noise.
-    interpolation: `log` for a parabola through the logarithms of the correlation, which has no bias for Gaussians;
-        `parabola` for the paper's, through the differences.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    rule : {"absolute", "paper"}
+        `absolute` for a threshold in noise, `paper` for one relative to the waveform's largest and least difference.
+    fraction : float
+        Paper's rule: share of the range of differences that separates minima.
+    threshold : float
+        Absolute rule: least depth of a minimum and least correlation at it [standard deviations of the filtered noise].
+    interpolation : {"log", "parabola"}
+        `log` for a parabola through the logarithms of the correlation, which has no bias for Gaussians; `parabola` for
+        the paper's, through the differences.
+    reach : float
+        Half of the reference's length [widths of the system pulse].
+    pulse : str
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
+
+    References
+    ----------
+    Wagner et al. (2007) eq. 6, 7; docs/algorithms.md 1.1.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     gain = np.float32(threshold * np.sqrt(np.sum(given.taps**2)))
@@ -133,13 +145,11 @@ def asdf(
         inside = (time >= 0) & (time <= len(signal) - 1) & (peaked | (rule == "paper"))
         return kept.waveform[inside], time[inside], amplitude[inside]
 
-    waveform, time, amplitude = _in_parts(signal_above(block, noise), noise.std, detect)
-    width = np.full(len(time), system.sigma_ref / block.spacing)
-    return candidate_table(block, system, waveform, time, amplitude, width)
+    return candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))
 
 
 def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Samples from minima of values (n, rows) to the peak, and where the correlation (rows, n) has one there too."""
+    """Distance from minima of values (n, rows) to the peak [samples]; whether the correlation (rows, n) peaks there."""
     waveform, row = minima.waveform, minima.row
     shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))
     near = [correlations[row + d, waveform] for d in (-1, 0, 1)]
@@ -150,7 +160,18 @@ def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: b
 
 
 def parabola_shift(before: np.ndarray, here: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Samples from the middle one of three values to the least value of their parabola; inf where it has none."""
+    """Find the vertex of the parabola through three equidistant values.
+
+    Parameters
+    ----------
+    before, here, after : float array, shape (k,)
+        The three values.
+
+    Returns
+    -------
+    float64 array, shape (k,)
+        Samples from the middle value to the vertex; inf where the parabola has no minimum.
+    """
     before, here, after = (values.astype(np.float64) for values in (before, here, after))
     curve = before - 2 * here + after
     return np.where(curve > 0, 0.5 * (before - after) / np.where(curve > 0, curve, 1.0), np.inf)

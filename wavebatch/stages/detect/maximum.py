@@ -1,6 +1,8 @@
-"""Detectors: where a waveform holds echoes. Times in ns; widths are first guesses."""
+"""The standard detectors: local maxima of a filtered waveform. Times in ns; widths are first guesses for the fit."""
 
 from __future__ import annotations
+
+from typing import Annotated
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from wavebatch.kernels.signal.filters import (
     refine_peaks,
 )
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import make_table, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
@@ -26,15 +28,23 @@ BROAD = 4.0
 
 
 @stage("detect")
-def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.0) -> EchoTable:
+def maximum(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.0
+) -> EchoTable:
     """Echoes at the local maxima of the [1 4 6 4 1]/16-smoothed waveform.
 
-    Of pulses wider than 4 samples, on whose tops noise has maxima of its own, a Gaussian takes the place of these taps,
-    which grows by half of what they are wider. Time, amplitude and width come from a log-parabola through five samples
-    around the maximum. Never splits a broad echo. Source: Wagner et al. (2007), max-detection; smoothing as in
-    ALGORITHMS 1.1.
+    System pulses wider than 4 samples have several noise maxima on their tops. They are smoothed by a Gaussian instead,
+    which grows by half of the additional width. Time, amplitude and width come from a log-parabola through five samples
+    around the maximum. A broad echo is never split.
 
-    threshold: least height above the baseline, in standard deviations of the smoothed noise.
+    Parameters
+    ----------
+    threshold : float
+        Least height above the baseline [standard deviations of the smoothed noise].
+
+    References
+    ----------
+    Wagner et al. (2007), max-detection; smoothing as in docs/algorithms.md 1.1.
     """
     signal = signal_above(block, noise)
     ref = system.sigma_ref / block.spacing
@@ -60,9 +70,9 @@ def maximum(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshol
 
 
 def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Samples to the nearest other maximum of the waveform (m,), infinite without one.
+    """Distance in samples to the nearest other maximum of the waveform (m,), infinite without one.
 
-    Echoes closer than two widths have one maximum (ALGORITHMS 2.2), so half of the gap bounds the width.
+    Echoes closer than two widths have one maximum (docs/algorithms.md 2.2), so half of the gap bounds the width.
     """
     gap = np.full(len(sample) + 1, np.inf)
     gap[1:-1] = np.where(np.diff(waveform) == 0, np.diff(sample), np.inf)
@@ -70,14 +80,23 @@ def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
 
 
 @stage("detect")
-def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float = 4.27) -> EchoTable:
+def matched_filter(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: Annotated[float, Range(0.0, 1e6)] = 4.27
+) -> EchoTable:
     """Echoes at the maxima of the correlation with the system pulse: the most sensitive detector of weak echoes.
 
-    Sub-sample times by a parabola through the logarithms of three correlations (1.00-1.04 of the Cramer-Rao bound
-    for an isolated echo of the system's width). Source: ALGORITHMS 1.1 (4), 1.3, 4.1.
+    Times come from a parabola through the logarithms of three correlations. For an isolated echo of the system's width
+    their error is 1.00 to 1.04 of the Cramer-Rao bound.
 
-    threshold: least correlation, in standard deviations of the filtered noise; 4.27 lets noise through in 0.1 % of 200
-    samples.
+    Parameters
+    ----------
+    threshold : float
+        Least correlation [standard deviations of the filtered noise]; noise exceeds 4.27 in 0.1 % of waveforms of 200
+        samples.
+
+    References
+    ----------
+    docs/algorithms.md 1.1 (4), 1.3, 4.1.
     """
     ref = system.sigma_ref / block.spacing
     taps = gaussian_taps(ref)
@@ -92,22 +111,28 @@ def matched_filter(block: WaveformBlock, noise: Noise, system: SystemPulse, *, t
 
 @stage("detect")
 def second_derivative(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
-    threshold: float = 2.0,
-    scale: float = 0.85,
-    level: float = 4.0,
-) -> EchoTable:
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 2.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.85,
+    level: Annotated[float, Range(0.1, 1e6)] = 4.0,
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of the negative second derivative: separates echoes that share one maximum.
 
-    The derivative is taken of the waveform smoothed by a Gaussian. Equal echoes are told apart from
-    1.48 sqrt(s^2 + a^2) on, a the smoothing. Source: Hofton et al. (2000), inflection points; ALGORITHMS 1.2, 2.2.
+    The derivative is taken of the waveform smoothed by a Gaussian of width a. Equal echoes of width s are separated
+    from a distance of 1.48 sqrt(s^2 + a^2) on.
 
-    threshold: least curvature, in standard deviations of the filtered noise.
-    scale: width of the smoothing, in widths of the system pulse.
-    level: least height of the smoothed signal above the baseline, in standard deviations of its noise.
+    Parameters
+    ----------
+    threshold : float
+        Least curvature [standard deviations of the filtered noise].
+    scale : float
+        Width of the smoothing [widths of the system pulse].
+    level : float
+        Least height of the smoothed signal above the baseline [standard deviations of its noise].
+
+    References
+    ----------
+    Hofton et al. (2000), inflection points; docs/algorithms.md 1.2, 2.2.
     """
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
@@ -115,8 +140,7 @@ def second_derivative(
     taps = curvature_taps(max(scale * ref, 0.7))
     curvature = filter_symmetric(signal, taps)
     waveform, sample = find_peaks(curvature, np.float32(threshold * np.sqrt(filter_energy(taps))) * noise.std)
-    s, n = smoothed.shape
-    high = smoothed.reshape(-1)[sample * n + waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
+    high = smoothed[sample, waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]
     waveform, sample = waveform[high], sample[high]
     time, _ = refine_peaks(curvature, waveform, sample)
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, ref)

@@ -1,8 +1,8 @@
-"""Detectors that take the waveform apart: wavelets and deconvolution."""
+"""Detectors that transform the waveform: wavelets and deconvolution."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -14,12 +14,12 @@ from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filt
 from wavebatch.kernels.signal.runs import list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
-from wavebatch.stages.chain import stage
+from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
 from wavebatch.stages.reference_pulse import reference_pulse
 
 HAT_WIDTH = 0.75
-"""Width of the Mexican hat that counts like the B3 wavelet, in system widths (ALGORITHMS 1.2)."""
+"""Width of the Mexican hat that separates echoes as the B3 wavelet does [system widths] (docs/algorithms.md 1.2)."""
 
 COARSEST = 15
 """Level of the B3 transform that spans the longest waveforms."""
@@ -30,22 +30,28 @@ AT_A_TIME = 1024
 
 @stage("detect")
 def wavelet(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     wavelet: Literal["b3", "mexican_hat"] = "b3",
-    threshold: float = 4.0,
-    scale: float = 0.0,
-) -> EchoTable:
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    scale: Annotated[float, Range(0.0, 100.0)] = 0.0,
+) -> EchoTable:  # fmt: skip
     """Echoes at the maxima of one scale of a wavelet transform.
 
-    The B3-spline transform with holes tells echoes apart from about one full width at half maximum on; its level
-    follows the width of the system pulse. Source: Wang, Wang and Tseng; ALGORITHMS 1.2.
+    The B3-spline transform with holes separates echoes from a distance of about one full width at half maximum on; its
+    level follows the width of the system pulse.
 
-    wavelet: `b3` for the B3-spline transform, `mexican_hat` for the second derivative of a Gaussian.
-    threshold: least value at a maximum, in standard deviations of the transformed noise; the paper's is 3.
-    scale: level of the B3 transform (1, 2, ...), or width of the Mexican hat in ns; 0 takes what suits the system.
+    Parameters
+    ----------
+    wavelet : {"b3", "mexican_hat"}
+        `b3` for the B3-spline transform, `mexican_hat` for the second derivative of a Gaussian.
+    threshold : float
+        Least value at a maximum [standard deviations of the transformed noise]; the paper's is 3.
+    scale : float
+        Level of the B3 transform (1, 2, ...), or width of the Mexican hat [ns]; 0 chooses by the system pulse.
+
+    References
+    ----------
+    Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
     ref = system.sigma_ref / block.spacing
     signal = signal_above(block, noise)
@@ -60,31 +66,39 @@ def wavelet(
     waveform, sample = find_peaks(detail, np.float32(threshold * gain) * noise.std)
     time, _ = refine_peaks(detail, waveform, sample)
     amplitude = smooth_121(signal)[sample, waveform]
-    return candidate_table(block, system, waveform, time, amplitude, np.full(len(time), ref))
+    return candidate_table(block, system, waveform, time, amplitude)
 
 
 @stage("detect")
 def richardson_lucy(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    *,
+    block: WaveformBlock, noise: Noise, system: SystemPulse, *,
     reference: Literal["gaussian", "system", "given"] = "system",
-    iterations: int = 16,
-    threshold: float = 4.27,
-    reach: float = 3.0,
+    iterations: Annotated[int, Range(1, 10_000)] = 16,
+    threshold: Annotated[float, Range(0.0, 1e6)] = 4.27,
+    reach: Annotated[float, Range(0.5, 20.0)] = 3.0,
     pulse: str = "",
-) -> EchoTable:
+) -> EchoTable:  # fmt: skip
     """Echoes at the peaks of the waveform deconvolved by Richardson and Lucy's iteration with the pulse.
 
-    Each iteration is extrapolated from those before it. Separates echoes of the system's width that are 2 widths apart
-    (1.5 with 40 iterations), but draws close ones together. Source: Richardson (1972), Lucy (1974); ALGORITHMS 2.5.
+    Each iteration starts from an extrapolation of the earlier ones. Separates echoes of the system's width that are 2
+    widths apart (1.5 with 40 iterations), but draws close ones together.
 
-    reference: a Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
-    iterations: more of them separate closer echoes, and split more broad ones.
-    threshold: least amplitude of an echo, in standard deviations that it would have if it were alone.
-    reach: half of the reference's length, in widths of the system pulse.
-    pulse: samples of the given pulse, separated by spaces, as many per ns as the waveform has.
+    Parameters
+    ----------
+    reference : {"gaussian", "system", "given"}
+        A Gaussian of the system's width, the system pulse of the survey, or the pulse given below.
+    iterations : int
+        More iterations separate closer echoes, and split more broad ones.
+    threshold : float
+        Least amplitude of an echo [standard deviations that the amplitude of an isolated echo would have].
+    reach : float
+        Half of the reference's length [widths of the system pulse].
+    pulse : str
+        Samples of the given pulse, separated by spaces, with the spacing of the waveform.
+
+    References
+    ----------
+    Richardson (1972), Lucy (1974); docs/algorithms.md 2.5.
     """
     given = reference_pulse(system, block.spacing, reference, reach, pulse)
     signal = signal_above(block, noise)
@@ -98,15 +112,13 @@ def richardson_lucy(
         profile = deconvolve_richardson_lucy(np.ascontiguousarray(signal[:, rows]), given.taps, 3 * std, iterations)
         waveform, time, amplitude = _find_spikes(profile, half, np.float32(least) * std)
         found.append((rows[waveform], time + (given.peak - given.middle), amplitude))
-    waveform, time, amplitude = (np.concatenate(fields) for fields in zip(*found, strict=True))
-    width = np.full(len(time), system.sigma_ref / block.spacing)
-    return candidate_table(block, system, waveform, time, amplitude, width)
+    return candidate_table(block, system, *(np.concatenate(fields) for fields in zip(*found, strict=True)))
 
 
 def _find_spikes(profile: np.ndarray, half: int, least: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Waveform, centre and sum of the spikes in deconvolved waveforms (s, n) whose sum is at least `least` (n,).
 
-    A spike reaches `half` samples around its peak, or half-way to the next one.
+    A spike reaches `half` samples around its peak, or halfway to the next peak.
     """
     s = len(profile)
     waveform, sample = find_peaks(profile, 0.1 * least / half)

@@ -16,7 +16,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.chain import Chain
-from wavebatch.stages.decompose.rebuild import MODELS
+from wavebatch.stages.decompose.rebuild import fitted_pulse
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, shape_limits
 from wavebatch.tools.plots.packets import Place
 
@@ -89,8 +89,7 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
     first, decomposer = chain.steps[0], chain.steps[2]
     noise = first.stage.function(block, system, **first.parameters)
     echoes = chain.run(block, system)
-    shape_of = MODELS[decomposer.stage.name]
-    shape = None if shape_of is None else shape_of(system, block.spacing, **decomposer.effective())
+    shape = fitted_pulse(decomposer, system, block.spacing)
     level = clip_level(block, system)
     views = []
     for row, number in enumerate(packets):

@@ -1,0 +1,311 @@
+"""The public API: `import wavebatch as wb` from a strip to a cloud, lazily, typed, and the same as the commands."""
+
+import ast
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wavebatch as wb
+from wavebatch.cli import main
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.stages.chain_file import list_profiles
+from wavebatch.tools.simulate import simulate_strip
+
+PACKAGE = Path(wb.__file__).parent
+FUNCTIONS = ("open_strip", "survey", "load_chain", "auto_chain", "run", "read_cloud")
+
+
+def _python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    return done.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """Two small simulated strips."""
+    folder = tmp_path_factory.mktemp("strips")
+    for number, scene in enumerate(("urban", "forest")):
+        simulate_strip(scene, folder / f"{scene}.las", pulses=1500, seed=number)
+    return [folder / "urban.las", folder / "forest.las"]
+
+
+@pytest.fixture(scope="module")
+def clouds(strips, tmp_path_factory):
+    """Folder of the clouds of the two strips, and the result of the run."""
+    out = tmp_path_factory.mktemp("clouds")
+    return out, wb.run(strips, out, chain="accurate", columns="+echo_time")
+
+
+# The package
+
+
+def test_import_loads_neither_numpy_nor_laspy():
+    code = "import sys, wavebatch; print([name for name in sys.modules if name.split('.')[0] in %r])"
+    heavy = ("numpy", "scipy", "laspy", "lazrs", "click", "tqdm")
+    assert _python(code % (heavy,)) == "[]"
+
+
+def test_every_public_name_can_be_had_and_is_listed():
+    assert set(wb.__all__) == set(dir(wb)) == {*wb._HOMES, "__version__"}
+    for name in wb.__all__:
+        assert getattr(wb, name) is not None
+    space: dict = {}
+    exec("from wavebatch import *", space)
+    assert set(wb.__all__) <= space.keys()
+
+
+def test_type_checkers_see_the_names_that_python_finds():
+    assert (PACKAGE / "py.typed").exists()
+    tree = ast.parse((PACKAGE / "__init__.py").read_text("utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If) and node.test.id == "TYPE_CHECKING")
+    typed = {
+        alias.asname or alias.name: (f"wavebatch.{wb._HOMES[alias.asname or alias.name]}", alias.name)
+        for node in block.body
+        for alias in node.names
+    }
+    assert typed == {name: (f"wavebatch.{home}", name) for name, home in wb._HOMES.items()}
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'wavebatch' has no attribute 'nothing'"):
+        _ = wb.nothing
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_functions_are_documented(name):
+    doc = inspect.getdoc(getattr(wb, name))
+    assert "Parameters\n----------" in doc and "Returns\n-------" in doc
+    for parameter in inspect.signature(getattr(wb, name)).parameters:
+        assert f"\n{parameter} : " in doc, parameter
+
+
+# A strip
+
+
+def test_a_strip_tells_what_it_holds(strips):
+    with wb.open_strip(strips[0]) as strip:
+        assert strip.facts.path == strips[0]
+        assert strip.crs is None
+        assert [type(one) for one in strip.digitizers.values()] == [wb.Digitizer]
+        blocks = list(strip.blocks(size=400))
+        assert len(strip) == sum(len(block) for block in blocks)
+        assert "urban.las" in repr(strip)
+    assert len(blocks) > 2 and all(0 < len(block) <= 400 for block in blocks)
+    for block in blocks:
+        n, s = block.samples.shape
+        assert n == len(block) and s == block.digitizer.n_samples and block.samples.dtype.kind == "u"
+        assert block.spacing == 1.0
+        assert block.gps_time.shape == (n,) and block.origin.shape == block.direction.shape == (n, 3)
+    with pytest.raises(ValueError, match="size must be at least 1, got 0"), wb.open_strip(strips[0]) as strip:
+        next(strip.blocks(0))
+
+
+def test_a_strip_that_is_none_is_one_line(tmp_path):
+    (tmp_path / "no.las").write_bytes(b"LASF")
+    with pytest.raises(wb.InputError) as caught:
+        wb.open_strip(tmp_path / "no.las")
+    assert "no.las" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_from_strip_to_echoes(strips):
+    with wb.open_strip(strips[0]) as strip:
+        survey = wb.survey(strip)
+        assert isinstance(survey.system, wb.SystemPulse) and survey.decisions
+        for chain in (wb.auto_chain(survey), wb.load_chain("accurate")):
+            echoes = [chain.run(block, survey.system) for block in strip.blocks()]
+            again = [chain.run(block, survey.system) for block in strip.blocks(size=100)]
+            assert isinstance(echoes[0], wb.EchoTable)
+            for name in ("time", "amplitude", "sigma", "flags"):
+                whole, parts = (np.concatenate([getattr(t, name) for t in tables]) for tables in (echoes, again))
+                np.testing.assert_array_equal(whole, parts)
+
+
+def test_echoes_become_a_structured_array(strips):
+    with wb.open_strip(strips[0]) as strip:
+        survey = wb.survey(strip)
+        echoes = wb.load_chain("accurate").run(next(strip.blocks()), survey.system)
+    rows = echoes.to_numpy()
+    assert len(rows) == len(echoes) > 1000
+    for name in ("waveform", "time", "amplitude", "sigma", "time_err", "flags"):
+        np.testing.assert_array_equal(rows[name], getattr(echoes, name))
+    assert {"echo_width", "x", "y", "z"} <= set(rows.dtype.names)
+    np.testing.assert_array_equal(rows["echo_width"], echoes.attributes["echo_width"])
+
+
+def test_survey_takes_a_path_and_says_what_the_command_says(strips):
+    survey = wb.survey(strips[0], waveforms=500)
+    assert survey.waveforms == 500
+    result = CliRunner().invoke(main, ["survey", str(strips[0]), "--waveforms", "500", "--json"])
+    told = json.loads(result.stdout)
+    assert told["waveforms"] == 500 and told["figures"] == dict(survey.figures)
+    assert told["decisions"] == [
+        {"part": one.part, "needed": one.needed, "reason": one.reason} for one in survey.decisions
+    ]
+
+
+def test_a_strip_without_waveforms_cannot_be_surveyed(strips, tmp_path, edit_points):
+    def strip_off(points):
+        points["wavepacket_index"] = 0
+        return points
+
+    bare = edit_points(strips[0], tmp_path / "bare.las", strip_off)
+    with pytest.raises(wb.InputError, match="holds no waveform"):
+        wb.survey(bare)
+
+
+# Chains
+
+
+def test_chains_come_by_name_or_path(tmp_path):
+    for name in list_profiles():
+        assert wb.load_chain(name).name == f"profile {name}"
+    path = tmp_path / "mine.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.none")
+    path.write_text("".join(f'[[chain]]\nstage = "{stage}"\n' for stage in stages))
+    assert [step.stage.name for step in wb.load_chain(path).steps][2] == "decompose.none"
+    assert len(wb.load_chain(str(path)).steps) == 3
+    with pytest.raises(wb.ConfigError, match="profile 'acurate' does not exist; did you mean 'accurate'"):
+        wb.load_chain("acurate")
+    with pytest.raises(wb.ConfigError, match="none.toml: chain file cannot be read"):
+        wb.load_chain("none.toml")
+
+
+# A run
+
+
+def test_run_writes_what_the_command_writes(strips, clouds, tmp_path):
+    out, result = clouds
+    assert isinstance(result, wb.BatchResult) and result.failed == 0
+    assert [outcome.status for outcome in result.outcomes] == ["written", "written"]
+    command = ["run", *map(str, strips), "-o", str(tmp_path), "--profile", "accurate", "--columns", "+echo_time", "-q"]
+    assert CliRunner().invoke(main, command).exit_code == 0
+    for strip in strips:
+        cloud = f"{strip.stem}.laz"
+        assert (out / cloud).read_bytes() == (tmp_path / cloud).read_bytes()
+        one, two = (json.loads((folder / f"{strip.stem}.report.json").read_text()) for folder in (out, tmp_path))
+        assert {**one, "timing": None} == {**two, "timing": None}
+
+
+def test_run_takes_one_strip_a_chain_and_an_event_handler(strips, tmp_path):
+    events: list = []
+    result = wb.run(strips[0], tmp_path / "new", chain=wb.load_chain("fast"), format="las", on_event=events.append)
+    assert result.failed == 0 and (tmp_path / "new" / "urban.las").exists()
+    assert [events[0]["event"], events[-1]["event"]] == ["start", "written"]
+    again = wb.run(strips[0], tmp_path / "new", chain=wb.load_chain("fast"), format="las", resume=True)
+    assert again.outcomes[0].status == "skipped"
+
+
+def test_a_run_with_a_survey_is_the_run_that_makes_it(strips, tmp_path):
+    survey = wb.survey(strips[0])
+    for out, options in (("a", {"system": survey}), ("b", {})):
+        assert wb.run(strips[0], tmp_path / out, chain="accurate", **options).failed == 0
+    a, b = (wb.read_cloud(tmp_path / out / "urban.laz") for out in "ab")
+    for name in a.dtype.names:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+
+
+def test_run_chooses_the_chain_by_default(strips, tmp_path):
+    wb.run(strips[0], tmp_path)
+    report = json.loads((tmp_path / "urban.report.json").read_text())
+    assert report["choice"]["by"] == "auto"
+
+
+def test_a_strip_that_fails_is_in_the_result(strips, tmp_path):
+    bad = tmp_path / "bad.las"
+    bad.write_bytes(b"LASF")
+    result = wb.run([bad, strips[0]], tmp_path / "out", chain="fast")
+    assert result.failed == 1
+    assert isinstance(result.outcomes[0].error, wb.InputError) and result.outcomes[1].status == "written"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"chain": "balance"}, "did you mean 'balanced'"),
+        ({"columns": "+echo_tim"}, "did you mean 'echo_time'"),
+        ({"chain": "fast", "tolerance": 0.02}, "exclude each other"),
+        ({"memory": 1000}, "too little"),
+        ({"chain": "fast", "sensor": wb.SensorRequest(height=500.0)}, None),
+    ],
+)
+def test_wrong_options_start_nothing(strips, tmp_path, options, words):
+    if words is None:
+        assert wb.run(strips[0], tmp_path / "out", **options).failed == 0
+        return
+    with pytest.raises(wb.ConfigError, match=words):
+        wb.run(strips[0], tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_option_that_does_not_exist_is_a_type_error(strips, tmp_path):
+    with pytest.raises(TypeError, match="job"):
+        wb.run(strips[0], tmp_path, job=4)
+
+
+# A cloud
+
+
+def test_read_cloud_gives_every_column_by_name(clouds):
+    out, _ = clouds
+    cloud = wb.read_cloud(out / "urban.laz")
+    with laspy.open(out / "urban.laz") as reader:
+        points = reader.read()
+    np.testing.assert_array_equal(cloud["x"], np.asarray(points.x))
+    for name in points.point_format.standard_dimension_names:
+        if name not in ("X", "Y", "Z"):
+            np.testing.assert_array_equal(cloud[name], np.asarray(points[name]))
+    for name in points.point_format.extra_dimension_names:
+        assert name in COLUMNS
+        stored = np.asarray(points[name])
+        assert cloud.dtype[name] == stored.dtype
+        expected = stored if name == "echo_flags" else np.where(stored == -9999, np.nan, stored)
+        np.testing.assert_array_equal(cloud[name], expected)
+    assert cloud.dtype["echo_flags"] == np.uint16
+    passed = (cloud["echo_flags"] & int(wb.EchoFlag.NO_WAVEFORM)) != 0
+    assert passed.any() and np.isnan(cloud["amplitude"][passed]).all() and np.isfinite(cloud["amplitude"]).any()
+
+
+@pytest.mark.parametrize("names", ["asprs", "riegl", "pdal", "opals"])
+def test_columns_have_our_names_whatever_they_were_written_as(strips, clouds, tmp_path, names):
+    wb.run(strips[0], tmp_path, chain="accurate", names=names)
+    ours, theirs = wb.read_cloud(clouds[0] / "urban.laz"), wb.read_cloud(tmp_path / "urban.laz")
+    for name in ("amplitude", "echo_width", "echo_width_err", "echo_flags"):
+        np.testing.assert_allclose(theirs[name], ours[name], atol=0.051 if name == "echo_width" else 0)
+    # RIEGL and ASPRS write widths as scaled integers, which no-data makes NaN.
+    assert np.isnan(theirs["echo_width"]).any()
+    assert theirs.dtype["echo_width"] == (np.float64 if names in ("asprs", "riegl") else np.float32)
+
+
+def test_read_cloud_reads_only_what_is_asked_for(clouds):
+    cloud = wb.read_cloud(clouds[0] / "urban.laz", ["z", "echo_width", "scan_angle_rank"])
+    assert cloud.dtype.names == ("z", "echo_width", "scan_angle_rank")
+    with pytest.raises(wb.ConfigError, match="has no column 'echo_wdth'; did you mean 'echo_width'"):
+        wb.read_cloud(clouds[0] / "urban.laz", ["echo_wdth"])
+    with pytest.raises(wb.InputError, match="nothing.laz"):
+        wb.read_cloud(clouds[0] / "nothing.laz")
+
+
+# Real data
+
+
+def test_the_riegl_strip_end_to_end(riegl, tmp_path):
+    with wb.open_strip(riegl) as strip:
+        survey = wb.survey(strip)
+        assert survey.system.components
+        chain = wb.auto_chain(survey)
+        block = next(strip.blocks(size=2000))
+        echoes = chain.run(block, survey.system)
+        assert 0.9 * len(block) < len(echoes) < 2 * len(block)
+        waveforms = len(strip)
+    result = wb.run(riegl, tmp_path)
+    assert result.failed == 0 and result.report.to_json()["counts"]["waveforms"] == waveforms
+    cloud = wb.read_cloud(tmp_path / f"{riegl.stem}.laz")
+    assert len(cloud) == result.report.to_json()["counts"]["points_out"]
+    assert np.nanmedian(cloud["echo_width"]) == pytest.approx(2.3548 * survey.system.sigma_ref, rel=0.2)

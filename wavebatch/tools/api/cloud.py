@@ -1,0 +1,94 @@
+"""A point cloud as one NumPy table: the standard fields of LAS and the columns by wavebatch's names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.echo_reader import find_columns
+
+
+def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.ndarray:
+    """Read the points of a LAS or LAZ cloud with all columns by name.
+
+    Parameters
+    ----------
+    path : path or str
+        A cloud of `run`, or any other LAS or LAZ file.
+    columns : sequence of str, optional
+        Names to read, in this order; all by default: x, y, z, the standard fields under laspy's names, extra bytes.
+
+    Returns
+    -------
+    ndarray
+        Structured array (n,), one row per point. `cloud["amplitude"]` is a column.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read.
+    ConfigError
+        Where it has no column of a name, with the nearest name.
+
+    Notes
+    -----
+    wavebatch's columns have wavebatch's names and units, whatever `--names` they were written with, except those that
+    were written in dB. All other extra bytes have their names in the file. Where the file stores a no-data value the
+    column is NaN. Columns of floating-point numbers keep their type. Integer columns that are scaled or declare a
+    no-data value become float64, so that they can be NaN; all other integer columns (`echo_flags`, return numbers,
+    classes) keep their type. `scan_angle` is in degrees.
+    """
+    reader = _TableReader(Path(path), columns)
+    with reader:
+        table = np.empty(reader.point_count, reader.dtype)
+        start = 0
+        for piece in reader.read_pieces():
+            table[start : start + len(piece)] = piece
+            start += len(piece)
+    return table
+
+
+class _TableReader(ColumnReader):
+    """A ColumnReader whose pieces have several columns, of `dtype`."""
+
+    def __init__(self, path: Path, columns: Sequence[str] | None) -> None:
+        super().__init__(path, None)
+        names = self._name_columns()
+        chosen = {name: names.get(name, name) for name in (names if columns is None else columns)}
+        try:
+            found = {name: self._find(stored) for name, stored in chosen.items()}
+        except BaseException:
+            self._file.close()
+            raise
+        self._readers = {name: read for name, (_, read) in found.items()}
+        self._stored = {name: facts.name for name, (facts, _) in found.items()}
+        self.dtype = np.dtype([(name, self._choose_dtype(stored)) for name, stored in self._stored.items()])
+
+    def _name_columns(self) -> dict[str, str]:
+        """Name of every column in the table -> its name in the file."""
+        known = self.list_columns()
+        extra = [one for one in self._header.point_format.extra_dimensions if one.num_elements == 1]
+        ours = {one.name: name for name, one in find_columns(extra, COLUMNS).items() if name not in known}
+        axes = {axis: axis for axis in "xyz"}
+        standard = {name: name for name in known if name not in axes and name not in {one.name for one in extra}}
+        return axes | standard | {ours.get(one.name, one.name): one.name for one in extra}
+
+    def _choose_dtype(self, stored: str) -> np.dtype:
+        if stored in ("x", "y", "z", "scan_angle"):
+            return np.dtype(np.float64)
+        dimension = self._header.point_format.dimension_by_name(stored)
+        dtype = np.dtype(dimension.dtype if dimension.dtype is not None else np.uint8)  # bit fields have none
+        is_whole = dtype.kind != "f" and dimension.scales is None and dimension.no_data is None
+        return dtype if is_whole or dtype.kind == "f" and dimension.scales is None else np.dtype(np.float64)
+
+    def _convert(self, points) -> np.ndarray:
+        rows = np.empty(len(points), self.dtype)
+        for name, read in self._readers.items():
+            # Integers without no-data are copied: those above 2^53 are no floating-point numbers.
+            whole = self.dtype[name].kind in "ui"
+            rows[name] = np.asarray(points[self._stored[name]]) if whole else read(points)
+        return rows

@@ -1,0 +1,230 @@
+"""Runs strips through a chain from Python and from `wavebatch run`: one place that turns options into jobs.
+
+`plan_run` checks everything and starts nothing; `run` plans and runs.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+from wavebatch.batch.preflight import check_outputs, plan_memory
+from wavebatch.batch.run import BatchResult, run_batch
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.inputs import find_strips
+from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain_file import list_profiles
+from wavebatch.surveying.calibration import load_calibration, needs_sensor
+from wavebatch.surveying.choose_chain import Request, widest
+from wavebatch.surveying.sensor import SensorRequest
+from wavebatch.surveying.survey import Survey
+from wavebatch.surveying.system_file import SavedSurvey, load_survey
+from wavebatch.tools.api.chain import AUTO, load_chain
+
+ChainLike = Chain | Path | str | None
+
+
+def run(
+    strips: Iterable[Path | str] | Path | str,
+    out: Path | str,
+    *,
+    chain: ChainLike = None,
+    tolerance: float | None = None,
+    system: Survey | Path | str | None = None,
+    sensor: SensorRequest | None = None,
+    calibration: Path | str | None = None,
+    columns: str | None = None,
+    points: Literal["echoes", "returns"] = "echoes",
+    format: Literal["laz", "las"] = "laz",
+    point_format: int | None = None,
+    names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = "wavebatch",
+    keep_packets: bool = False,
+    direction: Literal["auto", "toward", "away"] = "auto",
+    headerless: bool = False,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    memory: int | None = None,
+    block_size: int | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    on_event: Callable[[dict[str, Any]], None] | None = None,
+) -> BatchResult:
+    """Write a point cloud and a report for every strip; what `wavebatch run` does.
+
+    With more than one job, call it under `if __name__ == "__main__":`, since new processes import your script.
+
+    Parameters
+    ----------
+    strips : iterable of path or str, path or str
+        Files, folders, globs, or "@list.txt" with one of these per line.
+    out : path or str
+        Folder of the clouds and reports; made if it is not there.
+    chain : Chain, path or str, optional
+        A chain, the path of a chain file, or the name of a shipped chain; "auto", the default, lets the survey of each
+        strip choose.
+    tolerance : float, optional
+        Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
+    system : Survey, path or str, optional
+        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip.
+    sensor : SensorRequest, optional
+        Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
+    calibration : path or str, optional
+        A file of `wavebatch calibrate`.
+    columns : str, optional
+        "a,b" writes these columns only, "+a,+b" adds them to the usual ones.
+    points : {"echoes", "returns"}
+        One point per echo found, or the points of the input with new columns.
+    format : {"laz", "las"}
+        Of the clouds.
+    point_format : int, optional
+        LAS point format of the clouds; default: that of the strip without waveforms.
+    names : {"wavebatch", "asprs", "riegl", "pdal", "opals"}
+        Names and units of the extra bytes.
+    keep_packets : bool
+        Keep the waveforms.
+    direction : {"auto", "toward", "away"}
+        Where packet vectors point.
+    headerless : bool
+        Accept a .wdp file without its 60-byte header.
+    jobs : int
+        Processes; 0 means one per processor. The result is the same for any number.
+    scheduler : str, optional
+        Address of a dask cluster whose workers replace `jobs`.
+    memory : int, optional
+        Most memory of all processes together [bytes].
+    block_size : int, optional
+        Waveforms processed at a time. The result is the same for any number.
+    overwrite : bool
+        Replace existing outputs.
+    resume : bool
+        Keep outputs that are complete and up to date, make all others again.
+    on_event : callable, optional
+        Called with a dictionary when a strip starts, advances, is written, skipped or fails.
+
+    Returns
+    -------
+    BatchResult
+        Outcome of every strip. A strip that fails does not stop the others: look at `.failed` and `.outcomes`.
+
+    Raises
+    ------
+    ConfigError
+        For wrong options, before anything starts.
+    """
+    plan = plan_run(
+        strips, out, chain=chain, tolerance=tolerance, system=system, sensor=sensor, calibration=calibration,
+        columns=columns, points=points, format=format, point_format=point_format, names=names,
+        keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
+        memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
+    )  # fmt: skip
+    return run_batch(*plan, on_event)
+
+
+def plan_run(
+    strips: Iterable[Path | str] | Path | str,
+    out: Path | str,
+    *,
+    chain: ChainLike = None,
+    tolerance: float | None = None,
+    system: Survey | Path | str | None = None,
+    sensor: SensorRequest | None = None,
+    calibration: Path | str | None = None,
+    columns: str | None = None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    memory: int | None = None,
+    block_size: int | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    **output: Any,
+) -> tuple[list[StripJob], BatchOptions]:
+    """Check the options of `run` and turn them into jobs; nothing is started or written.
+
+    Parameters
+    ----------
+    strips, out, chain, tolerance, system, sensor, calibration, columns, jobs, scheduler, memory
+        As for `run`.
+    block_size, overwrite, resume
+        As for `run`.
+    **output
+        The remaining ones: fields of RunOptions.
+
+    Returns
+    -------
+    jobs : list of StripJob
+        One per strip, in the order given.
+    options : BatchOptions
+        For `run_batch`.
+
+    Raises
+    ------
+    ConfigError
+        For whatever is wrong with the options.
+    """
+    found, request = find_request(chain, tolerance=tolerance, system=system)
+    sensor = sensor or SensorRequest()
+    known = None if calibration is None else load_calibration(Path(calibration))
+    template = StripJob(Path(), found, RunOptions(), request, sensor, known)
+    # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
+    if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
+        found = template.extend(found)
+    _check_use(found, sensor, known)
+    options = RunOptions(columns=choose_columns(found, columns), **output)
+    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
+    processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
+    batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
+    plan = [StripJob(path, found, options, request, sensor, known) for path in paths]
+    check_outputs(plan, batch_options)
+    return plan, batch_options
+
+
+def find_request(
+    chain: ChainLike, *, tolerance: float | None = None, system: Survey | Path | str | None = None
+) -> tuple[Chain, Request]:
+    """Find the chain to run with, or the widest one that a survey may choose, and the request that goes with it.
+
+    Parameters
+    ----------
+    chain : Chain, path or str, optional
+        As for `run`.
+    tolerance : float, optional
+        Range error [m] by which a chain is chosen.
+    system : Survey, path or str, optional
+        A survey, or the file of a saved one.
+
+    Returns
+    -------
+    chain : Chain
+        The chain itself, or the widest.
+    request : Request
+        How each strip gets its chain and its pulse.
+
+    Raises
+    ------
+    ConfigError
+        For a chain or a saved survey that cannot be read.
+    """
+    if tolerance is not None and chain is not None:
+        raise ConfigError("chain and tolerance exclude each other; give one of them")
+    auto = chain in (None, AUTO) and tolerance is None
+    if isinstance(system, Survey):
+        saved: SavedSurvey | None = SavedSurvey(system)
+    else:
+        saved = None if system is None else load_survey(system)
+    request = Request(auto, tolerance, saved)
+    if chain is None or auto:
+        return widest(request), request
+    return chain if isinstance(chain, Chain) else load_chain(chain), request
+
+
+def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any) -> None:
+    """Raise ConfigError for files that the chain would ignore."""
+    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration}
+    option = next((name for name, value in given.items() if value is not None), None)
+    if option is not None and not needs_sensor(chain):
+        stage = "attribute.backscatter_coefficient" if option == "--calibration" else "attribute.range"
+        raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")

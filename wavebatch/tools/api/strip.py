@@ -1,0 +1,173 @@
+"""A strip as users see it from Python: what its headers say, its waveforms block by block, and its survey."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import Digitizer, WaveformBlock
+from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.surveying import Survey
+from wavebatch.surveying.angle_limits import survey_angles
+from wavebatch.surveying.auto_chain import decide
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+
+BLOCK_SIZE = 16_384
+"""Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
+
+
+class Strip:
+    """An open full-waveform strip. A context manager; make one with `open_strip`.
+
+    `len(strip)` is the number of waveforms, each counted once however many points share it. The first use of `len`,
+    `scan` or `blocks` reads all point records once.
+
+    Attributes
+    ----------
+    reader : StripReader
+        Reads points and packets unit by unit.
+    """
+
+    def __init__(self, reader: StripReader) -> None:
+        self.reader = reader
+        self._scan: StripScan | None = None
+
+    def __enter__(self) -> Strip:
+        """Return the strip."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the strip."""
+        self.close()
+
+    def __len__(self) -> int:
+        """Return the number of waveforms."""
+        return self.scan.packets
+
+    def __repr__(self) -> str:
+        """Return path and number of points."""
+        return f"<Strip {self.facts.path}: {self.facts.point_count} points>"
+
+    @property
+    def facts(self) -> StripFacts:
+        """What the headers say: path, point format, point count, scales, offsets, digitizers, ..."""
+        return self.reader.facts
+
+    @property
+    def digitizers(self) -> Mapping[int, Digitizer]:
+        """How samples were made, by the index of the wave packet descriptor."""
+        return self.reader.facts.digitizers
+
+    @property
+    def crs(self) -> str | None:
+        """Coordinate reference system as the file has it (WKT or GeoTIFF keys as text); None without one."""
+        return self.reader.facts.crs
+
+    @property
+    def scan(self) -> StripScan:
+        """Result of one pass over all point records, made on first use.
+
+        Raises
+        ------
+        InputError
+            Where the strip cannot be processed: no packet can be read, vectors point nowhere, ...
+        """
+        if self._scan is None:
+            self._scan = self.reader.scan()
+        return self._scan
+
+    def blocks(self, size: int | None = None) -> Iterator[WaveformBlock]:
+        """Every waveform of the strip once, in blocks of one digitizer and one length.
+
+        Parameters
+        ----------
+        size : int, optional
+            Most waveforms of a block; 16384 by default. The echoes do not depend on it.
+
+        Yields
+        ------
+        WaveformBlock
+            n waveforms of s samples, in the order of the file within each digitizer.
+        """
+        if size is not None and size < 1:
+            raise ValueError(f"size must be at least 1, got {size}")
+        for number in range(self.reader.unit_count()):
+            unit = self.reader.read_unit(number, self.scan)
+            for block, _ in self.reader.read_blocks(unit, size or BLOCK_SIZE, owned_only=True):
+                yield block
+
+    def close(self) -> None:
+        """Close the files and remove temporary ones. Harmless twice."""
+        if self._scan is not None:
+            self._scan.close()
+            self._scan = None
+        self.reader.close()
+
+
+def open_strip(path: Path | str, *, direction: str = "auto", headerless: bool = False) -> Strip:
+    """Open a LAS or LAZ strip with waveforms; only headers are read.
+
+    Parameters
+    ----------
+    path : path or str
+        File of point format 4, 5, 9 or 10; external packets lie in a .wdp file of the same name.
+    direction : {"auto", "toward", "away"}
+        Where packet vectors point, seen from the target; "auto" lets the file decide.
+    headerless : bool
+        Accept a .wdp file without its 60-byte header.
+
+    Returns
+    -------
+    Strip
+        Close it, or use it in a `with` statement.
+
+    Raises
+    ------
+    InputError
+        Where the file is not what it claims to be; one line with the reason.
+    """
+    return Strip(StripReader(path, direction=direction, headerless=headerless))
+
+
+def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergence: float | None = None) -> Survey:
+    """Measure sensor and scene on a sample of the strip: noise, system pulse, saturation, overlapping echoes.
+
+    Parameters
+    ----------
+    strip : Strip, path or str
+        The strip, opened with `open_strip`, or its path.
+    waveforms : int, optional
+        Waveforms to look at, spread over the strip; 8192 by default, fewer where they are long.
+    divergence : float, optional
+        Full angle of the beam between the 1/e^2 points [mrad]. With it the survey also says whether echo widths tell
+        incidence angles.
+
+    Returns
+    -------
+    Survey
+        `.system` is the SystemPulse for `Chain.run`; `.decisions` say which parts of a chain the strip needs, and why.
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be read or holds no waveform.
+    """
+    if not isinstance(strip, Strip):
+        with open_strip(strip) as opened:
+            return survey(opened, waveforms=waveforms, divergence=divergence)
+    sample = read_sample(strip.reader, strip.scan, waveforms)
+    if not sample:
+        path = strip.facts.path
+        raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
+    found = survey_sample(sample)
+    if divergence is not None:
+        found = survey_angles(strip.reader, strip.scan, found, divergence)
+    chosen = decide(found)
+    parts = {decision.part for decision in chosen}
+    # What the scene needs but no chain has without further files follows the decisions of the chosen chain.
+    others = (decision for decision in found.decisions if decision.part not in parts)
+    return replace(found, decisions=(*chosen, *others))
