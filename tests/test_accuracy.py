@@ -1,4 +1,4 @@
-"""Accuracy against the Cramer-Rao bound, close pairs, false splits, false alarms, whole scenes (docs/algorithms.md 7)."""
+"""Accuracy against the Cramer-Rao bound, close pairs, false splits and alarms, scenes (docs/algorithms.md 7)."""
 
 import naive
 import numpy as np
@@ -224,7 +224,7 @@ def test_scenes_are_decomposed_as_well_as_measured(scene, profile, exact, comple
 
 
 def test_forest_at_the_default_threshold():
-    """Without the survey's raised threshold for real pulses: the exact count of docs/algorithms.md 4.3, .610 and more."""
+    """Without the threshold raised for real pulses: the exact count of docs/algorithms.md 4.3, .610 and more."""
     block, truth = simulate_block("forest", 8192, np.random.default_rng(11))
     found = load_profile("accurate").run(block, surveying.survey_block(block, learn=False).system)
     result = score(found, truth, 8192, noise_std=find_scene("forest").recording.recorded_noise)

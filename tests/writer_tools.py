@@ -1,6 +1,7 @@
 """Small LAS and LAZ files with whatever a test needs in them, and readers of the results."""
 
 import io
+import json
 import os
 from pathlib import Path
 
@@ -9,10 +10,15 @@ import numpy as np
 import pytest
 
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.cloud import layout
+from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.disk.publish import publish_together
+from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.extra_bytes import build_dtype
-from wavebatch.files.las.header import LasHeader, Vlr, encode_evlr_header
+from wavebatch.files.las.header import LasHeader, Vlr, encode_evlr_header, read_header
 from wavebatch.files.las.write_points import PointFile
+from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
 
 BACKENDS = (laspy.LazBackend.Lazrs, laspy.LazBackend.Laszip)
@@ -73,6 +79,22 @@ def write_source(
     file.finish()
     publish_together([file.draft])
     return points
+
+
+def facts_of(path: Path) -> StripFacts:
+    """What the reader finds about a strip."""
+    with StripReader(path) as reader:
+        return reader.facts
+
+
+def plan_output(path: Path, *args, **options) -> OutputLayout:
+    """The layout for any LAS or LAZ file."""
+    return layout.plan_output(read_checked_header(path, waveforms=False), *args, **options)
+
+
+def read_provenance(path: Path) -> list[dict]:
+    """The accounts of a cloud, oldest first; empty if wavebatch did not write it."""
+    return [json.loads(vlr.payload) for vlr in read_header(Path(path)).vlrs if vlr.user == "wavebatch"]
 
 
 def write_strip(path: Path, *, point_format: int = 9, version: str = "1.4", n: int = 100, **options) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from strips import descriptor, make_raw, vlr
+from writer_tools import plan_output
 
 from wavebatch.batch import neighbour_pass
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
@@ -21,7 +22,6 @@ from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.layout import plan_output
 from wavebatch.files.disk import spool
 from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain

@@ -60,7 +60,7 @@ def test_two_strips_of_one_name_are_wrong_usage(tiny_strip, tmp_path):
     other = tmp_path / "tiny.laz"
     other.write_bytes(tiny_strip.read_bytes())
     result = _run(tiny_strip, other, "-o", tmp_path / "out")
-    assert result.exit_code == 2 and "both would be written as tiny" in result.stderr
+    assert result.exit_code == 2 and "both outputs would be named tiny" in result.stderr
     assert not (tmp_path / "out").exists()
 
 
@@ -149,7 +149,7 @@ def test_the_wrong_direction_puts_echoes_elsewhere(tiny_strip, tmp_path):
         warned[sign] = [line for line in result.stderr.splitlines() if ": warning: " in line]
     assert warned["toward"] == []
     (line,) = warned["away"]
-    assert line.startswith(f"{tiny_strip}: warning: --direction away overrides what the file says: ")
+    assert line.startswith(f"{tiny_strip}: warning: --direction away overrides the evidence of the file: ")
     quiet = _run(tiny_strip, "-o", tmp_path / "away", "--direction", "away", "--profile", "fast", "--overwrite", "-q")
     assert quiet.exit_code == 0 and quiet.stderr == ""
     report = json.loads((tmp_path / "away" / "tiny.report.json").read_text())

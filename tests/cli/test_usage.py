@@ -63,7 +63,7 @@ def test_commands_over_many_files_take_what_run_takes(tiny_strip, tmp_path):
     (tmp_path / "empty").mkdir()
     for command in ("check", "stats"):
         told = invoke(command, str(tmp_path / "empty"))
-        assert told.exit_code == 2 and told.stderr.endswith("empty: folder holds no .las or .laz file\n")
+        assert told.exit_code == 2 and told.stderr.endswith("empty: the folder holds no .las or .laz file\n")
 
 
 def test_options_that_commands_share_have_one_name():

@@ -141,7 +141,7 @@ def test_text_with_a_lever_arm(tmp_path):
         ("time,x,y,z\n1,2,3,4\n", "1 usable positions"),
         ("\n\n", "neither text nor SBET"),
         ("\0\1\2", "neither text nor SBET"),
-        ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees and the strip does not say its CRS"),
+        ("time,lat,lon,h\n1,48,11,500\n2,48,11,500\n", "in degrees, but the strip has no CRS"),
     ],
 )
 def test_refusals_are_one_line(tmp_path, text, message):
@@ -170,10 +170,10 @@ def write_sbet(path, latitude=48.0, number=400):
 
 def test_sbet_without_pyproj_or_crs_is_refused(tmp_path, monkeypatch):
     path = write_sbet(tmp_path / "s.sbet")
-    with pytest.raises(InputError, match="does not say its CRS"):
+    with pytest.raises(InputError, match="but the strip has no CRS"):
         read_trajectory(path)
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"pip install 'wavebatch\[crs\]'"):
+    with pytest.raises(InputError, match=r"pip install 'wavebatch\[gis\]'"):
         read_trajectory(path, crs="EPSG:32632")
 
 
@@ -192,5 +192,5 @@ def test_sbet_is_projected(tmp_path):
     assert found.velocity[200, 1] == pytest.approx(127.0, abs=2.0)
     with pytest.raises(InputError, match="needs metres"):
         read_trajectory(tmp_path / "s.sbet", crs="EPSG:4326")
-    with pytest.raises(InputError, match="CRS is not understood"):
+    with pytest.raises(InputError, match="CRS of the strip is not understood"):
         read_trajectory(tmp_path / "s.sbet", crs="nonsense")

@@ -47,6 +47,7 @@ def test_no_room_for_buckets_is_one_line(monkeypatch):
     def full(*args, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("wavebatch.files.disk.buckets.tempfile.TemporaryFile", full)
-    with pytest.raises(InputError, match="No space left on device.*TMPDIR"):
-        Buckets(ROW, 2)
+    monkeypatch.setattr("wavebatch.files.disk.spool.make_folder", full)
+    monkeypatch.setattr("wavebatch.files.disk.spool.MEMORY", 1)
+    with pytest.raises(InputError, match="No space left on device.*TMPDIR"), Buckets(ROW, 2) as buckets:
+        buckets.add(np.zeros(3, ROW), lambda rows: sort_by_time(rows["gps_time"], 2))

@@ -7,7 +7,7 @@ import pytest
 from strips import make_raw, read_all, vlr
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.las import checked_header
+from wavebatch.files.las import header
 from wavebatch.files.strip.reader import StripReader
 
 
@@ -89,12 +89,12 @@ def test_counts_of_1_4(tmp_path, count):
 
 @pytest.mark.parametrize("offset", [0, 10, 226, 2**32 - 1])
 def test_offset_to_points_that_cannot_be(tmp_path, offset):
-    refused(patched(tmp_path, 96, struct.pack("<I", offset)), "contradicts itself")
+    refused(patched(tmp_path, 96, struct.pack("<I", offset)), "but points at byte")
 
 
 @pytest.mark.parametrize("size", [0, 100, 234, 65535])
 def test_header_size_that_cannot_be(tmp_path, size):
-    refused(patched(tmp_path, 94, struct.pack("<H", size)), "contradicts itself|VLR")
+    refused(patched(tmp_path, 94, struct.pack("<H", size)), "but points at byte|VLR")
 
 
 @pytest.mark.parametrize("count", [2, 1000, 2**32 - 1])
@@ -116,8 +116,8 @@ def test_offsets_that_give_no_coordinates(tmp_path):
 
 
 def test_a_front_that_does_not_fit_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(checked_header, "MAX_FRONT", 200)
-    refused(make_raw().write(tmp_path / "a.las"), "beyond all reason")
+    monkeypatch.setattr(header, "MAX_FRONT", 200)
+    refused(make_raw().write(tmp_path / "a.las"), r"header with 1 VLRs in .* bytes \(at most")
 
 
 def test_user_ids_and_descriptions_that_are_no_text(tmp_path):

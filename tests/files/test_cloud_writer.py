@@ -1,5 +1,6 @@
 """Whole output files: read back with lazrs and LASzip, byte by byte where bytes must be kept."""
 
+import dataclasses
 import itertools
 import json
 import os
@@ -10,12 +11,21 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from writer_tools import BACKENDS, data_file, read_raw, write_source, write_strip
+from writer_tools import (
+    BACKENDS,
+    data_file,
+    facts_of,
+    plan_output,
+    read_provenance,
+    read_raw,
+    write_source,
+    write_strip,
+)
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.layout import plan_output
-from wavebatch.files.cloud.writer import CloudWriter, read_provenance, remove_stale
+from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las import laz_encode
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import Vlr, find_evlrs, read_header
@@ -240,7 +250,7 @@ def test_provenance_is_json_that_keeps_the_history(tmp_path):
     assert [vlr.record_id for vlr in vlrs] == [1, 2]
     assert json.dumps(json.loads(vlrs[0].payload), sort_keys=True, separators=(",", ":")).encode() == vlrs[0].payload
     assert read_provenance(path) == []
-    with pytest.raises(ConfigError, match="provenance of its output takes .* a VLR holds 65535"):
+    with pytest.raises(ConfigError, match="account of the run takes .* a VLR holds at most 65535"):
         CloudWriter(layout, tmp_path / "d.las", provenance={"long": "x" * 70000})
 
 
@@ -310,7 +320,7 @@ def packets_of(path, points):
 def test_real_files_keep_their_packets(tmp_path, name, suffix):
     path = data_file(name)
     points = read_raw(path)
-    layout = plan_output(path, COLUMNS, keep_packets=True)
+    layout = plan_output(path, COLUMNS, packets=facts_of(path))
     rows = make_rows(layout, points)
     target = tmp_path / f"out{suffix}"
     write(layout, target, rows)
@@ -333,7 +343,7 @@ def test_real_files_keep_their_packets(tmp_path, name, suffix):
 def test_kept_packets_in_every_format(tmp_path, point_format, version, new, internal, suffix):
     path = tmp_path / "a.laz"
     points = write_strip(path, point_format=point_format, version=version, internal=internal)
-    layout = plan_output(path, ["amplitude"], keep_packets=True, point_format=new)
+    layout = plan_output(path, ["amplitude"], packets=facts_of(path), point_format=new)
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / f"a{suffix}"
     rows = layout.rows(points)
@@ -348,18 +358,15 @@ def test_kept_packets_in_every_format(tmp_path, point_format, version, new, inte
 
 
 def test_a_file_without_header_gets_one_and_offsets_follow(tmp_path):
-    class Facts:
-        path, packet_file, internal = tmp_path / "a.las", tmp_path / "a.wdp", False
-        packet_start, packet_base, packet_end = 0, 0, 0
-
-    points = write_strip(Facts.path, internal=False)
-    before = packets_of(Facts.path, points)
-    bare = Facts.packet_file.read_bytes()[60:]
-    Facts.packet_file.write_bytes(bare)
-    Facts.packet_end = len(bare)
+    path = tmp_path / "a.las"
+    points = write_strip(path, internal=False)
+    before = packets_of(path, points)
+    places = {"packet_start": 0, "packet_base": 0, "packet_end": (tmp_path / "a.wdp").stat().st_size - 60}
+    facts = dataclasses.replace(facts_of(path), **places)
+    (tmp_path / "a.wdp").write_bytes((tmp_path / "a.wdp").read_bytes()[60:])
     points["wavepacket_offset"] -= np.uint64(60)
     points["wavepacket_index"][3] = 0
-    layout = plan_output(Facts, [], keep_packets=True)
+    layout = plan_output(path, [], packets=facts)
     (tmp_path / "out").mkdir()
     write(layout, tmp_path / "out" / "a.las", layout.rows(points))
     seen = read_raw(tmp_path / "out" / "a.las")
@@ -376,7 +383,7 @@ def multi_channel(path):
 
 def test_several_scanner_channels_go_through_laszip(tmp_path):
     points = multi_channel(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", COLUMNS, keep_packets=True)
+    layout = plan_output(tmp_path / "a.las", COLUMNS, packets=facts_of(tmp_path / "a.las"))
     rows = make_rows(layout, points)
     write(layout, tmp_path / "out.laz", rows)
     for backend in BACKENDS:
@@ -386,7 +393,7 @@ def test_several_scanner_channels_go_through_laszip(tmp_path):
 def test_several_scanner_channels_are_refused_without_laszip(tmp_path, monkeypatch):
     monkeypatch.setattr(laz_encode, "laszip", None)
     points = multi_channel(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", [], keep_packets=True)
+    layout = plan_output(tmp_path / "a.las", [], packets=facts_of(tmp_path / "a.las"))
     rows = layout.rows(points)
     with (
         pytest.raises(InputError, match=r"out.laz: points of several scanner channels .* pip install laszip"),
@@ -403,14 +410,11 @@ def test_several_scanner_channels_are_refused_without_laszip(tmp_path, monkeypat
 
 
 def test_packets_that_are_not_there(tmp_path):
-    write_source(tmp_path / "a.las", 9, (1, 4), global_encoding=4)
-    with pytest.raises(InputError, match="a.las: a.wdp with its packets is not beside it"):
-        plan_output(tmp_path / "a.las", [], keep_packets=True)
-    write_source(tmp_path / "b.las", 9, (1, 4), global_encoding=2)
-    with pytest.raises(InputError, match="b.las: the record of its packets would begin at byte 0"):
-        plan_output(tmp_path / "b.las", [], keep_packets=True)
+    write_source(tmp_path / "a.las", 9, (1, 4))
+    with pytest.raises(InputError, match="a.las: has no packets to keep; leave --keep-packets out"):
+        plan_output(tmp_path / "a.las", [], packets=facts_of(tmp_path / "a.las"))
     points = write_strip(tmp_path / "c.las", internal=False)
-    layout = plan_output(tmp_path / "c.las", [], keep_packets=True)
+    layout = plan_output(tmp_path / "c.las", [], packets=facts_of(tmp_path / "c.las"))
     (tmp_path / "c.wdp").write_bytes(b"cut")
     with pytest.raises(InputError, match="ends .* bytes too early"):
         write(layout, tmp_path / "d.las", layout.rows(points))
@@ -419,7 +423,7 @@ def test_packets_that_are_not_there(tmp_path):
 
 def test_a_killed_publication_of_two_files_can_be_finished(tmp_path):
     points = write_strip(tmp_path / "a.las", internal=False)
-    layout = plan_output(tmp_path / "a.las", [], keep_packets=True)
+    layout = plan_output(tmp_path / "a.las", [], packets=facts_of(tmp_path / "a.las"))
     (tmp_path / "out").mkdir()
     target = tmp_path / "out" / "a.las"
     write(layout, target, layout.rows(points))
@@ -471,7 +475,7 @@ def test_outputs_are_not_replaced_unless_asked_and_never_the_input(tmp_path):
 
 def test_kept_packets_never_replace_those_of_the_input(tmp_path):
     points = write_strip(tmp_path / "a.laz", internal=False)
-    layout = plan_output(tmp_path / "a.laz", [], keep_packets=True)
+    layout = plan_output(tmp_path / "a.laz", [], packets=facts_of(tmp_path / "a.laz"))
     before = (tmp_path / "a.wdp").read_bytes()
     with pytest.raises(InputError, match="a.wdp: is the input itself"):
         write(layout, tmp_path / "a.las", layout.rows(points), overwrite=True)
@@ -487,8 +491,11 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.layout import plan_output
 from wavebatch.files.cloud.writer import CloudWriter
+from wavebatch.files.strip.reader import StripReader
 source, target = map(Path, sys.argv[1:3])
-layout = plan_output(source, ["amplitude"], keep_packets=target.stem == "keep")
+with StripReader(source) as reader:
+    facts = reader.facts
+layout = plan_output(facts.checked, ["amplitude"], packets=facts if target.stem == "keep" else None)
 rows = layout.rows(np.frombuffer(np.random.default_rng(0).bytes(60000 * 59), dtype="V59").view(
     np.dtype([("a", "V59")])).view(__import__("wavebatch.files.las.header", fromlist="x").STANDARD_DTYPES[9]))
 rows["classification_flags"] &= 0b11001111
@@ -543,8 +550,8 @@ def test_more_points_than_an_old_header_counts(tmp_path):
     points = write_source(tmp_path / "a.las", 4, (1, 3))
     layout = plan_output(tmp_path / "a.las", [])
     with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
-        cloud._file._statistics.count = 2**32 - 100
-        with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; promote with --point-format 6"):
+        cloud._statistics.count = 2**32 - 100
+        with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; use --point-format 6"):
             cloud.write(layout.rows(points))
 
 

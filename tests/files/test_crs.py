@@ -112,7 +112,7 @@ def test_units_of_geotiff_keys(directory, doubles, citation, units):
 def test_units_that_nobody_knows_are_no_metres(directory, doubles):
     units = parse_geotiff(directory, doubles)
     assert not units.is_metric
-    assert "a unit that is not known" in units.describe()
+    assert "an unknown unit" in units.describe()
 
 
 def test_more_keys_than_bytes_are_cut():

@@ -66,19 +66,14 @@ def test_fields_have_different_names_whatever_the_records_say():
 @given(
     dtype=st.sampled_from([t for t in TYPES if t[0] in "ui"]),
     ends=st.tuples(st.integers(-(2**63), 2**64), st.integers(-(2**63), 2**64)),
-    measured=st.booleans(),
 )
-def test_chosen_no_data_lies_outside_the_values(dtype, ends, measured):
+def test_chosen_no_data_lies_outside_the_values(dtype, ends):
     info = np.iinfo(dtype)
     least, largest = (int(np.clip(end, info.min, info.max)) for end in sorted(ends))
     record = ExtraRecord.build("a", dtype, "")
-    if measured:
-        empty = choose_no_data(record, (least, largest))
-    else:
-        declared = record.with_range(np.array([least], dtype), np.array([largest], dtype))
-        empty = choose_no_data(declared)
+    empty = choose_no_data(record.with_range(np.array([least], dtype), np.array([largest], dtype)))
     if empty is None:
-        assert (largest - least >= info.max - info.min - 1) or (least == largest and not measured)
+        assert largest - least >= info.max - info.min - 1 or least == largest
     else:
         assert empty.dtype == np.dtype(dtype) and not least <= int(empty[0]) <= largest
         again = record.with_no_data(empty).no_data
@@ -95,6 +90,6 @@ def test_no_data_without_any_evidence():
     assert np.isnan(choose_no_data(ExtraRecord.build("a", "f4", ""))[0])
     assert choose_no_data(ExtraRecord.build("a", "u2", "")) is None
     assert choose_no_data(ExtraRecord.undocumented("a", 3)) is None
-    assert list(choose_no_data(ExtraRecord.build("a", "u2", "", no_data=5), (0, 10))) == [5]
+    assert list(choose_no_data(ExtraRecord.build("a", "u2", "", no_data=5))) == [5]
     vector = ExtraRecord(bytes([0, 0, 29]) + bytes(189))
     assert np.isnan(choose_no_data(vector)).tolist() == [True] * 3

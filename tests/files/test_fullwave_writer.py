@@ -133,10 +133,10 @@ def test_samples_that_do_not_fit_are_refused(tmp_path, samples):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"version": "1.3", "point_format": 9}, "LAS 1.3 with point format 9 is no waveform file; 1.3 takes 4 and 5"),
-        ({"version": "1.5", "point_format": 4}, "1.5 takes 9 and 10"),
-        ({"point_format": 6}, "with point format 6 is no waveform file"),
-        ({"version": "1.x"}, "LAS 1.x with"),
+        ({"version": "1.3", "point_format": 9}, "LAS 1.3 has no waveforms in point format 9; choose format 4 or 5"),
+        ({"version": "1.5", "point_format": 4}, "no waveforms in point format 4; .* 9 or 10 for 1.5"),
+        ({"point_format": 6}, "has no waveforms in point format 6"),
+        ({"version": "1.x"}, "LAS 1.x has no waveforms in"),
         ({"digitizers": ()}, "digitizers need different indices from 1 to 255, got"),
         ({"digitizers": ONE * 2}, "digitizers need different indices"),
         ({"digitizers": [Digitizer(0, 8, 10, 1.0)]}, "from 1 to 255"),

@@ -40,7 +40,7 @@ def test_files_of_one_name_may_be_read_together_but_not_written_into_one_folder(
     (folder / "sub" / "b.laz").write_bytes(b"")
     arguments = [str(folder), str(folder / "sub")]
     assert [path.name for path in find_files(arguments)] == ["a.LAZ", "b.las", "b.laz", "c.laz"]
-    with pytest.raises(ConfigError, match="both would be written as b"):
+    with pytest.raises(ConfigError, match="both outputs would be named b"):
         find_strips(arguments)
 
 
@@ -61,7 +61,7 @@ def test_a_named_file_that_is_missing_fails_later_and_alone(folder):
         (["@none.txt"], "list cannot be read: No such file"),
         (["@loop.txt"], "line 1: a list cannot name another list"),
         (["@blank.txt"], "no strip given"),
-        (["b.las", "sub/b.laz"], "both would be written as b"),
+        (["b.las", "sub/b.laz"], "both outputs would be named b"),
     ],
 )
 def test_what_means_nothing_is_refused_in_one_line(folder, monkeypatch, arguments, words):

@@ -6,10 +6,9 @@ import laspy
 import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
-from writer_tools import data_file, random_points, read_raw, write_source, write_strip
+from writer_tools import data_file, facts_of, plan_output, random_points, read_raw, write_source, write_strip
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.layout import plan_output
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import STANDARD_DTYPES, Vlr
 
@@ -69,19 +68,16 @@ def test_scan_angle_of_every_rank(tmp_path):
     assert rows["scan_angle"][128 + 15] == 2500
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "keep"), [(5, 6, False), (10, 7, False), (9, 1, False), (4, 9, False), (4, 6, True)]
-)
+@pytest.mark.parametrize(("old", "new", "keep"), [(5, 6, 0), (10, 7, 0), (9, 1, 0), (4, 9, 0), (4, 6, 1)])
 def test_ways_that_lose_something_are_refused(tmp_path, old, new, keep):
     write_source(tmp_path / "a.las", old, VERSIONS[old])
     with pytest.raises(ConfigError, match=f"point format {old} cannot be written as {new}.* possible are"):
-        plan_output(tmp_path / "a.las", [], point_format=new, keep_packets=keep)
+        facts = facts_of(tmp_path / "a.las") if keep else None
+        plan_output(tmp_path / "a.las", [], point_format=new, packets=facts)
 
 
-def test_keeping_packets_that_nobody_has(tmp_path):
+def test_points_are_echoes_or_returns(tmp_path):
     write_source(tmp_path / "a.las", 6, (1, 4))
-    with pytest.raises(ConfigError, match="has no waveforms; leave --keep-packets out"):
-        plan_output(tmp_path / "a.las", [], keep_packets=True)
     with pytest.raises(ConfigError, match="points 'all': must be echoes or returns"):
         plan_output(tmp_path / "a.las", [], points="all")
 
@@ -161,7 +157,7 @@ def write_several(path):
 def test_returns_keep_all_extra_bytes_exactly(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
-    assert layout.dropped == {} and layout.renamed == {"amplitude": "wb amplitude"}
+    assert layout.dropped == {} and layout.written[0].record.name == "wb amplitude"
     assert layout.extra_fields == (*points.dtype.names[-6:], "wb amplitude")
     rows = layout.rows(points, matched=np.zeros(6, bool))
     for name in points.dtype.names[-6:]:
@@ -182,13 +178,6 @@ def test_echoes_carry_extra_bytes_to_matched_rows_only(tmp_path):
         expected = np.broadcast_to(record.no_data.reshape(record.dtype.shape), rows[name][~matched].shape)
         np.testing.assert_array_equal(rows[name][~matched], expected, name)
     assert layout.rows(points)["real"].tobytes() == points["real"].tobytes()
-
-
-def test_measured_ranges_let_integers_be_carried(tmp_path):
-    points = write_several(tmp_path / "a.las")
-    layout = plan_output(tmp_path / "a.las", [], ranges={"bare": (0, 200)})
-    rows = layout.rows(points, matched=np.zeros(6, bool))
-    assert set(layout.dropped) == {"ExtraBytes"} and set(rows["bare"]) == {228}
 
 
 def test_our_own_output_can_be_an_input(tmp_path):
@@ -231,25 +220,24 @@ def test_input_records_are_never_written_to(tmp_path):
 
 def test_kept_packets_keep_pointers_and_take_new_locations(tmp_path):
     points = write_strip(tmp_path / "a.las", n=4)
-    layout = plan_output(tmp_path / "a.las", ["echo_time"], keep_packets=True)
+    layout = plan_output(tmp_path / "a.las", ["echo_time"], packets=facts_of(tmp_path / "a.las"))
     xyz = np.full((4, 3), 0.5)
     xyz[1] = np.nan
     time = np.array([12.5, 13.0, np.nan, 14.0])
-    rows = layout.rows(points, xyz=xyz, columns={"echo_time": time})
+    rows = layout.rows(points, xyz=xyz, columns={"echo_time": time}, time=time)
     location = points["return_point_wave_location"]
     assert rows["return_point_wave_location"].tolist() == [12500.0, location[1], location[2], 14000.0]
     for name in ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "x_t", "y_t", "z_t"):
         np.testing.assert_array_equal(rows[name], points[name])
     kept = layout.rows(points, columns={"echo_time": time})  # no new positions: locations stay too
     np.testing.assert_array_equal(kept["return_point_wave_location"], location)
-    assert layout.rows(points, xyz=xyz, time=time)["return_point_wave_location"].tolist()[0] == 12500.0
 
 
 def test_real_vendor_file(tmp_path):
     path = data_file(RIEGL)
     points = read_raw(path)
     layout = plan_output(path, ["amplitude", "echo_width"], names="riegl")
-    assert layout.renamed == {"amplitude": "wb amplitude", "echo_width": "wb Pulse width"}
+    assert [column.record.name for column in layout.written] == ["wb amplitude", "wb Pulse width"]
     assert layout.dropped == {} and layout.extra_fields[:2] == ("Amplitude", "Pulse width")
     for record, name in zip(layout.extra_records, ("Amplitude", "Pulse width"), strict=False):
         assert int(record.no_data[0]) not in points[name]
@@ -262,13 +250,14 @@ def test_records_that_leave_no_room_are_refused(tmp_path):
     points = random_points(STANDARD_DTYPES[6], 1)
     write_source(tmp_path / "a.las", 6, (1, 4), points=points)
     data = bytearray((tmp_path / "a.las").read_bytes())
-    data[105:107] = (65535).to_bytes(2, "little")
+    data[105:107], data[247:255] = (65535).to_bytes(2, "little"), bytes(8)
+    data[107:111] = bytes(4)
     (tmp_path / "a.las").write_bytes(data)
     with pytest.raises(InputError, match="leave no room for the columns"):
         plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
     data[105:107] = (29).to_bytes(2, "little")
     (tmp_path / "a.las").write_bytes(data)
-    with pytest.raises(InputError, match="29-byte records are too short for point format 6"):
+    with pytest.raises(InputError, match="point records of 29 bytes are too short for format 6"):
         plan_output(tmp_path / "a.las", [])
     data[104] = 11
     (tmp_path / "a.las").write_bytes(data)

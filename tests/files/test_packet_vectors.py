@@ -53,7 +53,7 @@ def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):
     raw = make_raw(most_returns=1)
     raw.points["z_t"][::2] *= -1
     path = raw.write(tmp_path / "a.las")
-    with pytest.raises(InputError, match="cannot be told.*--direction toward or away"):
+    with pytest.raises(InputError, match="is not clear.*--direction toward or away"):
         scan_of(path)
     assert scan_of(path, direction="away").direction == "away"
 
@@ -74,7 +74,7 @@ def test_a_given_direction_that_the_file_denies_is_used_and_said(tmp_path):
     path = make_raw().write(tmp_path / "a.las")
     scan = scan_of(path, direction="away")
     assert scan.direction == "away"
-    assert "overrides what the file says" in scan.warnings[0]
+    assert "overrides the evidence of the file" in scan.warnings[0]
     assert scan_of(path, direction="toward").warnings == ()
 
 

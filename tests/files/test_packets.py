@@ -37,7 +37,7 @@ def assert_read(path, raw, **options):
 def test_a_missing_wdp_is_named(tmp_path):
     path = make_raw(internal=False).write(tmp_path / "a.las")
     path.with_suffix(".wdp").unlink()
-    assert "put a.wdp beside the strip" in refused(path, "packets are not there")
+    assert "put a.wdp next to the strip" in refused(path, "packets are missing")
 
 
 def test_upper_case_wdp_is_found(tmp_path):
@@ -154,15 +154,15 @@ def test_neither_place_falls_back_and_says_so(tmp_path):
     path = raw.write(tmp_path / "a.las")
     assert_read(path, raw)
     with StripReader(path) as reader:
-        assert "taken from the record in the file" in reader.facts.warnings[0]
+        assert "read from the record in the file" in reader.facts.warnings[0]
     raw = make_raw(internal=False)
     raw.encoding = 0
     path = raw.write(tmp_path / "b.las")
     assert_read(path, raw)
     with StripReader(path) as reader:
-        assert "taken from b.wdp" in reader.facts.warnings[0]
+        assert "read from b.wdp" in reader.facts.warnings[0]
     path.with_suffix(".wdp").unlink()
-    refused(path, "neither in the file nor beside it: put b.wdp")
+    refused(path, "neither in the file nor next to it: put b.wdp")
 
 
 def test_a_lost_pointer_is_found_among_the_evlrs(tmp_path):
@@ -171,7 +171,7 @@ def test_a_lost_pointer_is_found_among_the_evlrs(tmp_path):
     path = raw.write(tmp_path / "a.las")
     assert_read(path, raw)
     with StripReader(path) as reader:
-        assert "found among the EVLRs" in reader.facts.warnings[0]
+        assert "found as an EVLR" in reader.facts.warnings[0]
 
 
 def test_records_behind_the_packets_are_no_packets(tmp_path):

@@ -63,7 +63,7 @@ def test_devices_and_pipes_are_never_replaced(tmp_path):
     os.mkfifo(pipe)
     for target in (pipe, "/dev/null", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"):
         assert is_stream(target)
-        with pytest.raises(InputError, match="is a device or a pipe, .*; name another"):
+        with pytest.raises(InputError, match="is a device or a pipe, .*; choose another name"):
             Draft(target, overwrite=True)
     with pytest.raises(InputError, match="pipe: is a device or a pipe"):
         refuse_existing(pipe)

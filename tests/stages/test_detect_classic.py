@@ -1,4 +1,4 @@
-"""Classic detectors: what each promises of isolated echoes, and the detection probabilities of docs/algorithms.md 1.3."""
+"""Classic detectors: isolated echoes, and detection probabilities (docs/algorithms.md 1.3)."""
 
 import numpy as np
 import pytest

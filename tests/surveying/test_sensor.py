@@ -174,7 +174,7 @@ def test_height_is_the_last_resort():
         (CrsUnits("geocentric"), 1.0, "coordinates are geocentric"),
         (CrsUnits("projected", 1200 / 3937), 3.2804, "coordinates are US survey feet, so ranges"),
         (CrsUnits("projected", 1.0, 0.3048), 1.0, "coordinates are metres with heights in international feet"),
-        (CrsUnits("projected", np.nan), 1.0, "coordinates are a unit that is not known"),
+        (CrsUnits("projected", np.nan), 1.0, "coordinates are an unknown unit"),
         (CrsUnits(None), 3.2798, "packet vectors are 3.280 times c/2 long, as in feet"),
     ],
 )

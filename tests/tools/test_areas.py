@@ -193,7 +193,7 @@ def test_polygons_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("features", "words"),
     [
-        ([], "no polygon in it"),
+        ([], "holds no polygon"),
         ([feature("Point", [1, 2])], "is a Point"),
         ([feature("Polygon", [])], "has no ring"),
         ([feature("Polygon", [[[0, 0], [1, 1]]])], "three corners"),

@@ -313,7 +313,7 @@ def test_what_cannot_be_drawn_is_one_line(tmp_path, cloud, kind):
         (nothing, "amplitude", 1, "9 have no data in amplitude"),
         (broken, "z", 1, "broken.las"),
         (tmp_path / "none.las", "z", 1, "none.las"),
-        (cloud, "amplitud", 2, "did you mean 'amplitude'? It has amplitude, echo_flags, Pulse width, comment, x"),
+        (cloud, "amplitud", 2, "did you mean 'amplitude'? Columns of the file: amplitude, echo_flags"),
         (cloud, "qqqqqq", 2, "known are amplitude"),
         (nothing, "intensity --flags-with WEAK", 2, "no column echo_flags"),
         (cloud, "intensity --flags-with WEEK", 2, "did you mean 'WEAK'"),

@@ -22,6 +22,7 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.tools.bench.plot import _draw_panel, _place_labels
+from wavebatch.tools.plots.draw_sheet import draw_sheet
 from wavebatch.tools.plots.packets import MOST, Wanted, find_places
 from wavebatch.tools.plots.waveform import build_views, read_views
 
@@ -306,3 +307,36 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
         assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
         for other in boxes[number + 1 :]:
             assert not box.overlaps(other)
+
+
+def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, tmp_path):
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        drawn = [
+            [place.packet for place in find_places(reader, scan, Wanted(random=40, seed=seed, sheet=True), None)]
+            for seed in (1, 1, 2)
+        ]
+        assert drawn[0] == drawn[1] == sorted(set(drawn[0])) and len(drawn[0]) == 40 and drawn[0] != drawn[2]
+        assert len(find_places(reader, scan, Wanted(packets=((0, 60),), sheet=True), None)) == 60
+        with pytest.raises(ConfigError, match=f"{MOST} fit"):
+            find_places(reader, scan, Wanted(random=40), None)
+    pytest.importorskip("matplotlib")
+    target = tmp_path / "sheet.svg"
+    words = (tiny_strip, "-o", target, "--random", 9, "--seed", 1, "--sheet", "--profile", "fast", "--overwrite")
+    result = run(*words)
+    assert result.exit_code == 0 and "9 waveforms" in result.stderr, result.output
+    first = target.read_bytes()
+    assert first.decode().count("packet ") == 9 and "returns of the file" in first.decode()
+    assert run(*words).exit_code == 0 and target.read_bytes() == first
+    clash = run(tiny_strip, "-o", tmp_path / "p.png", "--random", 3, "--packet", 2)
+    assert clash.exit_code == 2 and "--random chooses the waveforms" in clash.stderr
+
+
+def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
+    pytest.importorskip("matplotlib")
+    views = build_views(
+        simulate(PulseShape(), [(400.0, 30.3, 2.0)], n=2), make_chain("decompose.gaussian"), PULSE, [0, 1]
+    )
+    views += build_views(simulate(PulseShape(), [(0.1, 30.3, 2.0)], n=1), make_chain("decompose.none"), PULSE, [2])
+    draw_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
+    text = (tmp_path / "s.svg").read_text("utf-8")
+    assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text

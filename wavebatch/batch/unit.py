@@ -172,10 +172,10 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
     """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
     options = job.options
     return plan_output(
-        facts,
+        facts.checked,
         options.columns,
         point_format=options.point_format,
-        keep_packets=options.keep_packets,
+        packets=facts if options.keep_packets else None,
         names=options.names,
         points=options.points,
     )
@@ -261,7 +261,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     timing: dict[str, float] = {}
     echoes_mode = prepared.job.options.points == "echoes"
     start = time.perf_counter()
-    with prepared.job.open() as reader:
+    with StripReader.reopen(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
         blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)

@@ -6,17 +6,19 @@ Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import print_result, talk
+from wavebatch.cli.messages import one_line, print_json, print_result, talk
 from wavebatch.cli.options import common_options, from_options, parse_length, seed_option
+from wavebatch.core.errors import InputError
 
 
 @click.command()
-@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP] [CHAIN...]")
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
 @click.option("--scene", "scenes", multiple=True, metavar="NAME",
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
 @click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
@@ -37,6 +39,9 @@ from wavebatch.cli.options import common_options, from_options, parse_length, se
 @click.option("--promises", is_flag=True, help="Also measure and list what each release promises.")
 @click.option("--large", is_flag=True, envvar="BENCH_LARGE",
               help="With --promises: measure memory for 10^7 pulses too.")
+@click.option("--real", is_flag=True,
+              help="Inject echoes into the waveforms of each STRIP and count those found, count false echoes, and "
+              "compare surveys of parts of the strip (not with --no-stability).")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
               help="Folder for bench.json, bench.txt and the plots. Existing files are replaced.")
 @common_options("json", "quiet")
@@ -47,6 +52,9 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
     survey of it. Without STRIP, named scenes are simulated (default: mixed). The table has one row per chain and the
     standard error of each figure.
 
+    With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
+    The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
+
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.bench.command import BenchOptions, run_bench
@@ -54,6 +62,13 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
     from wavebatch.tools.bench.report import format_document, write_outputs
 
     strips = [path for path in files if path.suffix.lower() != ".toml"]
+    silent = options["quiet"] or not sys.stderr.isatty()
+    say = (lambda text: None) if silent else talk
+    if options["real"]:
+        if not strips or len(strips) < len(files):
+            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
+        _bench_real(strips, output, options, say)
+        return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
     settings = from_options(
@@ -64,11 +79,36 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
         chains=tuple(path for path in files if path.suffix.lower() == ".toml"),
         tolerance_cm=parse_length(tolerance) if tolerance else None,
     )
-    silent = options["quiet"] or not sys.stderr.isatty()
-    document = run_bench(settings, (lambda text: None) if silent else talk)
+    document = run_bench(settings, say)
     text = format_document(document)
     if "promises" in document:
         text += "\n\n" + format_promises(document["promises"])
     for line in write_outputs(document, text, output) if output else []:
         talk(line)
     print_result(options["as_json"], document, [text])
+
+
+def _bench_real(
+    strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
+) -> None:
+    """Measures strip after strip; one that cannot be measured is named, and the others go on."""
+    from wavebatch.tools.bench.real import measure_real
+    from wavebatch.tools.bench.real.report import format_report, write_report
+
+    reports, failed = [], False
+    for path in strips:
+        try:
+            report = measure_real(path, seed=options["seed"], stability=options["stability"], say=say)
+        except InputError as error:
+            failed = True
+            talk(f"error: {one_line(error)}")
+            continue
+        reports.append(report)
+        if output:
+            talk(write_report(report, output))
+        if not options["as_json"]:
+            click.echo(format_report(report) + "\n")
+    if options["as_json"]:
+        print_json({"strips": [report.to_json() for report in reports]})
+    if failed:
+        sys.exit(1)

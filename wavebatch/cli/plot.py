@@ -60,6 +60,9 @@ def plot() -> None:
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
               help="Most waveforms of --flags-with or of the default.")
+@click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
+@shared.seed_option("Seed of the random packets.")
+@click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
 @click.option("--times", "shown", callback=_read_range, metavar="LOW:HIGH",
               help="Part of the waveforms to show [ns].  [default: all]")
 @shared.chain_options
@@ -80,13 +83,17 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
     if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
+    if options["random"] and any(options[name] for name in ("packets", "points", "times", "flags_with")):
+        raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
     check_picture(output, overwrite=options["overwrite"])
     wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
     views, chain = _view(strip, wanted, options)
+    from wavebatch.tools.plots.draw_sheet import draw_sheet
     from wavebatch.tools.plots.draw_waveform import draw_waveforms
 
     shown, overwrite = options["shown"], options["overwrite"]
-    draw_waveforms(views, output, strip=strip.name, chain=chain, times=shown, overwrite=overwrite)
+    draw = draw_sheet if options["sheet"] else draw_waveforms
+    draw(views, output, strip=strip.name, chain=chain, times=shown, overwrite=overwrite)
     if not options["quiet"]:
         echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")

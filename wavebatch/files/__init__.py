@@ -1,1 +1,1 @@
-"""Reading and writing LAS files and wave packets: the only place that knows laspy, paths, picoseconds and volts."""
+"""All that knows files: formats, paths, picoseconds, volts and temporary files. Other rooms get arrays and facts."""

@@ -1,4 +1,8 @@
-"""Picture files: matplotlib (extra `plot`) asked for late, the house style, the same bytes for the same figure."""
+"""Picture files drawn with matplotlib (optional extra `plot`): one style, and equal bytes for equal figures.
+
+All plots are written through `open_picture`. matplotlib is imported only when a picture is drawn, because it takes
+longer to import than many commands take to run.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ _METADATA: dict[str, dict[str, str | None]] = {
     ".svg": {"Creator": "wavebatch", "Date": None},
     ".pdf": {"Creator": "wavebatch", "Producer": None, "CreationDate": None},
 }
-"""Per kind of picture what stands in it about its making: no dates, no versions."""
+"""Metadata of each kind of picture: no dates and no versions, so that equal figures give equal bytes."""
 
 _STYLE = {
     "axes.axisbelow": True,
@@ -41,7 +45,7 @@ _STYLE = {
     "pdf.fonttype": 42,
     "svg.fonttype": "none",
     "svg.hashsalt": "wavebatch",
-    # A dollar sign in a file's name starts no formula.
+    # A dollar sign in a file name must not start a formula.
     "text.parse_math": False,
     "xtick.color": "#333333",
     "ytick.color": "#333333",
@@ -51,9 +55,9 @@ _STYLE = {
 
 
 def check_picture(target: Path, *, overwrite: bool) -> None:
-    """Raises ConfigError where `target` is no kind of picture or matplotlib is missing, InputError where it exists."""
+    """Raise ConfigError for an unknown suffix or if matplotlib is missing, InputError if the file exists."""
     if target.suffix.lower() not in _METADATA:
-        raise ConfigError(f"{target}: pictures are written as {', '.join(_METADATA)}; name one of these")
+        raise ConfigError(f"{target}: unknown kind of picture; use {', '.join(_METADATA)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError(f"{target}: pictures need matplotlib: pip install 'wavebatch[plot]'")
     if not overwrite:
@@ -64,20 +68,20 @@ def check_picture(target: Path, *, overwrite: bool) -> None:
 def open_picture(
     target: Path, size: tuple[float, float], *, overwrite: bool = False, dpi: float = 150
 ) -> Iterator[Figure]:
-    """A figure of `size` inches; what is drawn in the `with` block is written to `target` and published at its end.
+    """Give a figure of `size` inches to the `with` block and write it to `target` at the end of the block.
 
-    The suffix says which kind. The bytes depend on what is drawn, not on the user's matplotlibrc, screen or clock.
-    Raises as `check_picture` does, and InputError where the file cannot be written.
+    The suffix selects the kind of picture. The user's matplotlibrc, screen and clock have no effect.
+    Raises as `check_picture` does, and InputError if the file cannot be written.
     """
     check_picture(target, overwrite=overwrite)
-    # In cron, with no home to write to, matplotlib would talk about its cache on stderr.
+    # Without a home folder (cron) matplotlib would write about its cache on stderr.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         import matplotlib
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ConfigError(f"{target}: matplotlib cannot be imported, install it anew: {error}") from error
+        raise ConfigError(f"{target}: matplotlib cannot be imported; install it again: {error}") from error
 
     kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}
     with matplotlib.rc_context({**kept, **_STYLE}), warnings.catch_warnings():
@@ -90,7 +94,7 @@ def open_picture(
 
 
 _UNTOUCHED = ("backend", "backend_fallback", "interactive", "toolbar", "timezone", "webagg.port")
-"""Settings of matplotlib that are not of a figure's looks."""
+"""Settings of matplotlib that do not change the look of a figure; setting them would touch the user's backend."""
 
 
 def _save(figure: Figure, target: Path, overwrite: bool) -> None:
@@ -105,7 +109,7 @@ def _save(figure: Figure, target: Path, overwrite: bool) -> None:
 
 
 def plain_text(text: str, most: int = 80) -> str:
-    """Text from a file for a picture: printable, on one line, its middle left out where it is longer than `most`."""
+    """Return text from a file for use in a picture: printable, on one line, shortened in the middle to `most`."""
     text = " ".join("".join(char if char.isprintable() else " " for char in text).split())
     if len(text) <= most:
         return text

@@ -1,4 +1,8 @@
-"""Polygons of a GeoJSON file, and which points lie inside."""
+"""Polygons of a GeoJSON file, and the test which points lie inside.
+
+Used for the areas of `wavebatch stats` and for reference targets of the calibration. Coordinates are those of the
+clouds; nothing is projected.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +19,28 @@ from wavebatch.core.errors import ConfigError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polygon:
-    """An area with a name; one with several parts or with holes has several rings."""
+    """An area with a name; several parts or holes give several rings."""
 
     name: str
     rings: tuple[np.ndarray, ...]
-    """Corners of each, f8 (k, 2)."""
+    """Corners of each ring, f8 (k, 2)."""
 
 
 def find_inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether points (n,) lie inside an odd number of rings, bool (n,); points without a place lie nowhere.
+    """Return which points lie inside an odd number of rings, so that a hole is a ring inside another.
 
-    Of two polygons that share a border, each point of it lies in one.
+    A point on the common border of two polygons lies in exactly one of them.
+
+    Parameters
+    ----------
+    rings : sequence of f8 (k, 2), m
+        Corners of each ring.
+    x, y : f8 (n,), m
+        Points; NaN lies in no polygon.
+
+    Returns
+    -------
+    bool (n,)
     """
     corners = np.concatenate(rings)
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
@@ -42,9 +57,9 @@ def find_inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np
 
 
 def load_polygons(path: Path | str) -> list[Polygon]:
-    """The polygons of a GeoJSON file, named by the property `name` or by their number; ConfigError in one line.
+    """Return the polygons and multipolygons of a GeoJSON file, named by the property `name` or by their number.
 
-    Polygons and MultiPolygons, in the coordinates of the clouds.
+    Raises ConfigError if the file cannot be read or holds anything else.
     """
     try:
         text = Path(path).read_text("utf-8-sig")
@@ -54,24 +69,24 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     for number, (properties, rings) in enumerate(read_features(text, path), 1):
         for ring in rings:
             if len(ring) < 3 or not np.isfinite(ring).all():
-                raise ConfigError(f"{path}: polygon {number}: a ring needs three corners, and finite coordinates")
+                raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")
         polygons.append(Polygon(str(properties.get("name") or number), tuple(rings)))
     if not polygons:
-        raise ConfigError(f"{path}: no polygon in it; give a GeoJSON FeatureCollection of polygons")
+        raise ConfigError(f"{path}: holds no polygon; give a GeoJSON FeatureCollection of polygons")
     return polygons
 
 
 def read_features(text: str, path: Path | str) -> list[tuple[dict[str, Any], list[np.ndarray]]]:
-    """Properties and rings, f8 (k, 2) each, of every feature of a GeoJSON document; ConfigError in one line.
+    """Return properties and rings, f8 (k, 2) each, of all features of a GeoJSON document.
 
-    path: named in errors.
+    path: name for messages. Raises ConfigError for anything else than polygons.
     """
     try:
         features = []
         for feature in json.loads(text)["features"]:
             shape = feature["geometry"]
             if shape["type"] not in ("Polygon", "MultiPolygon"):
-                raise ConfigError(f"{path}: a feature is a {shape['type']}; only polygons have an area")
+                raise ConfigError(f"{path}: a feature is a {shape['type']}; give polygons only")
             parts = [shape["coordinates"]] if shape["type"] == "Polygon" else shape["coordinates"]
             rings = [np.array([[float(x), float(y)] for x, y, *_ in ring]) for part in parts for ring in part]
             if not rings:

@@ -1,4 +1,7 @@
-"""Which strips or clouds an argument list means: files, globs, folders and lists."""
+"""Input files from command-line arguments: files, patterns, folders and lists.
+
+All commands that take several files use it. The order of the arguments is kept, because outputs are made in it.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,12 @@ SUFFIXES = (".las", ".laz")
 
 
 def find_files(arguments: Iterable[str]) -> list[Path]:
-    """The files that arguments mean, each once, in the order of the arguments; folders and globs by name.
+    """Return the files of the arguments, each once, in the order of the arguments.
 
-    A folder means its LAS and LAZ files, not those of folders in it. `@list.txt` means one such argument per line;
-    relative ones are taken from the list's folder, empty lines and lines that start with # are left out. A named file
-    that does not exist is kept: it fails when its turn comes, and the others do not suffer.
-    Raises ConfigError where an argument means nothing.
+    A folder gives its LAS and LAZ files by name, without those of subfolders. `@list.txt` holds one argument per line,
+    relative to the folder of the list; empty lines and lines that start with # are skipped. A file that does not exist
+    is kept: it fails in its turn, so that the other files are still processed.
+    Raises ConfigError if a folder, pattern or list gives no file.
     """
     files: dict[Path, Path] = {}
     for argument in arguments:
@@ -28,9 +31,9 @@ def find_files(arguments: Iterable[str]) -> list[Path]:
 
 
 def find_strips(arguments: Iterable[str]) -> list[Path]:
-    """The strips that arguments mean, as `find_files` finds them.
+    """Return the strips of the arguments, as `find_files` does.
 
-    Raises ConfigError where there is none, or two would have outputs of the same name.
+    Raises ConfigError if there is none, or if two strips would get outputs of the same name.
     """
     strips = find_files(arguments)
     if not strips:
@@ -39,7 +42,7 @@ def find_strips(arguments: Iterable[str]) -> list[Path]:
     for path in strips:
         other = stems.setdefault(os.path.normcase(path.stem), path)
         if other is not path:
-            raise ConfigError(f"{other} and {path}: both would be written as {path.stem}; run them into two folders")
+            raise ConfigError(f"{other} and {path}: both outputs would be named {path.stem}; use two output folders")
     return strips
 
 
@@ -51,7 +54,7 @@ def _expand(argument: str, folder: Path) -> Iterator[Path]:
     if path.is_dir():
         found = sorted(entry for entry in path.iterdir() if _is_strip(entry))
         if not found:
-            raise ConfigError(f"{path}: folder holds no .las or .laz file")
+            raise ConfigError(f"{path}: the folder holds no .las or .laz file")
         yield from found
     elif path.exists() or not glob.has_magic(argument):
         yield path
@@ -71,7 +74,7 @@ def _read_list(path: Path) -> Iterator[Path]:
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: list cannot be read: {getattr(error, 'strerror', '') or error}") from error
+        raise ConfigError(f"{path}: the list cannot be read: {getattr(error, 'strerror', '') or error}") from error
     for number, line in enumerate(lines, 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):

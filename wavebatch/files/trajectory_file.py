@@ -1,4 +1,7 @@
-"""Trajectory files: text with named columns, and SBET, into the coordinates of the strip."""
+"""Readers of trajectory files: text with named columns, and SBET; positions come in the coordinates of the strip.
+
+`surveying/sensor.py` calls `read_trajectory` for `--trajectory`. Add names of text columns to COLUMN_NAMES.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,10 @@ SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "wander", "x_acceleration", "y_acceleration", "z_acceleration", "x_rate", "y_rate", "z_rate")])  # fmt: skip
 
 MOST_RECORDS = 400_000
-"""Positions of an SBET that are kept: 5 hours at 20 Hz."""
+"""Most positions that are kept of an SBET: 5 hours at 20 Hz; more of them do not make the interpolation better."""
 
 MOST_TEXT = 1 << 30
-"""Bytes of a text file."""
+"""Most bytes of a text file: it is held in memory."""
 
 COLUMN_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("time", "gpstime", "gps", "t", "sow", "gpsseconds", "gpssow", "secondsofweek", "weekseconds", "timestamp"),
@@ -31,7 +34,7 @@ COLUMN_NAMES: dict[str, tuple[str, ...]] = {
     "pitch": ("pitch",),
     "heading": ("heading", "yaw", "azimuth"),
 }
-"""Names of columns in text files, without case, blanks, units and punctuation."""
+"""Names of columns in text files, compared without case, blanks, units and punctuation."""
 
 _ATTITUDE = ("roll", "pitch", "heading")
 
@@ -39,10 +42,21 @@ _ATTITUDE = ("roll", "pitch", "heading")
 def read_trajectory(
     path: Path | str, *, crs: str | None = None, lever_arm: tuple[float, float, float] | None = None
 ) -> Trajectory:
-    """The positions of a file, in its own clock and the strip's coordinates.
+    """Return the positions of a trajectory file in the coordinates of the strip, with the times of the file.
 
-    crs: of the strip, as WKT or an EPSG code; needed where the file has degrees. lever_arm: from the file's position to
-    the scanner, forward, right, down [m]; needs roll, pitch and heading. Raises InputError in one line.
+    Parameters
+    ----------
+    path : Path or str
+        Text with a header line, or an SBET.
+    crs : str or None
+        CRS of the strip as WKT or EPSG code; needed if the file has degrees.
+    lever_arm : (float, float, float), m
+        From the position of the file to the scanner: forward, right, down; needs roll, pitch and heading.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or does not have what is needed.
     """
     path = Path(path)
     try:
@@ -77,8 +91,8 @@ def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
     columns["z"] = columns.pop("height")
     inside = (np.abs(some["latitude"]) <= np.pi / 2) & (np.abs(some["longitude"]) <= 2 * np.pi)
     if not (inside & np.isfinite(some["time"])).mean() > 0.99:
-        raise InputError(f"{path}: not an SBET: its latitudes and longitudes are no radians; give text with headers")
-    # The platform's heading is counted from the wander frame, whose north the wander angle turns.
+        raise InputError(f"{path}: not an SBET: its latitudes and longitudes are not radians; give text with headers")
+    # An SBET counts the heading in the wander frame, which is turned from north by the wander angle.
     columns["heading"] = some["heading"] - some["wander"]
     columns["latitude"], columns["longitude"] = np.degrees(some["latitude"]), np.degrees(some["longitude"])
     return columns
@@ -86,7 +100,7 @@ def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
 
 def _read_text(path: Path, size: int) -> dict[str, np.ndarray]:
     if size > MOST_TEXT:
-        raise InputError(f"{path}: trajectory of {size / 1e9:.1f} GB of text; thin it to 20 positions a second")
+        raise InputError(f"{path}: {size / 1e9:.1f} GB of text are too much; thin it to 20 positions per second")
     lines = path.read_text("utf-8", "replace").splitlines()
     place, names = _find_header(path, lines)
     body = (_split(line) for line in lines[place + 1 :])
@@ -114,7 +128,7 @@ def _numbers(fields: list[str], number: int) -> list[float] | None:
 
 
 def _find_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
-    """Number of the header line, and the meaning of each of its columns, empty where there is none."""
+    """Number of the header line, and the meaning of each column; empty for columns that are not used."""
     for place, line in enumerate(lines[:200]):
         names = [_meaning(field) for field in _split(line)]
         if "time" in names and ({"x", "y", "z"} <= set(names) or {"latitude", "longitude", "z"} <= set(names)):
@@ -132,11 +146,11 @@ def _meaning(field: str) -> str:
 
 
 def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.ndarray:
-    """Coordinates (n, 3) as the strip has them."""
+    """Coordinates (n, 3) in the CRS of the strip."""
     if "x" in columns:
         return np.stack([columns["x"], columns["y"], columns["z"]], axis=1)
     if crs is None:
-        raise InputError(f"{path}: the trajectory is in degrees and the strip does not say its CRS; give one in metres")
+        raise InputError(f"{path}: the trajectory is in degrees, but the strip has no CRS; give a trajectory in metres")
     try:
         import pyproj
     except ImportError as error:
@@ -151,5 +165,5 @@ def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.
         transformer = pyproj.Transformer.from_crs("EPSG:4979", target, always_xy=True)
         placed = transformer.transform(columns["longitude"], columns["latitude"], columns["z"])
     except pyproj.exceptions.ProjError as error:
-        raise InputError(f"{path}: the strip's CRS is not understood ({error}); give x, y, z") from error
+        raise InputError(f"{path}: the CRS of the strip is not understood ({error}); give x, y, z") from error
     return np.stack([np.asarray(values, np.float64) for values in placed], axis=1)

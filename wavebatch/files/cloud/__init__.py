@@ -1,1 +1,1 @@
-"""Point clouds with echo columns: layout, writer, and readers of points, echoes, returns and angles."""
+"""Point clouds with echo columns: layout, writer, and readers of echoes, returns, angles and single columns."""

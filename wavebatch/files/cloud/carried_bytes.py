@@ -1,55 +1,51 @@
-"""What of the input goes to the output as it is: its extra bytes and the bytes of its packets."""
+"""Extra bytes and waveform packets that are copied unchanged from a strip to its output cloud.
+
+`layout.plan_output` calls it. Rows of new echoes have no extra bytes, so a dimension is copied only if it has a free
+value for "no data".
+"""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord, choose_no_data, read_records
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    STANDARD_DTYPES,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    LasHeader,
-    has_record,
-)
+from wavebatch.files.las.checked_header import CheckedHeader
+from wavebatch.files.las.extra_bytes import ExtraRecord, choose_no_data
+from wavebatch.files.las.header import EVLR_HEADER_SIZE, STANDARD_DTYPES
+from wavebatch.files.strip.facts import StripFacts
 
 
 @dataclass(frozen=True, slots=True)
 class PacketSource:
-    """The bytes of all packets of the input, and what takes their offsets to those of the output."""
+    """The bytes of all packets of the input, and how offsets change in the output."""
 
     path: Path
     start: int
     end: int
     internal: bool
     shift: int
+    """Added to each byte offset: 60 if offsets count from the first byte of a .wdp without header, else 0."""
 
 
 @dataclass(frozen=True, slots=True)
 class Carried:
-    """One of the input's extra dimensions on its way to the output."""
+    """An extra dimension of the input that is copied to the output."""
 
     record: ExtraRecord
     source: int
-    """Byte offset in the input record; that in the output record is where the dtype says."""
+    """Byte offset in the input record; the output's dtype has the offset there."""
 
 
-def plan_carried(
-    path: Path, header: LasHeader, whole: bool, ranges: Mapping[str, tuple[float, float]]
-) -> tuple[tuple[Carried, ...], dict[str, str]]:
-    """Input extra dimensions that are carried over, and why others are not; `whole`: every row has them."""
-    at = STANDARD_DTYPES[header.point_format].itemsize
-    payloads = [vlr.payload for vlr in header.vlrs if has_record([vlr], "LASF_Spec", EXTRA_BYTES_RECORD_ID)]
-    records = read_records(payloads[0] if payloads else b"", header.point_length - at)
+def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[tuple[Carried, ...], dict[str, str]]:
+    """Return the extra dimensions to copy, and for the others the reason why not.
+
+    whole: every output row comes from an input point, so no value for "no data" is needed.
+    """
+    at = STANDARD_DTYPES[checked.header.point_format].itemsize
     carried, dropped = [], {}
-    for record in records:
-        empty = choose_no_data(record, ranges.get(record.name))
+    for record in checked.records:
+        empty = choose_no_data(record)
         if whole:
             carried.append(Carried(record, at))
         elif empty is None:
@@ -60,23 +56,9 @@ def plan_carried(
     return tuple(carried), dropped
 
 
-def find_packets(facts: Any, path: Path, header: LasHeader) -> PacketSource:
-    """Where the packets lie: as the reader found, or as the header says where there is only a path."""
-    if getattr(facts, "packet_file", None) is not None:
-        shift = max(0, EVLR_HEADER_SIZE - (facts.packet_start - facts.packet_base))
-        return PacketSource(Path(facts.packet_file), facts.packet_start, facts.packet_end, facts.internal, shift)
-    internal = bool(header.global_encoding & WAVES_INTERNAL) or not header.global_encoding & WAVES_EXTERNAL
-    if not internal:
-        for suffix in (".wdp", ".WDP"):
-            beside = path.with_suffix(suffix)
-            if beside.is_file():
-                return PacketSource(beside, EVLR_HEADER_SIZE, os.path.getsize(beside), False, 0)
-        raise InputError(f"{path}: {path.with_suffix('.wdp').name} with its packets is not beside it")
-    start, size = header.waveform_start, os.path.getsize(path)
-    if not 0 < start <= size - EVLR_HEADER_SIZE:
-        raise InputError(f"{path}: the record of its packets would begin at byte {start} of {size}; damaged or cut")
-    with open(path, "rb") as file:
-        file.seek(start + 18)
-        length = int.from_bytes(file.read(8), "little")
-    end = min(size, start + EVLR_HEADER_SIZE + length) if length else size
-    return PacketSource(path, start + EVLR_HEADER_SIZE, end, True, 0)
+def find_packets(facts: StripFacts) -> PacketSource:
+    """Return the packets of a strip; raises InputError if it has none."""
+    if facts.packet_file is None:
+        raise InputError(f"{facts.path}: has no packets to keep; leave --keep-packets out")
+    shift = max(0, EVLR_HEADER_SIZE - (facts.packet_start - facts.packet_base))
+    return PacketSource(facts.packet_file, facts.packet_start, facts.packet_end, facts.internal, shift)

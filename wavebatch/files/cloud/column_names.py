@@ -1,8 +1,11 @@
-"""Names, types and units under which columns are written: one table for wavebatch's own style and four others."""
+"""Names, types and units of written columns: one table for wavebatch's style and four styles of other programs.
+
+The layout of a cloud names columns with it, and the cloud readers find columns of all styles. A style may use a name
+only if the column has the meaning and unit that the other program gives to this name.
+"""
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -12,34 +15,35 @@ from laspy import PointFormat
 
 from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import STANDARD_DTYPES
 
 
 @dataclass(frozen=True, slots=True)
 class Naming:
-    """How a style writes one column where it differs from the column's declaration."""
+    """How a style writes one column, where it differs from the declaration of the column."""
 
     name: str
     dtype: str | None = None
     unit: str | None = None
     scale: float | None = None
     no_data: float | None = None
-    """Stored value; only for styles that change the type."""
+    """Stored no-data value; only for styles that change the type."""
     decibel: bool = False
     """Written as 10 log10 of the value."""
 
 
 STYLES: dict[str, dict[str, Naming]] = {
     "wavebatch": {},
-    # The standard extra bytes of ASPRS have one of our quantities: the pulse width, full width at half maximum in ns.
+    # Of the standard extra bytes of ASPRS one is a wavebatch column: pulse width, full width at half maximum in ns.
     "asprs": {"echo_width": Naming("pulse width", "u2", scale=0.1, no_data=0.0)},
-    # RIEGL's Amplitude is in dB above the detection limit, which counts cannot be turned into; Reflectance is dB too.
+    # RIEGL's Amplitude is in dB above the detection limit, which cannot be computed from counts; Reflectance is in dB.
     "riegl": {
         "echo_width": Naming("Pulse width", "u2", scale=0.1, no_data=0.0),
         "reflectance": Naming("Reflectance", "i2", "dB", scale=0.01, no_data=-32768.0, decibel=True),
     },
-    # PDAL's Amplitude is in dB and its PulseWidth in samples of the digitizer, so these two names are left alone.
+    # PDAL's Amplitude is in dB and its PulseWidth in samples of the digitizer, so these two names are not used.
     "pdal": {
         "amplitude": Naming("PeakAmplitude"),
         "echo_time": Naming("EchoTime"),
@@ -68,7 +72,7 @@ STYLES: dict[str, dict[str, Naming]] = {
         "reflectance": Naming("Reflectance"),
     },
 }
-"""Per style the columns it names in its own way; every other column keeps wavebatch's name, type and unit."""
+"""Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 
 _SHORT = {
     "amplitude": "peak above the baseline",
@@ -87,19 +91,19 @@ _SHORT = {
     "relative_cross_section_err": "1 sigma, relative",
     "relative_reflectance_err": "1 sigma, relative",
 }
-"""Meanings short enough for the 32 bytes of a description, where the column's own is not."""
+"""Short meanings of columns whose declared meaning does not fit into the 32 bytes of a description."""
 
 _STANDARD = frozenset(
     re.sub("[_ ]", "", name.casefold())
     for number in STANDARD_DTYPES
     for name in (*PointFormat(number).dimension_names, *STANDARD_DTYPES[number].names)
 )
-"""Names of standard LAS dimensions, as `normalise` gives them."""
+"""Normalised names of the standard LAS dimensions."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenColumn:
-    """One column of ours as it stands in the file."""
+    """A wavebatch column as it is written to the file."""
 
     column: str
     """Name in COLUMNS."""
@@ -107,9 +111,9 @@ class WrittenColumn:
     naming: Naming
 
     def encode(self, values: np.ndarray) -> np.ndarray:
-        """Stored values of physical `values` (m,); what is not finite becomes no-data.
+        """Return the stored values (m,) of physical `values` (m,); values that are not finite become no-data.
 
-        Scaled values that the stored type cannot hold become its nearest value that is not no-data.
+        Scaled values outside the stored type become its nearest value that is not no-data.
         """
         dtype, no_data = self.record.dtype, self.record.no_data
         if dtype.kind in "ui" and np.asarray(values).dtype.kind in "ui":
@@ -130,12 +134,12 @@ class WrittenColumn:
 
 
 def normalise(name: str) -> str:
-    """What names are compared by: case, spaces, underscores and hyphens do not count."""
+    """Return the form in which names are compared: without case, spaces, underscores and hyphens."""
     return re.sub(r"[\s_\-]", "", name.casefold())
 
 
 def describe(column: Column, unit: str | None = None) -> str:
-    """Meaning and unit of the column in at most 32 bytes, `meaning [unit]`."""
+    """Return meaning and unit of a column in at most 32 bytes, as `meaning [unit]`."""
     tail = f" [{unit or column.unit}]"
     if column.name.endswith("_err") and column.name not in _SHORT:
         meaning = f"1 sigma of {column.name.removesuffix('_err')}"
@@ -147,12 +151,11 @@ def describe(column: Column, unit: str | None = None) -> str:
 
 
 def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> list[WrittenColumn]:
-    """The extra-bytes columns among `columns`, in their order, as `style` writes them.
+    """Return the extra-bytes columns among `columns`, in order, as `style` writes them.
 
-    taken: names of the input's own extra bytes, which they keep. THE RULE: where one of our names equals a name of the
-    input, of a standard LAS dimension or of another column of ours - whatever the case, spaces, underscores and
-    hyphens - ours is written with `wb ` in front (`wb2 `, `wb3 ` ... if that exists as well).
-    Columns that are LAS fields (x, y, z) are left out, repeated ones count once.
+    taken: names of the input's extra bytes, which stay. If the name of a wavebatch column is equal to one of these, to
+    a LAS field or to another column (compared by `normalise`), it gets the prefix `wb `, or `wb2 `, `wb3 ` ... if that
+    is taken too. Columns that are LAS fields (x, y, z) are skipped, repeated ones count once.
     Raises ConfigError for an unknown style or column.
     """
     if style not in STYLES:
@@ -160,7 +163,9 @@ def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> 
     used = {normalise(name) for name in taken} | _STANDARD
     written: list[WrittenColumn] = []
     for key in dict.fromkeys(columns):
-        column = _find_column(key)
+        if key not in COLUMNS:
+            raise ConfigError(f"column {key!r} does not exist; {nearest(key, COLUMNS)}")
+        column = COLUMNS[key]
         if not column.extra_bytes:
             continue
         naming = STYLES[style].get(key, Naming(key))
@@ -175,14 +180,6 @@ def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> 
         )
         written.append(WrittenColumn(key, record, naming))
     return written
-
-
-def _find_column(name: str) -> Column:
-    if name in COLUMNS:
-        return COLUMNS[name]
-    near = difflib.get_close_matches(name, COLUMNS, 1)
-    hint = f"did you mean {near[0]!r}?" if near else f"known are {', '.join(COLUMNS)}"
-    raise ConfigError(f"column {name!r} does not exist; {hint}")
 
 
 def _avoid(name: str, used: Collection[str]) -> str:

@@ -1,4 +1,8 @@
-"""Point clouds read in pieces: positions, GPS times and wavebatch's own columns, whatever style names them."""
+"""Point clouds read in pieces: positions, GPS times and wavebatch's columns under the names of any style.
+
+The comparisons read with `CloudReader`; the readers of returns, angles and single columns are built on it. Files may
+come from any program: laspy only describes the fields, the bytes are read and checked by wavebatch.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,13 @@ from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_names import STYLES
-from wavebatch.files.cloud.points import CloudPoints
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.read_points import open_points
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
-"""Columns that are read where the cloud has them."""
+"""Columns that are read if the cloud has them."""
 
 CLOUD_DTYPE = np.dtype(
     [
@@ -29,54 +35,51 @@ CLOUD_DTYPE = np.dtype(
         *((name, "<f4") for name in CLOUD_COLUMNS),
     ]
 )
-"""One echo of a cloud: time [s], position [m], the stored packet vector (0 where there is none; it may point either
-way), EchoFlag bits, return number and number of returns, intensity, and columns (NaN: no data)."""
+"""One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
+bits, return number and number of returns, intensity, and columns (NaN: no data)."""
 
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
 _LARGEST = 1e30
-"""Values beyond are damage, no data: their squares would leave single precision."""
+"""Larger values are damage and become no data: their squares would overflow in single precision."""
 
 
-class CloudReader:
-    """A LAS or LAZ file read in pieces; packets and extended records are never touched. Raises InputError."""
+class CloudReader(Closing):
+    """Reads a LAS or LAZ file in pieces of CLOUD_DTYPE; subclasses read other records. A context manager.
+
+    Raises InputError if the file is damaged, or compressed in a way that no installed library can read.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        self._file = CloudPoints(self.path)
-        header = self._file.header
-        self.point_count: int = header.point_count
-        names = set(header.point_format.dimension_names)
+        checked = read_checked_header(self.path, waveforms=False)
+        self.point_count: int = checked.header.point_count
+        self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        self._format = describe_format(checked)
+        names = set(self._format.dimension_names)
         self.has_gps_time = "gps_time" in names
         self.has_packets = "wavepacket_index" in names
-        self._sources = find_columns(list(header.point_format.extra_dimensions), (*CLOUD_COLUMNS, "echo_flags"))
+        self._sources = find_columns(list(self._format.extra_dimensions), (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
+        self._points = open_points(checked)
 
-    def __enter__(self) -> CloudReader:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._file.close()
+    def close(self) -> None:
+        """Close the file."""
+        self._points.close()
 
     def read_pieces(self, size: int = _PIECE) -> Iterator[np.ndarray]:
-        """Echoes from the first one on, CLOUD_DTYPE, at most `size` at a time.
+        """Yield the points of the file in order, at most `size` at a time.
 
-        Points whose packet index is 0 are left out of clouds that still have packets.
+        CLOUD_DTYPE leaves out points whose packet index is 0, if the cloud still has packets.
         """
-        size = max(min(size, _PIECE_BYTES // self._file.header.point_format.size), 1)
+        size = max(min(size, _PIECE_BYTES // self._format.size), 1)
         for start in range(0, self.point_count, size):
-            yield self._convert(self._file.read(start, min(start + size, self.point_count)))
+            yield self._convert(self._points.read(start, min(start + size, self.point_count)))
 
-    def _convert(self, points: laspy.ScaleAwarePointRecord) -> np.ndarray:
-        raw = points.array
-        rows = np.zeros(len(raw), CLOUD_DTYPE)
-        for axis, name in enumerate("XYZ"):
-            rows["xyz"][:, axis] = raw[name] * points.scales[axis] + points.offsets[axis]
-        if self.has_gps_time:
-            rows["gps_time"] = widen(raw["gps_time"])
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        rows = self._place(raw, CLOUD_DTYPE)
         for name in CLOUD_COLUMNS:
-            source = self._sources.get(name)
-            rows[name] = np.nan if source is None else self._read_column(raw, source)
+            rows[name] = self._read_column(raw, self._sources.get(name))
         rows["number"], rows["total"] = split_numbers(raw)
         rows["intensity"] = raw["intensity"]
         if "echo_flags" in self._sources:
@@ -87,8 +90,22 @@ class CloudReader:
             rows["ray"][:, axis] = widen(raw[name])
         return rows[raw["wavepacket_index"] != 0]
 
-    def _read_column(self, raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
-        """Physical values, NaN where the no-data value stands."""
+    def _place(self, raw: np.ndarray, dtype: np.dtype) -> np.ndarray:
+        """New rows of `dtype` with positions and GPS times of raw records, zero otherwise."""
+        rows = np.zeros(len(raw), dtype)
+        for axis in range(3):
+            rows["xyz"][:, axis] = self._locate(raw, axis)
+        if self.has_gps_time:
+            rows["gps_time"] = widen(raw["gps_time"])
+        return rows
+
+    def _locate(self, raw: np.ndarray, axis: int) -> np.ndarray:
+        return raw["XYZ"[axis]] * self.scales[axis] + self.offsets[axis]
+
+    def _read_column(self, raw: np.ndarray, dimension: DimensionInfo | None) -> np.ndarray | float:
+        """Physical values with NaN for no data; NaN if the cloud has no such dimension."""
+        if dimension is None:
+            return np.nan
         values = widen(raw[dimension.name])
         with np.errstate(over="ignore", invalid="ignore"):
             if dimension.scales is not None:
@@ -98,18 +115,38 @@ class CloudReader:
             return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
 
+def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
+    """Return laspy's point format with the extra dimensions of the checked records, under the names of the fields."""
+    point_format = laspy.PointFormat(checked.header.point_format)
+    for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
+        dtype, scaling = record.dtype, record.scaling
+        dimension = DimensionInfo(
+            field,
+            DimensionKind.from_letter(dtype.base.kind),
+            8 * dtype.itemsize,
+            dtype.shape[0] if dtype.shape else 1,
+            is_standard=False,
+            description=record.description,
+            scales=None if scaling is None else np.array(scaling[:1]),
+            offsets=None if scaling is None else np.array(scaling[1:]),
+            no_data=record.no_data,
+        )
+        point_format.dimensions.append(dimension)
+    return point_format
+
+
 def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return numbers and numbers of returns of raw records, u1 (n,) each."""
+    """Return the return numbers and numbers of returns of raw records, u1 (n,) each."""
     if "classification_flags" in raw.dtype.names:
         return raw["bit_fields"] & 15, raw["bit_fields"] >> 4
     return raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
-    """Extra dimension per column, of those that are there: our own name before those of the other styles, `wb ` in
-    front before without.
+    """Return the extra dimension of each column that the cloud has.
 
-    A dimension of another style counts only when it is stored as that style stores it: RIEGL's Amplitude is in dB.
+    wavebatch's name is preferred to those of other styles, and a name with the prefix `wb ` to one without. A dimension
+    of another style counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """
     by_name = {dimension.name: dimension for dimension in extra}
     wanted = set(columns)
@@ -125,7 +162,7 @@ def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str
 
 
 def _is_stored_as(dimension: DimensionInfo, column: str, scale: float | None) -> bool:
-    """Whether the dimension is one number, scaled or not as the style has it, and flags are bits."""
+    """Whether the dimension is one number, scaled if the style scales it, and flags are unsigned integers."""
     if dimension.num_elements != 1 or (dimension.scales is None) != (scale is None):
         return False
     return column != "echo_flags" or dimension.kind is DimensionKind.UnsignedInteger

@@ -1,11 +1,14 @@
-"""How the points of one output file look, and the rows made for it from input records and columns."""
+"""Layout of the points of one output cloud, and the rows that are made for it from input records and columns.
+
+The batch plans the layout once per strip, workers make the rows of each unit, and `writer.CloudWriter` writes them.
+A row depends only on its input point and echo, never on the block or unit that it is made in.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,14 +16,16 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.carried_bytes import Carried, PacketSource, find_packets, plan_carried
 from wavebatch.files.cloud.column_names import Naming, WrittenColumn, describe, name_columns
+from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record, read_header
+from wavebatch.files.las.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record
 from wavebatch.files.las.point_formats import choose_format, copy_standard
+from wavebatch.files.strip.facts import StripFacts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputLayout:
-    """How one strip's output points look; picklable, so that workers can build rows with it."""
+    """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
 
     source: Path
     version: tuple[int, int]
@@ -29,34 +34,32 @@ class OutputLayout:
     scales: tuple[float, float, float]
     offsets: tuple[float, float, float]
     dtype: np.dtype
-    """One output record: the standard fields under laspy's names, then `extra_records` under theirs."""
+    """One output record: the standard fields with laspy's names, then the extra dimensions."""
     carried: tuple[Carried, ...]
     written: tuple[WrittenColumn, ...]
     whole: bool
-    """Whether every row keeps its input extra bytes (returns), or only matched ones (echoes)."""
+    """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
     packets: PacketSource | None
     dropped: Mapping[str, str]
-    """Extra bytes of the input that are not carried, and why."""
-    renamed: Mapping[str, str]
-    """Our columns whose name in the file differs from their name in COLUMNS."""
+    """Extra bytes of the input that are not copied, and why."""
 
     @property
     def max_return(self) -> int:
-        """Largest return number that the point format holds; larger ones are written as this."""
+        """Largest return number that the point format can hold; larger ones are written as this."""
         return 15 if self.point_format >= 6 else 7
 
     @property
     def extra_records(self) -> tuple[ExtraRecord, ...]:
-        """Records of all extra bytes of the output, in their order."""
+        """Records of all extra dimensions of the output, in order."""
         return (*(carried.record for carried in self.carried), *(column.record for column in self.written))
 
     @property
     def extra_fields(self) -> tuple[str, ...]:
-        """Names of the fields of `dtype` that hold the extra bytes, in their order."""
+        """Names of the fields of `dtype` with extra dimensions, in order."""
         return self.dtype.names[len(self.dtype.names) - len(self.carried) - len(self.written) :]
 
     def extended(self, columns: Sequence[str]) -> OutputLayout:
-        """The layout with columns that never leave the program behind: for rows that are still on their way."""
+        """Return the layout with temporary columns at the end, which a second pass needs and the cloud does not get."""
         more = []
         for name in columns:
             column = COLUMNS[name]
@@ -75,14 +78,31 @@ class OutputLayout:
         matched: np.ndarray | None = None,
         time: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Output records (m,) of `dtype`, one per input record of `source` (m,).
+        """Return output records, one per input record.
 
-        xyz: coordinates [m], f8 (m, 3); rows of NaN, or None for all, keep the input's integers exactly.
-        return_number, number_of_returns: (m,), None keeps the input's; values beyond `max_return` are cut to it.
-        columns: physical values (m,) by name in COLUMNS; what is not finite or not given becomes no-data.
-        matched: bool (m,), None for all; the input's extra bytes of other rows become their no-data (echoes only).
-        time: echo times [ns], (m,); with kept packets they become the return location of rows with a new position.
-        Raises InputError where a coordinate does not fit the file's scale and offset.
+        Parameters
+        ----------
+        source : structured array (m,)
+            Input records; never changed.
+        xyz : f8 (m, 3), m
+            New coordinates; NaN, or None for all rows, keeps the integers of the input exactly.
+        return_number, number_of_returns : integers (m,)
+            None keeps those of the input; values above `max_return` are written as `max_return`.
+        columns : mapping of str to array (m,)
+            Physical values by name in COLUMNS; missing columns and values that are not finite become no-data.
+        matched : bool (m,)
+            Rows that keep the input's extra bytes (in other rows they become no-data); None: all rows.
+        time : float (m,), ns
+            Echo times; with kept packets they become the return location of rows with a new position.
+
+        Returns
+        -------
+        structured array (m,) of `dtype`
+
+        Raises
+        ------
+        InputError
+            If a coordinate does not fit the scale and offset of the file.
         """
         columns = columns or {}
         rows = np.zeros(len(source), self.dtype)
@@ -92,8 +112,7 @@ class OutputLayout:
         self._set_returns(rows, return_number, number_of_returns)
         self._carry(rows, source, matched)
         if self.packets is not None:
-            times = columns.get("echo_time") if time is None else time
-            self._point_at_packets(rows, None if xyz is None else xyz[:, 0], times)
+            self._point_at_packets(rows, None if xyz is None else xyz[:, 0], time)
         for field, column in zip(self.extra_fields[len(self.carried) :], self.written, strict=True):
             values = columns.get(column.column)
             if values is None:
@@ -116,10 +135,7 @@ class OutputLayout:
                     f"integers at scale {self.scales[axis]:g} and offset {self.offsets[axis]:g}; rescale the strip "
                     "(las2las -rescale ... -reoffset ...) and run again"
                 )
-            if new.all():
-                rows[name] = counts.astype(np.int32)
-            else:
-                rows[name][new] = counts[new].astype(np.int32)
+            rows[name] = np.where(new, counts, rows[name])
 
     def _set_returns(self, rows: np.ndarray, number: np.ndarray | None, count: np.ndarray | None) -> None:
         bits = 4 if self.point_format >= 6 else 3
@@ -153,31 +169,44 @@ class OutputLayout:
 
 
 def plan_output(
-    path_or_facts: Any,
+    checked: CheckedHeader,
     columns: Sequence[str],
     *,
     point_format: int | None = None,
-    keep_packets: bool = False,
+    packets: StripFacts | None = None,
     names: str = "wavebatch",
     points: str = "echoes",
-    ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> OutputLayout:
-    """How the output of a strip looks; only the strip's header is read.
+    """Return the layout of the output of a strip.
 
-    path_or_facts: path of the strip, or the reader's StripFacts of it.
-    columns: names in COLUMNS, in the order in which they are written.
-    point_format: None keeps the input's family without waveforms (with them, under keep_packets).
-    points: "echoes" carries the input's extra bytes on matched rows only, "returns" on all of them.
-    ranges: true least and largest stored value of input extra bytes by name, where measured; see `choose_no_data`.
-    Raises InputError for a strip that cannot be written this way, ConfigError for wrong options.
+    Parameters
+    ----------
+    checked : CheckedHeader
+        Header of the strip, or of any LAS or LAZ file.
+    columns : sequence of str
+        Names in COLUMNS, in the order in which they are written.
+    point_format : int or None
+        None keeps the format of the input, without its waveform fields unless packets are kept.
+    packets : StripFacts or None
+        Facts of the strip, to keep its packets; None leaves them out.
+    names : str
+        Style of the column names, a key of STYLES.
+    points : {"echoes", "returns"}
+        Whether extra bytes of the input are kept in matched rows only, or in all rows.
+
+    Raises
+    ------
+    InputError
+        For a strip that cannot be written in this way.
+    ConfigError
+        For wrong options.
     """
     if points not in ("echoes", "returns"):
         raise ConfigError(f"points {points!r}: must be echoes or returns")
-    path = Path(getattr(path_or_facts, "path", path_or_facts))
-    header = read_header(path)
-    target = choose_format(path, header, point_format, keep_packets)
+    path, header = checked.path, checked.header
+    target = choose_format(path, header, point_format, packets is not None)
     _check_crs(path, header, target)
-    carried, dropped = plan_carried(path, header, points == "returns", ranges or {})
+    carried, dropped = plan_carried(checked, points == "returns")
     written = name_columns(columns, names, [entry.record.name for entry in carried])
     return OutputLayout(
         source=path,
@@ -190,9 +219,8 @@ def plan_output(
         carried=carried,
         written=tuple(written),
         whole=points == "returns",
-        packets=find_packets(path_or_facts, path, header) if keep_packets else None,
+        packets=None if packets is None else find_packets(packets),
         dropped=dropped,
-        renamed={entry.column: entry.record.name for entry in written if entry.record.name != entry.column},
     )
 
 
@@ -203,7 +231,7 @@ def _check_crs(path: Path, header: LasHeader, target: int) -> None:
     if not has_record([*header.vlrs, *evlrs], PROJECTION, WKT_ID):
         raise InputError(
             f"{path}: its CRS is given by GeoTIFF keys only, point format {target} needs WKT, and wavebatch does not "
-            "convert them; keep the point format's family, or add a WKT record to the strip first"
+            "convert them; leave --point-format out, or add a WKT record to the strip first"
         )
 
 

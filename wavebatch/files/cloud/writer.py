@@ -1,4 +1,8 @@
-"""Point clouds written whole or not at all, with their input's records and the account of how they were made."""
+"""Writer of output clouds: points, the records of the input, and an account of how the cloud was made.
+
+The batch opens one `CloudWriter` per strip. Equal input and options must give equal bytes: write no time of day, no
+path and nothing that depends on the number of processes into the file.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +17,13 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.layout import OutputLayout
-from wavebatch.files.disk.publish import Draft, publish_together, remove_stale, reporting
+from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
     GEOTIFF_ID,
     PROJECTION,
+    SOFTWARE,
     WAVEFORM_RECORD_ID,
     WAVES_EXTERNAL,
     WAVES_INTERNAL,
@@ -27,86 +32,54 @@ from wavebatch.files.las.header import (
     Evlr,
     LasHeader,
     Vlr,
+    decode_text,
     find_evlrs,
     has_record,
     read_header,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 
-__all__ = ["CloudWriter", "read_provenance", "remove_stale"]
-
 _USER_ID = "wavebatch"
 _DESCRIPTORS = range(100, 356)
 
 
-class CloudWriter:
-    """Writes one output file: `write` rows in order, then `commit` or `abort`; as a context manager it aborts itself.
+class CloudWriter(PointFile):
+    """Writes one output cloud: `write` rows in order, then `commit` or `abort`; a context manager aborts.
 
-    layout: from `plan_output`. target: its suffix says LAS or LAZ.
-    provenance: what made the cloud; goes as JSON into a VLR of user id "wavebatch", with the same bytes every time.
-    `dropped` lists the records of the input that are not carried over, and why.
-    Raises InputError where the target exists (without overwrite), is the input itself, or cannot be written.
+    layout: from `plan_output`. target: its suffix selects LAS or LAZ.
+    provenance: how the cloud was made; becomes JSON in a VLR of user id "wavebatch".
+    `dropped` lists the records of the input that are not copied, and why.
+    Raises InputError if the target exists (without overwrite), is the input itself, or cannot be written.
     """
 
     def __init__(
         self, layout: OutputLayout, target: Path, *, provenance: Mapping[str, Any], overwrite: bool = False
     ) -> None:
-        self.target = Path(target)
         self._layout = layout
-        self._refuse_input(self.target)
+        self._refuse_input(Path(target))
         source = read_header(layout.source)
         self._evlrs, self.dropped = _choose_evlrs(layout.source, source)
         header = _build_header(layout, source, provenance, self._evlrs)
-        self._file = PointFile(self.target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
-        self._overwrite = overwrite
-        self._open = True
+        super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
-    def __enter__(self) -> CloudWriter:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.abort()
-
-    def write(self, rows: np.ndarray) -> None:
-        """Appends output records as `OutputLayout.rows` makes them."""
-        self._file.write(rows)
-
-    def commit(self) -> None:
-        """Completes and publishes the file (and its .wdp, first); on an error nothing of it remains."""
-        drafts = [self._file.draft]
-        try:
-            self._file.finish_points()
-            with reporting(self._layout.source), open(self._layout.source, "rb") as source:
-                for evlr in self._evlrs:
-                    start = evlr.start + EVLR_HEADER_SIZE
-                    self._file.append_record(_read(source, evlr.start), source, start, start + evlr.length)
-            if self._layout.packets is not None:
-                self._write_packets(drafts)
-            self._file.finish()
-        except BaseException:
-            for draft in drafts:
-                draft.discard()
-            raise
-        publish_together(drafts)
-        self._open = False
-
-    def abort(self) -> None:
-        """Removes what was written so far; harmless after commit."""
-        if self._open:
-            self._file.abort()
-            self._open = False
-
-    def _write_packets(self, drafts: list[Draft]) -> None:
+    def _append_records(self) -> None:
+        with reporting(self._layout.source), open(self._layout.source, "rb") as source:
+            for evlr in self._evlrs:
+                start = evlr.start + EVLR_HEADER_SIZE
+                source.seek(evlr.start)
+                self.append_record(source.read(EVLR_HEADER_SIZE), source, start, start + evlr.length)
         packets = self._layout.packets
+        if packets is None:
+            return
         head = waveform_head(packets.end - packets.start)
         with reporting(self.target), open(packets.path, "rb") as source:
             if packets.internal:
-                self._file.append_record(head, source, packets.start, packets.end, waveforms=True)
+                self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
-            beside = self.target.with_suffix(".wdp")
-            self._refuse_input(beside)
-            draft = Draft(beside, overwrite=self._overwrite)
-            drafts.insert(0, draft)
+            packet_file = self.target.with_suffix(".wdp")
+            self._refuse_input(packet_file)
+            draft = Draft(packet_file, overwrite=self.draft.overwrite)
+            self.drafts.insert(0, draft)
             draft.file.write(head)
             copy_bytes(source, packets.start, packets.end, draft.file)
 
@@ -117,18 +90,8 @@ class CloudWriter:
                 raise InputError(f"{target}: is the input itself; choose another output folder")
 
 
-def read_provenance(path: Path) -> list[dict[str, Any]]:
-    """What the wavebatch VLRs of a file say, oldest first; empty where wavebatch did not make it."""
-    return [json.loads(vlr.payload) for vlr in read_header(Path(path)).vlrs if vlr.user == _USER_ID]
-
-
-def _read(source: Any, start: int) -> bytes:
-    source.seek(start)
-    return source.read(EVLR_HEADER_SIZE)
-
-
 def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, str]]:
-    """Extended records to copy, and what is left out, with the reason."""
+    """Extended records to copy, and the names of the others with the reason."""
     found, missing = find_evlrs(path, header)
     kept: list[Evlr] = []
     dropped: dict[str, str] = {}
@@ -174,7 +137,7 @@ def _build_header(
         global_encoding=encoding,
         project_id=source.project_id,
         system_identifier=b"MODIFICATION",
-        generating_software=f"wavebatch {__version__}".encode(),
+        generating_software=SOFTWARE,
         creation=source.creation,
         gps_offset=source.gps_offset,
     )
@@ -188,19 +151,16 @@ def _is_carried(vlr: Vlr, layout: OutputLayout) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """NumPy's numbers as numbers, anything else that JSON does not know (paths) as text."""
+    """NumPy numbers become numbers; other types that JSON does not have, such as paths, become text."""
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, Any], number: int) -> Vlr:
-    """JSON with sorted keys and no time of day; what the input's header said of its maker is kept in it."""
-    made_by = {
-        "system_identifier": source.system_identifier.split(b"\0")[0].decode("latin-1"),
-        "generating_software": source.generating_software.split(b"\0")[0].decode("latin-1"),
-    }
+    """JSON with sorted keys and no time of day; it also keeps which program wrote the input."""
+    made_by = {key: decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
     account = {"wavebatch": __version__, "input_header": made_by, **provenance}
     text = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
     payload = text.encode(errors="backslashreplace")
     if len(payload) > 65535:
-        raise ConfigError(f"{path}: the provenance of its output takes {len(payload)} bytes, a VLR holds 65535")
+        raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most 65535")
     return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")

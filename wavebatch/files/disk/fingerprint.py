@@ -1,4 +1,7 @@
-"""What tells one strip from another without reading all of it: size and a hash of samples of its content."""
+"""Fingerprint of a strip: size and hash of samples, to recognise it without reading all of it.
+
+Reports, system files and calibrations hold it. A change here makes runs with `--resume` start again.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ _PIECES = 128
 
 
 def take_fingerprint(path: Path, packet_file: Path | None = None) -> dict[str, Any]:
-    """Size and sampled SHA-256 of a strip, and of its packet file where that is another one.
+    """Return size and sampled SHA-256 of a strip, and of its packet file if that is another file.
 
-    The first and last MiB are read whole and 128 pieces between them; times and names of the files do not count.
+    The first and the last MiB and 128 pieces of 16 KiB between them are read; names and times of files do not count.
     """
     fingerprint = _sample(Path(path))
     if packet_file is not None and Path(packet_file) != Path(path):

@@ -1,4 +1,8 @@
-"""Columns of unknown length as one .npz: spooled to disk while they come, then written whole or not at all."""
+"""Columns of unknown length written as one .npz, in bounded memory, whole or not at all.
+
+Voxels and the truth of simulated strips are written with it. Equal values must give equal bytes, so members of the
+archive have a fixed date.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +22,10 @@ _PIECE = 1 << 18
 
 
 class NpzWriter:
-    """Takes columns piece by piece: `add`, then `publish`; memory does not grow with their length.
+    """Writes columns in pieces: `add` any number of times, then `publish`.
 
-    columns: type of every column; rows of one with a shape (k,) make an array (n, k). The same values give the same
-    bytes. Raises InputError where the target exists (without overwrite) or cannot be written.
+    columns: dtype of each column; one with a shape (k,) becomes an array (n, k).
+    Raises InputError if the target exists (without overwrite) or cannot be written.
     """
 
     def __init__(self, target: Path, columns: Mapping[str, np.dtype | str], *, overwrite: bool = False) -> None:
@@ -40,14 +44,14 @@ class NpzWriter:
             self._opened = stack.pop_all()
 
     def add(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Appends values to the columns named."""
+        """Append values to columns by name."""
         for name, values in columns.items():
             with reporting(self.target):
                 self._spools[name].write(np.ascontiguousarray(values, self._dtypes[name].base).tobytes())
             self._lengths[name] += len(values)
 
     def publish(self, single: Mapping[str, np.ndarray | str | float]) -> None:
-        """Writes the .npz, with further values that are no columns behind them, and gives it its name."""
+        """Write the .npz, with the values `single` after the columns, and give it its name."""
         with reporting(self.target), zipfile.ZipFile(self._draft.file, "w", allowZip64=True) as archive:
             for name, spool in self._spools.items():
                 dtype = self._dtypes[name]
@@ -64,15 +68,15 @@ class NpzWriter:
         self.discard()
 
     def withdraw(self) -> None:
-        """Takes the published file back."""
+        """Remove the published file again."""
         self._draft.withdraw()
 
     def discard(self) -> None:
-        """Closes and removes everything temporary; harmless after `publish`."""
-        with contextlib.suppress(OSError):  # a full disk has been told when it was written to
+        """Close and remove all temporary files; may be called after `publish`."""
+        with contextlib.suppress(OSError):  # a full disk was reported when it was written to
             self._opened.close()
 
 
 def _open_member(archive: zipfile.ZipFile, name: str) -> IO[bytes]:
-    """A member with a fixed date."""
+    """New member with a fixed date."""
     return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)

@@ -1,4 +1,8 @@
-"""Output files that appear whole or not at all: written under a temporary name in the same folder, then published."""
+"""Output files that appear whole or not at all: written under a temporary name in the same folder, then renamed.
+
+All outputs of wavebatch are written through `Draft`. A killed run leaves only temporary files, which the next run
+removes; a lock shows which of them are still in use.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from wavebatch.core.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # not on Windows: stale files then stay until somebody removes them
+except ImportError:  # Windows has no fcntl: left-over files then stay until the user removes them
     fcntl = None
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
@@ -25,7 +29,7 @@ _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.E
 
 @contextlib.contextmanager
 def reporting(target: Path) -> Iterator[None]:
-    """Turns an operating system's error while `target` is written into one InputError line."""
+    """Turn an error of the operating system while `target` is written into one InputError line."""
     try:
         yield
     except OSError as error:
@@ -45,10 +49,10 @@ def _remedy(error: OSError) -> str:
 
 
 class Draft:
-    """A file being written: `file` is open under a temporary name, for reading too, and locked while its process lives.
+    """A file that is being written: `file` is open under a temporary name, also for reading, and locked.
 
-    target: the name it will have. overwrite: whether publishing replaces a file of that name.
-    Raises InputError where the folder cannot be written, or the name is that of a device or a pipe.
+    target: its final name. overwrite: whether publishing replaces an existing file.
+    Raises InputError if the folder cannot be written, or the name is that of a device or a pipe.
     """
 
     def __init__(self, target: Path, *, overwrite: bool) -> None:
@@ -62,14 +66,14 @@ class Draft:
         self.published = False
 
     def publish(self, *, same_is_fine: bool = False) -> None:
-        """Gives the finished file its name, at once; without overwrite an existing file is never replaced.
+        """Give the finished file its final name in one step; without overwrite an existing file is never replaced.
 
-        same_is_fine: an existing target with the very same bytes counts as published (what a killed run left).
+        same_is_fine: an existing file with the same bytes counts as published, because a killed run may have left it.
         """
         with reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
-            if fcntl is None:  # Windows names no open file anew
+            if fcntl is None:  # Windows cannot rename an open file
                 self.file.close()
             try:
                 if self.overwrite:
@@ -85,23 +89,23 @@ class Draft:
         self.discard()
 
     def discard(self) -> None:
-        """Closes and removes the temporary file; harmless when it is gone already."""
+        """Close and remove the temporary file; does nothing if it is gone already."""
         with contextlib.suppress(OSError):
             self.file.close()
         with contextlib.suppress(OSError):
             os.unlink(self.path)
 
     def withdraw(self) -> None:
-        """Takes a published file back, for when one that belongs to it could not be published."""
+        """Remove the published file again, because a file that belongs to it could not be published."""
         if self.published and not self.overwrite:
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
 
 
 def is_stream(target: Path) -> bool:
-    """Whether the name is that of a device, a pipe or a socket, which no file may replace: root could do it."""
+    """Whether the name is that of a device, pipe or socket; root could replace it with a file by mistake."""
     folder = Path(os.path.realpath(Path(target).parent))
-    if folder.as_posix() in ("/dev", "/dev/fd") or folder.is_relative_to("/proc"):  # links to files there, too
+    if folder.as_posix() in ("/dev", "/dev/fd") or folder.is_relative_to("/proc"):  # links to files there too
         return True
     try:
         mode = os.lstat(target).st_mode
@@ -111,7 +115,7 @@ def is_stream(target: Path) -> bool:
 
 
 def open_stream(target: Path) -> BinaryIO:
-    """A device or a pipe for writing; a pipe that nobody reads is an OSError, not waited for."""
+    """Open a device or a pipe for writing; raises OSError for a pipe without a reader instead of waiting."""
     descriptor = os.open(target, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
     if hasattr(os, "set_blocking"):
         os.set_blocking(descriptor, True)
@@ -119,15 +123,15 @@ def open_stream(target: Path) -> BinaryIO:
 
 
 def refuse_existing(target: Path) -> None:
-    """Raises InputError where something of that name exists; publishing checks again."""
+    """Raise InputError if something of that name exists; publishing checks again."""
     if os.path.lexists(target):
         raise InputError(_exists(target))
 
 
 def publish_together(drafts: Sequence[Draft]) -> None:
-    """Publishes drafts in order; the last one is the file whose presence says that all are there.
+    """Publish drafts in order; if the last one exists, all are complete.
 
-    A failure takes the earlier ones back, except those that replaced an older file.
+    On an error the earlier ones are removed again, except those that replaced an older file.
     """
     done: list[Draft] = []
     try:
@@ -143,9 +147,9 @@ def publish_together(drafts: Sequence[Draft]) -> None:
 
 
 def remove_stale(folder: Path) -> list[Path]:
-    """Removes the temporary files of dead processes from `folder` and returns their names.
+    """Remove the temporary files of ended processes from `folder` and return their names.
 
-    A file whose lock somebody holds is being written and stays. On systems without file locks nothing is removed.
+    A locked file is still being written and stays. On systems without file locks nothing is removed.
     """
     removed: list[Path] = []
     if fcntl is None:
@@ -163,7 +167,7 @@ def remove_stale(folder: Path) -> list[Path]:
 
 
 def _no_file(target: Path) -> str:
-    return f"{target}: is a device or a pipe, and this output must be a file of its own; name another"
+    return f"{target}: is a device or a pipe, but this output must be a regular file; choose another name"
 
 
 def _exists(target: Path) -> str:
@@ -173,7 +177,7 @@ def _exists(target: Path) -> str:
 
 
 def _create(folder: Path) -> tuple[Path, int]:
-    """A new locked file; tries again where `remove_stale` of another process took it before it was locked."""
+    """A new locked file; tries again if `remove_stale` of another process removed it before it was locked."""
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
     while True:
         path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
@@ -193,19 +197,19 @@ def _create(folder: Path) -> tuple[Path, int]:
 
 
 def _link(path: Path, target: Path) -> None:
-    """Names the file `target` too, or raises FileExistsError; never replaces, even when two processes race."""
+    """Gives the file the second name `target`, or raises FileExistsError; safe if two processes do it at once."""
     try:
         os.link(path, target)
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        # No hard links here: an empty file of that name, made by one process only, keeps the place.
+        # No hard links here: only one process can create this empty file, so it reserves the name.
         os.close(os.open(target, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         os.replace(path, target)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes the new name survive a power cut; folders cannot be opened on Windows, nor synced everywhere."""
+    """Makes the new name survive a power cut; Windows cannot open folders, some file systems cannot sync them."""
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,8 @@
-"""Bytes of a file by their place, and one line for whatever can go wrong while points are read."""
+"""Bytes read at a place of a file, and the errors of damaged files, each as one clear line.
+
+All readers of LAS files, packets and temporary files use this module. Input may be hostile: read no byte without a
+check that it is there.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +19,19 @@ from wavebatch.core.errors import InputError
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """The file open for reading; InputError for a folder, a device, or a pipe, which would block for ever."""
+    """Open a file for reading; raises InputError for a folder, a device or a pipe, which could block for ever."""
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise InputError(f"{path}: cannot be read: it is a folder, a pipe or a device; give a file")
     return open(path, "rb")
 
 
+def damaged(path: Path, what: str) -> InputError:
+    """Return the error for a file whose bytes contradict each other."""
+    return InputError(f"{path}: {what}; the file is damaged or cut: get it again")
+
+
 def read_exactly(fd: int, target: np.ndarray, at: int) -> None:
-    """Fills the bytes `target` (u1, contiguous) from byte `at` of the file; InputError where it ends before."""
+    """Fill the bytes `target` (u1, contiguous) from byte `at` of the file; raises InputError if it ends before."""
     view = memoryview(target)
     while view:
         got = os.preadv(fd, [view[: 1 << 30]], at) if hasattr(os, "preadv") else _seek_read(fd, view, at)
@@ -32,7 +41,7 @@ def read_exactly(fd: int, target: np.ndarray, at: int) -> None:
 
 
 def _seek_read(fd: int, view: memoryview, at: int) -> int:
-    """preadv for systems that have none (Windows)."""
+    """Does what preadv does, for Windows, which has no preadv."""
     os.lseek(fd, at, os.SEEK_SET)
     data = os.read(fd, min(len(view), 1 << 24))
     view[: len(data)] = data
@@ -40,20 +49,23 @@ def _seek_read(fd: int, view: memoryview, at: int) -> int:
 
 
 def take_records(records: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """records[rows] of a structured array, as plain bytes: NumPy copies records field by field, six times slower."""
+    """Return records[rows] of a structured array, copied as plain bytes.
+
+    NumPy copies structured records field by field, which takes six times as long.
+    """
     plain = np.ascontiguousarray(records).view(f"V{records.dtype.itemsize}")
     return plain[rows].view(records.dtype)
 
 
 def widen(values: np.ndarray) -> np.ndarray:
-    """Floating-point values as f8; signalling NaN, which a damaged file may hold, is NaN and no warning."""
+    """Return floating-point values as f8; a signalling NaN of a damaged file becomes a plain NaN without a warning."""
     with np.errstate(invalid="ignore"):
-        return values.astype(np.float64) * 1.0  # a copy alone keeps signalling NaN of 8 bytes
+        return values.astype(np.float64) * 1.0  # a copy alone would keep a signalling NaN of 8 bytes
 
 
 @contextlib.contextmanager
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
-    """Turns whatever a decoder or the disk says into one line with the points that were wanted."""
+    """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
     try:
         yield
     except InputError as error:
@@ -63,13 +75,13 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{path}: points {start} to {stop} cannot be read: {error.strerror or error}") from error
     except Exception as error:
-        raise _damaged(path, start, stop, error) from error
+        raise _undecodable(path, start, stop, error) from error
     except BaseException as error:
-        if type(error).__name__ != "PanicException":  # what lazrs raises where Rust code gives up
+        if type(error).__name__ != "PanicException":  # lazrs raises this when its Rust code panics
             raise
-        raise _damaged(path, start, stop, error) from error
+        raise _undecodable(path, start, stop, error) from error
 
 
-def _damaged(path: Path, start: int, stop: int, error: BaseException) -> InputError:
+def _undecodable(path: Path, start: int, stop: int, error: BaseException) -> InputError:
     what = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return InputError(f"{path}: points {start} to {stop} cannot be decompressed ({what}); damaged: get the file again")
+    return damaged(path, f"points {start} to {stop} cannot be decompressed ({what})")

@@ -1,4 +1,8 @@
-"""Rows of a cloud on their way, or what is found out about them, in a temporary file beside the cloud."""
+"""Rows of a cloud that wait for the second pass, in a temporary file next to the cloud.
+
+`batch/neighbour_pass.py` uses it. The file lies next to the output because that disk has room for the cloud; the
+folder for temporary files may be small.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +15,13 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import Draft, reporting
 
 PIECE = 1 << 16
-"""Rows that are read at a time."""
+"""Rows read at a time."""
 
 
 class RowStore:
-    """Rows of `dtype` in one temporary file, read again in their order; nobody else's `remove_stale` takes it.
+    """Rows of `dtype` in one temporary file, which is locked so that no other run removes it as left over.
 
-    target: the file that they are for, beside which they lie. Raises InputError where the folder cannot be written.
+    target: the output that the rows are for. Raises InputError if its folder cannot be written.
     """
 
     def __init__(self, target: Path, dtype: np.dtype) -> None:
@@ -29,20 +33,20 @@ class RowStore:
         return self.count
 
     def add(self, rows: np.ndarray) -> None:
-        """Appends rows (m,) of `dtype`."""
+        """Append rows (m,) of `dtype`."""
         with reporting(self._draft.target):
             self._draft.file.write(np.ascontiguousarray(rows).view(np.uint8).data if len(rows) else b"")
-            self._draft.file.flush()  # a worker forked now must not inherit bytes that it would write once more
+            self._draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
         self.count += len(rows)
 
     def extend(self, count: int) -> None:
-        """Makes it `count` rows long; new ones are zeros."""
+        """Set the length to `count` rows; new rows are zeros."""
         with reporting(self._draft.target):
             self._draft.file.truncate(count * self.dtype.itemsize)
         self.count = count
 
     def put(self, index: np.ndarray, rows: np.ndarray) -> None:
-        """Puts rows (m,) at places `index` (m,), ascending; the others stay."""
+        """Write rows (m,) at the ascending places `index` (m,)."""
         if not len(rows):
             return
         size = self.dtype.itemsize
@@ -55,15 +59,15 @@ class RowStore:
                 self._draft.file.write(content[start * size : end * size])
 
     def pieces(self, size: int = PIECE) -> Iterator[np.ndarray]:
-        """All rows, at most `size` at a time; they may be changed."""
+        """Yield all rows, at most `size` at a time; the arrays are writable."""
         with reporting(self._draft.target):
             for start in range(0, self.count, size):
                 rows = np.empty(min(size, self.count - start), self.dtype)
                 self._draft.file.seek(start * self.dtype.itemsize)
                 if self._draft.file.readinto(rows.view(np.uint8)) != rows.nbytes:
-                    raise InputError(f"{self._draft.target}: its temporary file was cut by somebody else; run it again")
+                    raise InputError(f"{self._draft.target}: its temporary file was cut by another program; run again")
                 yield rows
 
     def close(self) -> None:
-        """Removes the file; harmless twice."""
+        """Remove the file; may be called twice."""
         self._draft.discard()

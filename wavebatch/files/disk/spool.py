@@ -1,4 +1,8 @@
-"""Entries sorted into numbered buckets: in memory while they are few, on disk beyond that."""
+"""Entries sorted into numbered buckets: few of them stay in memory, many go to a temporary file.
+
+The strip scan, the second pass and `Buckets` use it. A sealed spool is pickled and read by other processes; only the
+process that made it removes the file.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +16,16 @@ from wavebatch.files.disk.raw_bytes import read_exactly
 from wavebatch.files.disk.temp_folders import make_folder, reporting_scratch
 
 MEMORY = 1 << 24
-"""Bytes of entries that are held before they go to disk."""
+"""Bytes of entries in memory before they are written to disk."""
 KEPT = 1 << 20
-"""Bytes of entries that stay in memory after all: a sealed spool travels to other processes."""
+"""Bytes of entries that a sealed spool keeps in memory: it is pickled for other processes."""
 
 
 class Spool:
-    """Takes entries of one dtype for buckets 0..n-1; after `seal` it is read-only and can be pickled.
+    """Entries of one dtype in buckets 0..n-1: `append`, then `seal`, then `read`; sealed it can be pickled.
 
-    What does not fit memory lies in one temporary file as segments, each sorted by bucket and led by a table of where
-    its buckets begin. `close` removes the file; copies in other processes only read it.
+    The temporary file holds segments, each sorted by bucket, after a table of where its buckets begin. `close` removes
+    the file; copies in other processes only read it.
     """
 
     def __init__(self, buckets: int, dtype: np.dtype) -> None:
@@ -33,14 +37,15 @@ class Spool:
         self._held = 0
         self._segments: list[int] = []
         self._memory: tuple[np.ndarray, np.ndarray] | None = None
+        self._sealed = False
 
     @property
     def path(self) -> Path | None:
-        """The temporary file, or None while everything fits memory."""
+        """The temporary file; None while all entries are in memory."""
         return None if self.folder is None else self.folder / "spool"
 
     def append(self, bucket: np.ndarray, entries: np.ndarray) -> None:
-        """Adds entries (k,) to buckets (k,)."""
+        """Add entries (k,) to buckets (k,)."""
         if not len(entries):
             return
         self._pending.append((bucket.astype(np.int64), entries))
@@ -50,7 +55,10 @@ class Spool:
             self._flush()
 
     def seal(self) -> Spool:
-        """Ends the writing."""
+        """End the writing; may be called twice."""
+        if self._sealed:
+            return self
+        self._sealed = True
         if self._segments or self._held > KEPT:
             self._flush()
         else:
@@ -58,14 +66,14 @@ class Spool:
         return self
 
     def read(self, bucket: int) -> np.ndarray:
-        """Entries of a bucket in the order in which they were added."""
+        """Return the entries of a bucket in the order in which they were added."""
         parts = list(self.pieces(bucket))
         if not parts:
             return np.empty(0, self.dtype)
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def pieces(self, bucket: int) -> Iterator[np.ndarray]:
-        """The same entries part by part, each as large as a segment held."""
+        """Yield the same entries in parts, one per segment."""
         if self._memory is not None:
             starts, entries = self._memory
             if starts[bucket + 1] > starts[bucket]:
@@ -82,7 +90,7 @@ class Spool:
                     yield part
 
     def close(self) -> None:
-        """Removes the temporary file; harmless twice."""
+        """Remove the temporary file; may be called twice."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
         self._pending, self._memory = [], None

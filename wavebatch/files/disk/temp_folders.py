@@ -1,5 +1,8 @@
-"""Folders for temporary files that go with the process they belong to: at its end, or, if it was killed, at the start
-of the next one."""
+"""Folders for temporary files that are removed when their process ends, or by the next run if it was killed.
+
+Everything that does not fit into memory goes through here. A folder is in use as long as its lock is held; nothing
+else shows whether a process of another run is still alive.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ from wavebatch.core.errors import InputError
 
 try:
     import fcntl
-except ImportError:  # not on Windows: folders of killed processes then stay until somebody removes them
+except ImportError:  # Windows has no fcntl: folders of killed processes then stay until the user removes them
     fcntl = None
 
 _LOCK = "lock"
@@ -27,9 +30,9 @@ _own: list[_Owned] = []
 
 
 def make_folder() -> Path:
-    """A new folder for temporary files, in the place that `use_scratch` says, or in one of this process's own.
+    """Return a new folder for temporary files, in the folder of `use_scratch` or in one of this process.
 
-    Raises OSError where there is no room for it.
+    Raises OSError if there is no room for it.
     """
     place = _place.get()
     if place is None:
@@ -41,34 +44,34 @@ def make_folder() -> Path:
 
 
 def scratch_place() -> Path:
-    """Where `make_folder` works, for messages."""
+    """Return the folder in which `make_folder` makes folders, for messages."""
     return _place.get() or Path(tempfile.gettempdir())
 
 
 @contextlib.contextmanager
 def reporting_scratch() -> Iterator[None]:
-    """Turns an operating system's error with a temporary file into one InputError line."""
+    """Turn an error of the operating system with a temporary file into one InputError line."""
     try:
         yield
     except OSError as error:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{scratch_place()}: the temporary file for what does not fit memory cannot be used "
-            f"({error.strerror or error}); free space there or set TMPDIR to another folder"
+            f"{scratch_place()}: no temporary file can be used there ({error.strerror or error}); free space or set "
+            "TMPDIR to another folder"
         ) from error
 
 
 def use_scratch(folder: Path | None) -> None:
-    """Lets `make_folder` of this thread work in a folder that another process owns."""
+    """Let `make_folder` of this thread work in a folder of another process."""
     _place.set(folder)
 
 
 @contextlib.contextmanager
 def owning_scratch(parent: Path | None = None) -> Iterator[Path | None]:
-    """A folder in `parent`, usually TMPDIR, that is gone at the end; this thread's `make_folder` works in it meanwhile.
+    """Make a folder in `parent` (default: TMPDIR) for `make_folder` of this thread, and remove it at the end.
 
-    In a parent of the user's own the name is hidden. None where it cannot be made: who needs it will say so.
+    In a folder of the user its name is hidden. Gives None if it cannot be made: whoever needs it reports the error.
     """
     try:
         owned = _Owned(Path(parent or tempfile.gettempdir()), "." if parent else "")
@@ -84,10 +87,10 @@ def owning_scratch(parent: Path | None = None) -> Iterator[Path | None]:
 
 
 def remove_orphans(parent: Path) -> list[Path]:
-    """Removes the folders of killed processes from `parent` and returns their names.
+    """Remove the folders of killed processes from `parent` and return their names.
 
-    Only this user's and this machine's: a folder whose lock somebody holds is in use and stays, and of a process on
-    another machine nobody can tell whether it lives. On systems without file locks nothing is removed.
+    Only folders of this user and this machine: a locked folder is in use, and whether a process of another machine is
+    alive cannot be known. On systems without file locks nothing is removed.
     """
     removed: list[Path] = []
     if fcntl is None:
@@ -106,7 +109,7 @@ def remove_orphans(parent: Path) -> list[Path]:
 
 
 class _Owned:
-    """A new folder with a lock that this process holds as long as it lives."""
+    """A new folder with a lock that this process holds until it ends."""
 
     def __init__(self, parent: Path, hidden: str) -> None:
         remove_orphans(parent)
@@ -117,7 +120,7 @@ class _Owned:
                 return
             try:
                 self._lock = _take_lock(self.folder)
-            except (BlockingIOError, FileNotFoundError):  # another process took it for an orphan
+            except (BlockingIOError, FileNotFoundError):  # another process removed it as left over
                 continue
             except OSError:  # a file system without locks
                 return
@@ -126,7 +129,7 @@ class _Owned:
             os.close(self._lock)
 
     def close(self) -> None:
-        """Removes the folder with all that is in it; harmless twice."""
+        """Remove the folder with its content; may be called twice."""
         shutil.rmtree(self.folder, ignore_errors=True)
         if self._lock is not None:
             os.close(self._lock)
@@ -134,7 +137,7 @@ class _Owned:
 
 
 def _take_lock(folder: Path) -> int:
-    """Descriptor of the folder's lock, held; BlockingIOError where another process holds it."""
+    """Takes the lock of the folder and returns its descriptor; BlockingIOError if another process holds it."""
     descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -145,7 +148,7 @@ def _take_lock(folder: Path) -> int:
 
 
 def _prefix() -> str:
-    """What the names of this machine's folders begin with."""
+    """Start of the names of this machine's folders."""
     return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', socket.gethostname())}-"
 
 

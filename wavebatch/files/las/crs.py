@@ -1,6 +1,7 @@
-"""Coordinate reference systems as far as units go: what WKT and GeoTIFF keys say a coordinate of 1 is.
+"""Units of coordinates, from the WKT and the GeoTIFF keys of a strip.
 
-Bytes of these records may be anything: what cannot be read counts as not said.
+`find_facts` reads them once; the survey refuses strips that are not in metres. The records may hold any bytes: what
+cannot be read counts as missing, and nothing here raises an error for it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from wavebatch.files.strip.packets import MAX_EVLRS
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 _MAX_RECORD = 1 << 20
+"""Longest record that is read: the WKT of real files has a few kilobytes."""
 _MAX_DEPTH = 64
+"""Deepest nesting of WKT keywords; real ones have fewer than ten levels."""
 
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)|([-+]?[0-9.][-+0-9.eE]*)|([\[(])|([\])])|,|\s+')
 
@@ -30,34 +33,34 @@ METRES = {
     9014: 1.8288, 9015: 1853.248, 9030: 1852.0, 9036: 1000.0, 9037: 0.9143917963, 9060: 0.30479951024814694,
     9093: 1609.344, 9096: 0.9144,
 }  # fmt: skip
-"""Metres per unit by EPSG code of the unit."""
+"""Metres per unit by EPSG code of the unit (GeoTIFF specification 6.3.1.3)."""
 
 _NAMES = {1.0: "metres", 0.3048: "international feet", 1200 / 3937: "US survey feet"}
 
 
 @dataclass(frozen=True, slots=True)
 class CrsUnits:
-    """What a CRS says of its coordinates; None where it says nothing."""
+    """Kind and units of the coordinates of a CRS; None for what it does not give."""
 
     kind: str | None = None
     """`projected`, `geographic`, `geocentric` or None."""
     horizontal: float | None = None
-    """Metres per unit; NaN where it is a unit that nobody knows."""
+    """Metres per unit; NaN for an unknown unit."""
     vertical: float | None = None
-    """The same of heights; None: as horizontally."""
+    """Metres per unit of heights; None: as horizontal."""
 
     @property
     def is_metric(self) -> bool:
-        """Whether all coordinates are metres, or nothing else is said, on a plane with heights above it."""
+        """Whether coordinates are projected and in metres, as far as the CRS gives this."""
         metric = all(value is None or abs(value - 1.0) < 1e-9 for value in (self.horizontal, self.vertical))
         return metric and self.kind in (None, "projected")
 
     def describe(self) -> str:
-        """The units in words."""
+        """Return the units in words."""
         if self.kind == "geographic":
             return "degrees"
         if self.kind == "geocentric":
-            return "geocentric (ECEF), where heights are no coordinate"
+            return "geocentric (ECEF) without a height coordinate"
         along, up = (_name_unit(value) for value in (self.horizontal, self.vertical))
         return along if self.vertical is None or up == along else f"{along} with heights in {up}"
 
@@ -68,11 +71,11 @@ def _name_unit(metres: float | None) -> str:
     for known, name in _NAMES.items():
         if abs(metres / known - 1.0) < 1e-7:
             return name
-    return f"units of {metres:.10g} m" if math.isfinite(metres) else "a unit that is not known"
+    return f"units of {metres:.10g} m" if math.isfinite(metres) else "an unknown unit"
 
 
 def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits, ...]]:
-    """The WKT of a strip, else the names its GeoTIFF keys give, else None; and the units that each of the two says."""
+    """Return the WKT of a strip, else the name in its GeoTIFF keys, else None, and the units that each gives."""
     records = _read_records(path, header)
     units, text = [], None
     if WKT_ID in records:
@@ -86,7 +89,7 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
 
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
-    """Payloads of the projection's records by number, those of the header before those behind the points."""
+    """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
     evlrs, _ = find_evlrs(path, replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS)))
     for evlr in evlrs:
@@ -99,10 +102,10 @@ def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
 
 
 def parse_geotiff(directory: bytes, doubles: bytes = b"", texts: bytes = b"") -> CrsUnits:
-    """What a GeoKeyDirectory (34735) says; doubles, texts: the records 34736 and 34737 that it points into.
+    """Return the units of a GeoKeyDirectory (34735); `doubles` and `texts` are the records 34736 and 34737.
 
-    A citation that speaks of feet counts where no key names the unit: a code of a projected CRS implies one that only
-    the EPSG's tables know.
+    If no key gives the unit, a citation that names feet does: the EPSG code of a projected CRS implies a unit, but
+    only the EPSG tables know it.
     """
     keys = dict(_read_keys(directory))
     kind = _MODELS.get(keys.get(_MODEL, (0, 0))[1])
@@ -113,7 +116,7 @@ def parse_geotiff(directory: bytes, doubles: bytes = b"", texts: bytes = b"") ->
 
 
 def _read_keys(directory: bytes) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Key -> (record it lies in, value or offset there); the number of keys is that of the bytes, if that is less."""
+    """Pairs of key and (record, value or offset in it), as many as claimed, but no more than the bytes hold."""
     if len(directory) < 8:
         return
     count = min(struct.unpack_from("<4H", directory)[3], len(directory) // 8 - 1)
@@ -127,7 +130,7 @@ def _read_unit(keys: Mapping[int, tuple[int, int]], key: int, doubles: bytes) ->
         return None
     code = keys[key][1]
     if code != _USER_DEFINED:
-        # Leica's ALSPP writes the code of the CRS here.
+        # Leica's ALSPP writes the EPSG code of the CRS here, which is not a unit.
         return METRES.get(code, math.nan) if code in _UNIT_CODES else None
     place, at = keys.get(_LINEAR_SIZE, (0, 0)) if key == _LINEAR else (0, 0)
     if place != DOUBLES_ID or 8 * at + 8 > len(doubles):
@@ -162,7 +165,7 @@ _BOUND = {"BOUNDCRS": "SOURCECRS"}
 
 
 def parse_wkt(text: str) -> CrsUnits:
-    """What the WKT (1 or 2) of a CRS says."""
+    """Return kind and units of the WKT (version 1 or 2) of a CRS."""
     root = _parse_nodes(text)
     if root is None:
         return CrsUnits()
@@ -183,13 +186,13 @@ def parse_wkt(text: str) -> CrsUnits:
 
 
 def _unwrap(node: _Node) -> _Node:
-    """The CRS in a bound one, or the node itself."""
+    """The source CRS of a bound CRS, or the node itself."""
     source = node.find(_BOUND[node.word]) if node.word in _BOUND else None
     return source.children[0] if source is not None and source.children else node
 
 
 def _find_unit(node: _Node, *, last: bool = False) -> float | None:
-    """Metres per unit of a CRS: its own unit, else that of its first axis; last: of its third axis only."""
+    """Metres per unit of a CRS: its unit, else that of its first axis; last: only that of its third axis."""
     axes = [axis.find("LENGTHUNIT", "UNIT") for axis in node.children if axis.word == "AXIS"]
     unit = (axes[2] if len(axes) > 2 else None) if last else node.find("LENGTHUNIT", "UNIT") or next(iter(axes), None)
     if unit is None:
@@ -204,7 +207,7 @@ def _find_unit(node: _Node, *, last: bool = False) -> float | None:
 
 
 def _parse_nodes(text: str) -> _Node | None:
-    """The outermost keyword of WKT with all that is in it; None where the text is not WKT."""
+    """The outermost keyword of WKT with its content; None if the text is not WKT."""
     top = _Node("")
     stack, at = [top], 0
     while at < len(text):

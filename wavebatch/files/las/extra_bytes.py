@@ -1,4 +1,8 @@
-"""Extra bytes: the 192-byte records that describe them, and what the values of a record can be."""
+"""Extra bytes: the 192-byte records that describe them, and the dtype of points with extra bytes.
+
+All readers and writers of points use this module. A record keeps its bytes as they are in the file; an unknown or
+wrong description must never make a file unreadable, so its bytes become a column of unknown content.
+"""
 
 from __future__ import annotations
 
@@ -19,21 +23,15 @@ _AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_OFFSET, _AT_DESCRIPTION = 40, 64, 
 
 @dataclass(frozen=True, slots=True)
 class ExtraRecord:
-    """One described extra dimension; `data` are the 192 bytes as they stand in the file."""
+    """One described extra dimension; `data` are the 192 bytes of its record in the file."""
 
     data: bytes
 
     @classmethod
     def build(
-        cls,
-        name: str,
-        dtype: str,
-        description: str,
-        *,
-        no_data: float | None = None,
-        scale: float | None = None,
+        cls, name: str, dtype: str, description: str, *, no_data: float | None = None, scale: float | None = None
     ) -> ExtraRecord:
-        """A record for one new dimension; no_data is the stored value, name and description fit 32 bytes."""
+        """Return a record for a new dimension; `no_data` is a stored value; name and description take 32 bytes each."""
         texts = name.encode("utf-8"), description.encode("utf-8")
         if any(len(text) > 32 for text in texts):
             raise ValueError(f"extra bytes {name!r}: name and description hold 32 bytes at most")
@@ -46,27 +44,27 @@ class ExtraRecord:
 
     @classmethod
     def undocumented(cls, name: str, size: int) -> ExtraRecord:
-        """A record of type 0 over `size` (1 to 255) bytes of which nothing is known."""
+        """Return a record of type 0 for `size` (1 to 255) bytes of unknown content."""
         return cls(struct.pack("<HBB32s", 0, 0, size, name.encode()) + bytes(RECORD_SIZE - 36))
 
     @property
     def name(self) -> str:
-        """The name up to its first NUL."""
+        """The name up to the first NUL."""
         return self.data[4:36].split(b"\0")[0].decode("utf-8", "replace")
 
     @property
     def description(self) -> str:
-        """The description up to its first NUL."""
+        """The description up to the first NUL."""
         return self.data[_AT_DESCRIPTION:].split(b"\0")[0].decode("utf-8", "replace")
 
     @property
     def code(self) -> int:
-        """Data type of the LAS specification: 0 undocumented, 1-10 scalars, 11-30 the deprecated vectors."""
+        """Data type of the LAS specification: 0 undocumented, 1 to 10 scalars, 11 to 30 the deprecated vectors."""
         return self.data[2]
 
     @property
     def is_known(self) -> bool:
-        """Whether the size of the dimension can be told."""
+        """Whether the size of the dimension is known."""
         return self.code <= 30 and self.dtype.itemsize > 0
 
     @property
@@ -79,7 +77,7 @@ class ExtraRecord:
 
     @property
     def _container(self) -> np.dtype:
-        """Type of the 8-byte numbers in which no-data, least and largest value are declared."""
+        """Type of the 8-byte numbers that hold the no-data, least and largest value."""
         return np.dtype(f"<{self.dtype.base.kind}8")
 
     def _numbers(self, at: int, option: int) -> np.ndarray | None:
@@ -92,7 +90,7 @@ class ExtraRecord:
 
     @property
     def scaling(self) -> tuple[float, float] | None:
-        """Scale and offset of a scalar's stored value, or None where it is the value itself."""
+        """Scale and offset of a scalar's stored value; None if the stored value is not scaled."""
         if not self.data[3] & _SCALE or not 1 <= self.code <= 10:
             return None
         (scale,) = struct.unpack_from("<d", self.data, _AT_SCALE)
@@ -101,12 +99,12 @@ class ExtraRecord:
 
     @property
     def no_data(self) -> np.ndarray | None:
-        """Stored value per element that means "none", or None where the record declares none."""
+        """Stored value per element that means "no data"; None if the record declares none."""
         return self._numbers(_AT_NO_DATA, _NO_DATA)
 
     @property
     def declared_range(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Least and largest stored value per element as declared; what files declare is often not true."""
+        """Declared least and largest stored value per element; in many files they are wrong."""
         least, largest = self._numbers(_AT_MIN, _MIN), self._numbers(_AT_MAX, _MAX)
         return None if least is None or largest is None else (least, largest)
 
@@ -121,20 +119,20 @@ class ExtraRecord:
         return ExtraRecord(bytes(data))
 
     def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:
-        """The record with this stored no-data value per element."""
+        """Return the record with this stored no-data value per element."""
         return self._with(_AT_NO_DATA, _NO_DATA, numbers)
 
     def with_range(self, least: np.ndarray | None, largest: np.ndarray | None) -> ExtraRecord:
-        """The record with these stored extremes; None takes the declaration away. Type 0 has none."""
+        """Return the record with these stored extremes; None removes the declaration. Type 0 has none."""
         if self.code == 0:
             return self
         return self._with(_AT_MIN, _MIN, least)._with(_AT_MAX, _MAX, largest)
 
 
 def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
-    """Records of all `size` extra bytes of a point; bytes that `payload` does not describe get records of type 0.
+    """Return records for all `size` extra bytes of a point; bytes that `payload` does not describe get type 0.
 
-    A record whose type nobody knows, or that reaches beyond the extra bytes, ends the description.
+    A record of unknown type, or one that needs more bytes than there are, ends the description.
     """
     records: list[ExtraRecord] = []
     left = size
@@ -156,9 +154,9 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
 
 
 def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
-    """One point record: the standard fields as laspy names them, then the extra dimensions.
+    """Return the dtype of a point record: the standard fields with laspy's names, then the extra dimensions.
 
-    A field has its record's name; where that is empty or taken, " 2", " 3" ... follows.
+    A field has the name of its record; an empty or repeated name gets " 2", " 3" ... at its end.
     """
     standard = STANDARD_DTYPES[point_format]
     fields = {name: standard[name] for name in standard.names}
@@ -171,13 +169,13 @@ def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
     return np.dtype(list(fields.items()))
 
 
-def choose_no_data(record: ExtraRecord, extremes: tuple[float, float] | None = None) -> np.ndarray | None:
-    """A stored value per element that no real value has, or None where none is safe.
+def choose_no_data(record: ExtraRecord) -> np.ndarray | None:
+    """Return a stored value per element that no real value has, or None if none is safe.
 
-    A declared value stays. Floating-point numbers take NaN. Integers take the value half way between the largest and
-    the least one, counted round the end of the type, so that a value that has wrapped round does not meet it either:
-    extremes are the true least and largest; without them those that the record declares, unless they are equal (then
-    nobody ever filled them in). Undocumented bytes have none.
+    A declared no-data value stays. Floating-point numbers use NaN. Integers use the middle of the unused range between
+    the declared largest and least value, counted across the end of the type: this is farthest from all values, also
+    from one that overflowed. Equal declared values do not count, because then no writer filled them in. Undocumented
+    bytes have no safe value.
     """
     if record.no_data is not None or record.code == 0:
         return record.no_data
@@ -185,13 +183,10 @@ def choose_no_data(record: ExtraRecord, extremes: tuple[float, float] | None = N
     length = max(1, record.dtype.itemsize // base.itemsize)
     if base.kind == "f":
         return np.full(length, np.nan, base)
-    if extremes is not None:
-        ranges = [(int(extremes[0]), int(extremes[1]))] * length
-    elif record.declared_range is not None:
-        ranges = [(int(least), int(largest)) for least, largest in zip(*record.declared_range, strict=True)]
-        if any(least >= largest for least, largest in ranges):
-            return None
-    else:
+    if record.declared_range is None:
+        return None
+    ranges = [(int(least), int(largest)) for least, largest in zip(*record.declared_range, strict=True)]
+    if any(least >= largest for least, largest in ranges):
         return None
     count = 1 << (8 * base.itemsize)
     gaps = [count - (largest - least) for least, largest in ranges]

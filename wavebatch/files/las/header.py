@@ -1,43 +1,56 @@
-"""LAS headers, VLRs and EVLRs as the bytes they are: what is not understood is carried over unchanged."""
+"""LAS headers, VLRs and EVLRs: read, checked for size, and written again byte for byte.
+
+All readers and writers of LAS and LAZ files start here. Fields that wavebatch does not use are kept unchanged, so a
+header that is read and encoded again must give the same bytes. Limits stand before anything is read into memory.
+"""
 
 from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
 from laspy import PointFormat
 
+from wavebatch import __version__
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.raw_bytes import open_regular
+from wavebatch.files.disk.raw_bytes import damaged, open_regular
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}
 """Bytes of the header by LAS version."""
+SOFTWARE = f"wavebatch {__version__}".encode()
+"""Generating software in the headers of all outputs."""
+MAX_FRONT = 1 << 26
+"""Most bytes of header and VLRs, because they are held in memory."""
+MAX_VLRS = 1 << 16
+"""Most VLRs: each costs time and memory even when it is empty."""
+MAX_FILE = 1 << 54
+"""Byte offsets below this fit into 64 bits together with the index of a descriptor."""
 
 WAVES_INTERNAL = 0b10
 WAVES_EXTERNAL = 0b100
 WKT_BIT = 0b1_0000
 
 STANDARD_DTYPES = {number: PointFormat(number).dtype() for number in range(11)}
-"""Record of every point format without extra bytes; fields are named as in laspy's raw arrays."""
+"""Record of every point format without extra bytes; fields have the names of laspy's raw arrays."""
 
 EVLR_HEADER_SIZE = 60
 WAVEFORM_RECORD_ID = 65535
 PROJECTION = "LASF_Projection"
-"""User of the records that hold the CRS."""
+"""User id of the records that hold the CRS."""
 WKT_ID, GEOTIFF_ID = 2112, 34735
 _VLR = struct.Struct("<H16sHH32s")
 _EVLR = struct.Struct("<H16sHQ32s")
 _FRONT = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I12d")
-"""All that the headers of every version begin with, 227 bytes."""
+"""The first 227 bytes, which are the same in all versions."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vlr:
-    """One variable length record; user id and description are the raw bytes, NUL-padded."""
+    """A variable length record; user id and description are the raw bytes, padded with NUL."""
 
     user_id: bytes
     record_id: int
@@ -47,18 +60,18 @@ class Vlr:
 
     @property
     def user(self) -> str:
-        """The user id up to its first NUL; bytes that are not ASCII show as Latin-1."""
-        return self.user_id.split(b"\0")[0].decode("latin-1")
+        """The user id up to its first NUL."""
+        return decode_text(self.user_id)
 
     def encode(self) -> bytes:
-        """The record as it stands in a file."""
+        """Return the bytes of the record in a file."""
         front = (self.reserved, self.user_id, self.record_id, len(self.payload), self.description)
         return _VLR.pack(*front) + self.payload
 
 
 @dataclass(frozen=True, slots=True)
 class Evlr:
-    """Where an extended record lies: `start` is the offset of its 60-byte header, `length` that of its payload."""
+    """Place of an extended record: `start` is the offset of its 60-byte header, `length` the size of its payload."""
 
     start: int
     length: int
@@ -68,7 +81,7 @@ class Evlr:
 
 @dataclass(slots=True)
 class LasHeader:
-    """Every field of a LAS header; `vlrs` hold no "laszip encoded" record unless read from a LAZ file."""
+    """Every field of a LAS header; `vlrs` has a "laszip encoded" record only if it was read from a LAZ file."""
 
     version: tuple[int, int]
     point_format: int
@@ -80,7 +93,7 @@ class LasHeader:
     padding: bytes = b""
     """Bytes between the last VLR and the first point."""
     user_bytes: bytes = b""
-    """Bytes between the header proper and the first VLR."""
+    """Bytes between the standard header and the first VLR."""
     offset_to_points: int = 0
     file_source_id: int = 0
     global_encoding: int = 0
@@ -90,6 +103,10 @@ class LasHeader:
     creation: tuple[int, int] = (0, 0)
     """Day of the year and year."""
     point_count: int = 0
+    counts: tuple[int, int] = (0, 0)
+    """Points by the 32-bit and the 64-bit field of the file that was read; `point_count` is the one to use."""
+    file_size: int = 0
+    """Bytes of the file that was read; 0 for a new header."""
     by_return: tuple[int, ...] = (0,) * 15
     maxs: tuple[float, float, float] = (0.0, 0.0, 0.0)
     mins: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -97,16 +114,44 @@ class LasHeader:
     evlr_start: int = 0
     evlr_count: int = 0
     gps_range: tuple[float, float] = (0.0, 0.0)
-    """Largest and smallest gps time; LAS 1.5 only."""
+    """Largest and smallest GPS time; LAS 1.5 only."""
     gps_offset: int = 0
+
+    @classmethod
+    def new(
+        cls,
+        version: tuple[int, int],
+        point_format: int,
+        scales: Sequence[float],
+        offsets: Sequence[float],
+        wkt: str | None = None,
+        encoding: int = 0,
+    ) -> LasHeader:
+        """Return the header of a new file, without any date so that equal input gives equal bytes.
+
+        encoding: bits of the global encoding besides GPS time and WKT.
+        """
+        is_wkt = point_format >= 6 or (wkt and version >= (1, 4))
+        return cls(
+            version,
+            point_format,
+            0,
+            tuple(map(float, scales)),
+            tuple(map(float, offsets)),
+            vlrs=[build_wkt(wkt)] if wkt else [],
+            global_encoding=1 | encoding | (WKT_BIT if is_wkt else 0),
+            system_identifier=b"OTHER",
+            generating_software=SOFTWARE,
+            creation=(1, 2025),
+        )
 
     @property
     def size(self) -> int:
-        """Bytes before the first VLR."""
+        """Number of bytes before the first VLR."""
         return HEADER_SIZES[self.version] + len(self.user_bytes)
 
     def encode(self) -> bytes:
-        """Header, VLRs and padding as they stand in front of the points; also sets `offset_to_points`."""
+        """Return header, VLRs and padding, all bytes before the points; also sets `offset_to_points`."""
         vlrs = b"".join(vlr.encode() for vlr in self.vlrs)
         self.offset_to_points = self.size + len(vlrs) + len(self.padding)
         legacy = self.version < (1, 4) or (self.point_format < 6 and self.point_count < 2**32)
@@ -131,46 +176,48 @@ class LasHeader:
         return tail
 
 
-def read_header(path: Path) -> LasHeader:
-    """Header and VLRs of the LAS or LAZ file at `path`; the points are not looked at.
+def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
+    """Return header and VLRs of a LAS or LAZ file; the points are not read.
 
-    Raises InputError where the bytes are not those of a LAS file of version 1.0 to 1.5.
+    Raises InputError if it is not a LAS file of version `least` to 1.5, or if its header is too large or contradicts
+    itself.
     """
     try:
         with open_regular(path) as file:
-            return _read_header(file, path)
+            return read_header_of(file, path, least)
+    except InputError:
+        raise
     except OSError as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; check name and permissions") from error
 
 
-def read_header_of(file: BinaryIO) -> LasHeader:
-    """Header and VLRs of an open LAS or LAZ file."""
+def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
+    """Return header and VLRs of an open LAS or LAZ file; `path` is its name in messages."""
     file.seek(0)
-    return _read_header(file, Path(str(file.name)))
-
-
-def _read_header(file: BinaryIO, path: Path) -> LasHeader:
     front = file.read(_FRONT.size)
     if len(front) < _FRONT.size or front[:4] != b"LASF":
         raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF)")
     (_, source_id, encoding, project, major, minor, system, software, day, year, size, offset, n_vlrs,
      point_format, length, count, *rest) = _FRONT.unpack(front)  # fmt: skip
     standard = HEADER_SIZES.get((major, minor))
-    if standard is None:
-        raise InputError(f"{path}: LAS version {major}.{minor} is not known; versions 1.0 to 1.5 can be read")
+    if standard is None or (major, minor) < least:
+        what = "has no waveforms" if standard else "is not known"
+        versions = f"{least[0]}.{least[1]} to 1.5"
+        raise InputError(f"{path}: LAS version {major}.{minor} {what}; wavebatch needs versions {versions} here")
     file_size = os.fstat(file.fileno()).st_size
+    if file_size >= MAX_FILE:
+        raise InputError(f"{path}: a file of {file_size} bytes is too large for wavebatch; cut it into tiles")
     if not standard <= size <= offset <= file_size:
-        raise InputError(
-            f"{path}: a header of {size} bytes with points at byte {offset} of {file_size} contradicts itself; damaged"
-        )
+        raise damaged(path, f"header of {size} bytes, but points at byte {offset} of {file_size}")
+    if offset > MAX_FRONT or n_vlrs > MAX_VLRS:
+        raise damaged(path, f"header with {n_vlrs} VLRs in {offset} bytes (at most {MAX_VLRS} in {MAX_FRONT})")
     by_return, numbers = rest[:5], rest[5:]
     header = LasHeader(
         (major, minor), point_format & 0x3F, length, tuple(numbers[0:3]), tuple(numbers[3:6]),
         compressed=bool(point_format & 0xC0), offset_to_points=offset, file_source_id=source_id,
         global_encoding=encoding, project_id=project, system_identifier=system, generating_software=software,
-        creation=(day, year), point_count=count, by_return=(*by_return, *(0,) * 10),
+        creation=(day, year), point_count=count, counts=(count, 0), file_size=file_size,
+        by_return=(*by_return, *(0,) * 10),
         maxs=tuple(numbers[6::2]), mins=tuple(numbers[7::2]),
     )  # fmt: skip
     _read_tail(header, file.read(standard - _FRONT.size))
@@ -185,6 +232,7 @@ def _read_tail(header: LasHeader, tail: bytes) -> None:
         (header.waveform_start,) = struct.unpack_from("<Q", tail)
     if header.version >= (1, 4):
         header.evlr_start, header.evlr_count, count, *by_return = struct.unpack_from("<QIQ15Q", tail, 8)
+        header.counts = header.point_count, count
         if count:
             header.point_count, header.by_return = count, tuple(by_return)
     if header.version >= (1, 5):
@@ -195,14 +243,12 @@ def _read_tail(header: LasHeader, tail: bytes) -> None:
 def _read_vlrs(data: bytes, count: int, path: Path) -> Iterator[Vlr]:
     at = 0
     for number in range(count):
-        if at + _VLR.size > len(data):
-            raise InputError(f"{path}: VLR {number} of {count} runs into the points; the header is damaged")
-        reserved, user_id, record_id, length, description = _VLR.unpack_from(data, at)
-        at += _VLR.size
-        if at + length > len(data):
-            raise InputError(f"{path}: VLR {number} of {count} runs into the points; the header is damaged")
-        yield Vlr(user_id, record_id, data[at : at + length], description, reserved)
-        at += length
+        head = data[at : at + _VLR.size].ljust(_VLR.size, b"\0")
+        reserved, user_id, record_id, length, description = _VLR.unpack(head)
+        at += _VLR.size + length
+        if at > len(data):
+            raise damaged(path, f"VLR {number} of {count} runs into the points")
+        yield Vlr(user_id, record_id, data[at - length : at], description, reserved)
 
 
 def _read_padding(file: BinaryIO, header: LasHeader) -> bytes:
@@ -212,9 +258,9 @@ def _read_padding(file: BinaryIO, header: LasHeader) -> bytes:
 
 
 def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
-    """The EVLRs of a LAS 1.4 or 1.5 file that lie wholly inside it, in file order, and how many more the header claims.
+    """Return the EVLRs that lie wholly inside a file, in file order, and how many more the header claims.
 
-    Payloads are not read. The walk ends at the first record that runs over the end of the file.
+    Payloads are not read. The search ends at the first record that runs over the end of the file.
     """
     found: list[Evlr] = []
     points_end = header.offset_to_points
@@ -230,26 +276,31 @@ def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
             _, user_id, record_id, length, _ = _EVLR.unpack(file.read(EVLR_HEADER_SIZE))
             if start + EVLR_HEADER_SIZE + length > size:
                 break
-            found.append(Evlr(start, length, user_id.split(b"\0")[0].decode("latin-1"), record_id))
+            found.append(Evlr(start, length, decode_text(user_id), record_id))
             start += EVLR_HEADER_SIZE + length
     return found, header.evlr_count - len(found)
 
 
+def decode_text(data: bytes) -> str:
+    """Return a text field up to its first NUL; bytes that are not ASCII show as Latin-1."""
+    return data.split(b"\0")[0].decode("latin-1")
+
+
 def encode_evlr_header(user_id: bytes, record_id: int, length: int, description: bytes) -> bytes:
-    """The 60 bytes in front of an extended record, which are also the first of a `.wdp` file."""
+    """Return the 60 bytes before the payload of an extended record; a `.wdp` file begins with them too."""
     return _EVLR.pack(0, user_id, record_id, length, description)
 
 
 def is_projection(vlr: Vlr | Evlr) -> bool:
-    """Whether it is a record of the CRS, however its user id is written."""
+    """Whether it is a record of the CRS; upper and lower case of its user id do not matter."""
     return vlr.user.lower() == PROJECTION.lower()
 
 
 def build_wkt(wkt: str) -> Vlr:
-    """The record that holds the WKT of a CRS."""
+    """Return the record that holds the WKT of a CRS."""
     return Vlr(PROJECTION.encode(), WKT_ID, wkt.encode() + b"\0", b"OGC coordinate system WKT")
 
 
 def has_record(vlrs: Iterable[Vlr | Evlr], user: str, record_id: int) -> bool:
-    """Whether one of the records has this user id (any case) and number."""
+    """Whether one of the records has this user id (in any case) and number."""
     return any(vlr.record_id == record_id and vlr.user.lower() == user.lower() for vlr in vlrs)

@@ -1,6 +1,7 @@
-"""Decompresses points with LASzip in a process of its own: LASzip trusts its input, and a damaged file can crash it.
+"""Script that decompresses points with LASzip in a separate process, because a damaged file can crash LASzip.
 
-Run as a script: file, first point, point after the last, bytes per point. Raw records go to stdout.
+`laszip_decode.py` starts it with: file, first point, point after the last, bytes per point. Raw records go to stdout.
+It imports nothing of wavebatch, so that it starts fast.
 """
 
 import contextlib
@@ -12,7 +13,7 @@ _FAILED = 3
 
 
 def main(path: str, start: int, stop: int, length: int) -> None:
-    """Writes the records [start, stop) of `path`; exits with an error line on stderr where LASzip reports one."""
+    """Write the records [start, stop) of `path` to stdout; exit with a line on stderr if LASzip reports an error."""
     import laszip
 
     _limit_memory()
@@ -28,7 +29,7 @@ def main(path: str, start: int, stop: int, length: int) -> None:
                 sys.stdout.buffer.write(view)
                 start += len(view) // length
         sys.stdout.buffer.flush()
-    except BrokenPipeError:  # the reader has what it wants
+    except BrokenPipeError:  # the reader needs no more points
         sys.stdout = None
     except (OSError, RuntimeError, ValueError, MemoryError, laszip.LaszipError) as error:
         sys.stderr.write(str(error) or type(error).__name__)
@@ -36,7 +37,7 @@ def main(path: str, start: int, stop: int, length: int) -> None:
 
 
 def _limit_memory() -> None:
-    """A damaged file can claim any size."""
+    """Limits memory, because a damaged file can claim any size."""
     with contextlib.suppress(ImportError, ValueError, OSError):
         import resource
 

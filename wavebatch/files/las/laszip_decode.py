@@ -1,4 +1,8 @@
-"""Points that only LASzip can decompress (the coding of LAS 1.5), through a process that may crash without harm."""
+"""Points that only LASzip can decompress (the coding of LAS 1.5), read through a child process.
+
+`laz_decode.open_laz` calls it. LASzip trusts its input and a damaged file can crash it: only the child process then
+ends, and the run gets an error. Never import laszip for reading in the main process.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +20,18 @@ from wavebatch.files.disk.raw_bytes import guarded
 from wavebatch.files.las.checked_header import CheckedHeader
 
 PATIENCE = 60.0
-"""Seconds without a single byte after which the process is given up."""
+"""Seconds without any byte after which the child process is stopped: damaged files can make LASzip loop for ever."""
 _CHILD = Path(__file__).with_name("laszip_child.py")
 
 
 class LaszipPoints:
-    """Reads on in one process while the wanted points follow each other; any other point starts a new one."""
+    """Reads points in order from one child process; a jump to another place starts a new process."""
 
     def __init__(self, checked: CheckedHeader) -> None:
         if importlib.util.find_spec("laszip") is None:
             raise InputError(
-                f"{checked.path}: coded by LAZ items of version 4 (LAS 1.5), which lazrs cannot read; pip install "
-                "laszip, or decompress it first: laszip -i IN.laz -o OUT.las"
+                f"{checked.path}: compressed with the coding of LAS 1.5, which lazrs cannot read; pip install laszip, "
+                "or decompress it first: laszip -i IN.laz -o OUT.las"
             )
         self._checked = checked
         self._next, self._late = -1, False
@@ -35,7 +39,7 @@ class LaszipPoints:
         self._talk = tempfile.TemporaryFile()  # noqa: SIM115 - closed by close()
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Records [start, stop)."""
+        """Return records [start, stop)."""
         rows = np.empty(stop - start, self._checked.dtype)
         with guarded(self._checked.path, start, stop):
             if start != self._next and len(rows):
@@ -71,10 +75,10 @@ class LaszipPoints:
     def _explain(self) -> str:
         status = self._child.wait()
         if self._late:
-            return "LASzip does not come to an end; the file is damaged: get it again"
+            return f"LASzip gave no data for {PATIENCE:g} s; the file is damaged: get it again"
         self._talk.seek(0)
-        said = " ".join(self._talk.read(500).decode("utf-8", "replace").split())
-        reason = f"crashed (signal {-status})" if status < 0 else f"says: {said or 'nothing'}"
+        text = " ".join(self._talk.read(500).decode("utf-8", "replace").split())
+        reason = f"crashed (signal {-status})" if status < 0 else f"failed: {text or 'no message'}"
         return f"LASzip {reason}; the file is damaged: get it again"
 
     def _stop(self) -> None:
@@ -85,6 +89,6 @@ class LaszipPoints:
             self._child, self._next = None, -1
 
     def close(self) -> None:
-        """Ends the process; harmless twice."""
+        """End the child process; may be called twice."""
         self._stop()
         self._talk.close()

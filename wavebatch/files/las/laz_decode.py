@@ -1,4 +1,8 @@
-"""Points of LAZ files, chunk by chunk: what the compression's records claim is checked before a decoder sees it."""
+"""Points of LAZ files, chunk by chunk; all sizes are checked before the decoder gets any bytes.
+
+`read_points.open_points` calls it. lazrs and LASzip trust their input: a wrong size can make them crash, hang or
+allocate without limit, so each chunk is checked and passed on as a small file in memory.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +14,19 @@ import lazrs
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.raw_bytes import guarded, read_exactly
+from wavebatch.files.disk.raw_bytes import damaged, guarded, read_exactly
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import LasHeader, has_record
 from wavebatch.files.las.laszip_decode import LaszipPoints
 
 LASZIP_USER, LASZIP_ID = "laszip encoded", 22204
 MAX_CHUNKS = 2_000_000
+"""Most chunks of a file: 10^11 points in chunks of 50,000, the usual size."""
 MAX_CHUNK_POINTS = 5_000_000
 MAX_CHUNK_BYTES = 1 << 28
+"""Largest chunk: it is held in memory, compressed and decompressed."""
 MAX_POINTS_PER_BYTE = 1000
+"""More points per byte of file than any compression reaches; real files have fewer than one."""
 _PIECE = 50_000
 _LASZIP = struct.Struct("<HHBBHIIqqH")
 _ITEM = struct.Struct("<HHH")
@@ -30,22 +37,25 @@ _FORMAT_ITEMS = {
     6: (10,), 7: (10, 11), 8: (10, 12), 9: (10, 13), 10: (10, 12, 13),
 }  # fmt: skip
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers per item of the layered coding; extra bytes have one per byte."""
+"""Layers per item of the layered coding (point formats 6 to 10); extra bytes have one layer per byte."""
 _BYTES = {0, 14}
+"""Items of extra bytes."""
 
 
 def open_laz(checked: CheckedHeader) -> LazPoints | LaszipPoints:
-    """A reader of the points: lazrs, or the optional laszip backend where lazrs does not know the coding.
+    """Return a reader of the points: lazrs, or the optional laszip for codings that lazrs does not know.
 
-    Raises InputError where the compression's own records are damaged or nobody here can decode them.
+    Raises InputError if the records of the compression are damaged or no installed library can decode them.
     """
     coding = _read_coding(checked.path, checked.header)
-    _check_total(checked)
+    total = checked.header.point_count
+    if total > checked.size * MAX_POINTS_PER_BYTE:  # a scan of points that cannot be there would never end
+        raise damaged(checked.path, f"the header claims {total} points in {checked.size} bytes")
     return LaszipPoints(checked) if coding.newest > 3 else LazPoints(checked, coding)
 
 
 class _Coding:
-    """What the "laszip encoded" record says, checked."""
+    """The checked content of the "laszip encoded" record."""
 
     def __init__(self, payload: bytes, chunk_points: int, items: list[tuple[int, int, int]]) -> None:
         self.payload = payload
@@ -59,31 +69,31 @@ class _Coding:
 
 def _read_coding(path: Path, header: LasHeader) -> _Coding:
     payload = next((vlr.payload for vlr in header.vlrs if has_record([vlr], LASZIP_USER, LASZIP_ID)), b"")
-    damaged = InputError(f"{path}: its \"laszip encoded\" record is missing or damaged; get the file again")
+    broken = damaged(path, 'its "laszip encoded" record is missing or wrong')
     if len(payload) < _LASZIP.size:
-        raise damaged
+        raise broken
     compressor, coder, *_, chunk_points, _, _, n_items = _LASZIP.unpack_from(payload)
     if len(payload) < _LASZIP.size + n_items * _ITEM.size or not n_items:
-        raise damaged
-    items = [_ITEM.unpack_from(payload, _LASZIP.size + number * _ITEM.size) for number in range(n_items)]
+        raise broken
+    payload = payload[: _LASZIP.size + n_items * _ITEM.size]
+    items = list(_ITEM.iter_unpack(payload[_LASZIP.size :]))
     kinds = tuple(kind for kind, _, _ in items if kind not in _BYTES)
     good = all(size == _ITEM_SIZES[kind] if kind in _ITEM_SIZES else kind in _BYTES for kind, size, _ in items)
     length = sum(size for _, size, _ in items)
     if not good or kinds != _FORMAT_ITEMS[header.point_format] or length != header.point_length or coder != 0:
-        raise damaged
+        raise broken
     if [kind for kind, _, _ in items if kind in _BYTES] not in ([], [14 if header.point_format > 5 else 0]):
-        raise damaged
+        raise broken
+    remedy = "run laszip -i IN.laz -o OUT.las first"
     if compressor != (3 if header.point_format > 5 else 2) or not 0 < chunk_points <= _VARIABLE:
-        raise InputError(f"{path}: compressed in a way that is not chunked; run laszip -i IN.laz -o OUT.las first")
+        raise InputError(f"{path}: compressed without chunks; {remedy}")
     if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
-        raise InputError(
-            f"{path}: LAZ chunks of {chunk_points} points do not fit memory; run laszip -i IN.laz -o OUT.las first"
-        )
-    return _Coding(payload[: _LASZIP.size + n_items * _ITEM.size], chunk_points, items)
+        raise InputError(f"{path}: LAZ chunks of {chunk_points} points do not fit into memory; {remedy}")
+    return _Coding(payload, chunk_points, items)
 
 
 class LazPoints:
-    """One LAZ chunk at a time is in memory; points before the wanted ones are decoded and dropped."""
+    """Reads with lazrs, one chunk in memory at a time; points of a chunk before the wanted ones are decoded too."""
 
     def __init__(self, checked: CheckedHeader, coding: _Coding) -> None:
         self._checked, self._coding = checked, coding
@@ -118,7 +128,7 @@ class LazPoints:
         self._next += len(rows)
 
     def _open_chunk(self, chunk: int) -> None:
-        """Hands lazrs this chunk as a small file of its own, so that it can believe nothing beyond it."""
+        """Passes this chunk to lazrs as a small file in memory, so that lazrs cannot read beyond it."""
         start, end = int(self._place[chunk]), int(self._place[chunk + 1])
         data = np.empty(end - start + 8, np.uint8)
         data[:8] = np.frombuffer(struct.pack("<q", len(data)), np.uint8)
@@ -141,10 +151,7 @@ class LazPoints:
         if len(sizes) == 4 * self._coding.layers:
             total += int(sizes.view("<u4").sum(dtype=np.uint64))
         if total > len(chunk):
-            raise InputError(
-                f"{self._checked.path}: a LAZ chunk holds {len(chunk)} bytes and claims {total}; the file is damaged: "
-                "get it again"
-            )
+            raise damaged(self._checked.path, f"a LAZ chunk of {len(chunk)} bytes claims {total} bytes")
 
     def close(self) -> None:
         self._file.close()
@@ -152,24 +159,19 @@ class LazPoints:
 
 
 def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple[np.ndarray, np.ndarray]:
-    """First point and first byte of every chunk, i8, each with one more entry for the end."""
+    """First point and first byte of every chunk, i8, both with one more entry for the end."""
     start, total = checked.header.offset_to_points, checked.header.point_count
     if not total:
         return np.zeros(1, np.int64), np.zeros(1, np.int64)
-    broken = InputError(
-        f"{checked.path}: the table of LAZ chunks is missing or damaged; the file is cut, or was never closed: get it "
-        "again"
-    )
+    broken = damaged(checked.path, "the table of LAZ chunks is missing or wrong")
     if start + 8 > checked.size:
         raise broken
-    table = _read_i8(fd, start)
-    if table == -1:  # written as a stream: the table's place stands at the very end
-        table = _read_i8(fd, checked.size - 8)
+    table = _read_number(fd, start, "<i8")
+    if table == -1:  # written as a stream: the last 8 bytes hold the place of the table
+        table = _read_number(fd, checked.size - 8, "<i8")
     if not start + 8 <= table <= checked.size - 8:
         raise broken
-    head = np.empty(8, np.uint8)
-    read_exactly(fd, head, table)
-    version, count = head.view("<u4").tolist()
+    version, count = _read_number(fd, table, "<u4"), _read_number(fd, table + 4, "<u4")
     if version != 0 or not 0 < count <= min(MAX_CHUNKS, table - start - 8):
         raise broken
     with open(checked.path, "rb") as file, guarded(checked.path, 0, total):
@@ -184,7 +186,7 @@ def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple
     if counts.min() < 0 or counts.max() > MAX_CHUNK_POINTS or counts.sum() != total or sizes.max() > MAX_CHUNK_BYTES:
         raise InputError(
             f"{checked.path}: {count} LAZ chunks hold {counts.clip(0).sum()} points, the header claims {total}; the "
-            "file is damaged, or its chunks are too large: run laszip -i IN.laz -o OUT.las, which says more"
+            "file is damaged or its chunks are too large: see what laszip -i IN.laz -o OUT.las reports"
         )
     first = np.concatenate([[0], np.cumsum(counts)])
     place = start + 8 + np.concatenate([[0], np.cumsum(sizes)])
@@ -193,16 +195,7 @@ def _read_chunk_table(fd: int, checked: CheckedHeader, coding: _Coding) -> tuple
     return first, place
 
 
-def _check_total(checked: CheckedHeader) -> None:
-    """Refuses counts that no compression could hold: they would make a scan of nothing last for ever."""
-    total = checked.header.point_count
-    if total > checked.size * MAX_POINTS_PER_BYTE:
-        raise InputError(
-            f"{checked.path}: the header claims {total} points in {checked.size} bytes; damaged: get the file again"
-        )
-
-
-def _read_i8(fd: int, at: int) -> int:
-    data = np.empty(8, np.uint8)
-    read_exactly(fd, data, at)
-    return int(data.view("<i8")[0])
+def _read_number(fd: int, at: int, dtype: str) -> int:
+    data = np.empty(1, dtype)
+    read_exactly(fd, data.view(np.uint8), at)
+    return int(data[0])

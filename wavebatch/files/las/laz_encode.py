@@ -1,10 +1,15 @@
-"""Point records into a file: as they are, or compressed by lazrs or LASzip, whichever writes the format rightly."""
+"""Point records written to a file: plain, or compressed by lazrs or LASzip, whichever writes the format correctly.
+
+`write_points.PointFile` calls it. lazrs and LASzip each have a defect with waveform formats 9 and 10 (see the two
+classes); test changes by reading the output with both libraries.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import lazrs
@@ -15,7 +20,7 @@ from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader,
 
 try:
     import laszip
-except ImportError:  # optional: only waveform formats 9 and 10 with several scanner channels need it
+except ImportError:  # optional: only formats 9 and 10 with several scanner channels need it
     laszip = None
 
 _ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError] if laszip else []))
@@ -26,7 +31,7 @@ _ITEMS_AT = 34
 
 
 class PointEncoder(Protocol):
-    """Takes records and leaves them in the file; `finish` ends the points and must be called once."""
+    """Writes records to the file; `finish` ends the points and must be called once."""
 
     def write(self, rows: np.ndarray) -> None: ...
 
@@ -34,9 +39,9 @@ class PointEncoder(Protocol):
 
 
 def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
-    """Writes header and VLRs at the start of `file` and returns what takes the points behind them.
+    """Write header and VLRs at the start of `file` and return the encoder for the points after them.
 
-    The "laszip encoded" record of a compressed file is added to `header.vlrs`.
+    For a compressed file the "laszip encoded" record is added to `header.vlrs`.
     """
     if not header.compressed:
         return _PlainEncoder(file, header)
@@ -46,7 +51,7 @@ def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
 
 
 class _WatchedFile:
-    """What the compressors write to: keeps the reason of a failure, of which they only tell that there was one."""
+    """File for the compressors that keeps the first OSError: they report only that a write failed, not why."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -90,7 +95,7 @@ class _PlainEncoder:
 
 
 class _LazrsEncoder:
-    """lazrs 0.8 garbles the packet fields of formats 9 and 10 as soon as the scanner channel changes: refused here."""
+    """lazrs 0.8 writes wrong packet fields in formats 9 and 10 after a change of scanner channel; refused here."""
 
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
         extra = header.point_length - STANDARD_DTYPES[header.point_format].itemsize
@@ -125,7 +130,7 @@ class _LazrsEncoder:
 
 
 class _LaszipEncoder:
-    """LASzip 3.5 codes LAS 1.5 in a way that lazrs cannot read: it is shown a header of LAS 1.4 of the same size."""
+    """LASzip 3.5 writes LAS 1.5 in a coding that lazrs cannot read, so it gets a LAS 1.4 header of the same size."""
 
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
         version = min(header.version, (1, 4))
@@ -144,15 +149,15 @@ class _LaszipEncoder:
         with self._watched.explaining():
             self._zipper.done()
         self._file.flush()
-        written = read_header_of(self._file)
+        written = read_header_of(self._file, Path(str(self._file.name)))
         self._header.vlrs.append(written.vlrs[-1])
         self._header.encode()
         if self._header.offset_to_points != written.offset_to_points:
-            raise InputError("LASzip did not keep the header's records; write LAS, or leave --keep-packets out")
+            raise InputError("LASzip changed the records of the header; write LAS, or leave --keep-packets out")
 
 
 def _patch_wave_item(payload: bytes) -> bytes:
-    """The record with item WAVEPACKET13 called version 1: LASzip refuses lazrs' version 2, which is coded the same."""
+    """Sets the version of item WAVEPACKET13 to 1: LASzip refuses version 2 of lazrs, which has the same coding."""
     patched = bytearray(payload)
     for at in range(_ITEMS_AT, len(payload) - 5, 6):
         kind, _, version = np.frombuffer(payload, "<u2", 3, at)

@@ -1,4 +1,7 @@
-"""Standard fields from one point format to another: which ways lose nothing, and how the fields change."""
+"""Conversion of the standard fields between point formats: which conversions lose nothing, and how fields change.
+
+The output layout of a cloud uses it. A conversion is allowed only if it loses nothing except the waveform fields.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +9,36 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError
 from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader
 
 WITHOUT_WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
-"""Point format of the same family without the waveform fields."""
+"""For each waveform format the format with the same fields except the waveform fields."""
 _WAVE_FIELDS = frozenset(STANDARD_DTYPES[4].names) - frozenset(STANDARD_DTYPES[1].names)
-_ANGLE_UNIT = 0.006
+ANGLE_UNIT = 0.006
 """Degrees per count of `scan_angle` in formats 6-10; `scan_angle_rank` of formats 0-5 counts whole degrees."""
 _OVERLAP_CLASS = 12
 
 
 def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool) -> int:
-    """The point format of the output: its own family, or the `wanted` one if that loses nothing but waveforms."""
-    own = header.point_format
-    if own not in STANDARD_DTYPES:
-        raise InputError(f"{path}: point format {own} is not known; formats 0 to 10 can be written")
-    if header.point_length < STANDARD_DTYPES[own].itemsize:
-        raise InputError(f"{path}: {header.point_length}-byte records are too short for point format {own}; damaged")
-    if keep and own not in WITHOUT_WAVES:
-        raise ConfigError(f"{path}: point format {own} has no waveforms; leave --keep-packets out")
+    """Return the point format of the output: that of the input without waveforms, or the `wanted` one.
+
+    keep: the output keeps the waveform fields. Raises ConfigError if the wanted format would lose anything else.
+    """
+    given = header.point_format
     if wanted is None:
-        return own if keep else WITHOUT_WAVES.get(own, own)
-    legal = [number for number in STANDARD_DTYPES if _can_hold(own, number) and (number in WITHOUT_WAVES) == keep]
+        return given if keep else WITHOUT_WAVES.get(given, given)
+    legal = [number for number in STANDARD_DTYPES if _can_hold(given, number) and (number in WITHOUT_WAVES) == keep]
     if wanted not in legal:
         raise ConfigError(
-            f"{path}: point format {own} cannot be written as {wanted}{' with its packets' if keep else ''} without "
+            f"{path}: point format {given} cannot be written as {wanted}{' with its packets' if keep else ''} without "
             f"loss; possible are {', '.join(map(str, legal))}"
         )
     return wanted
 
 
 def _can_hold(old: int, new: int) -> bool:
-    """Whether format `new` has a place for all that `old` has, waveforms aside; never back to formats 0-5."""
+    """Whether format `new` has all fields of `old` except the waveform fields; never from 6-10 back to 0-5."""
     if old >= 6 > new:
         return False
     have = set(STANDARD_DTYPES[old].names) - _WAVE_FIELDS
@@ -48,7 +48,10 @@ def _can_hold(old: int, new: int) -> bool:
 
 
 def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> None:
-    """Copies the standard fields; formats of one family begin with the same bytes, which go over in one piece."""
+    """Copy the standard fields of records (n,) from format `old` to format `new`.
+
+    Formats of one family begin with the same bytes: these are copied in one piece, which is several times faster.
+    """
     base_old, base_new = WITHOUT_WAVES.get(old, old), WITHOUT_WAVES.get(new, new)
     if base_old == base_new:
         wave = old in WITHOUT_WAVES and new in WITHOUT_WAVES
@@ -65,7 +68,7 @@ def copy_standard(source: np.ndarray, rows: np.ndarray, old: int, new: int) -> N
 
 
 def _promote_bits(source: np.ndarray, rows: np.ndarray) -> None:
-    """Flags, class, returns and angle of formats 0-5 in the fields of formats 6-10; class 12 also sets overlap."""
+    """Writes flags, class, returns and angle of formats 0-5 into formats 6-10; class 12 also sets the overlap bit."""
     bits, flags = source["bit_fields"], source["raw_classification"]
     kind = flags & 0b11111
     rows["bit_fields"] = (bits & 0b111) | ((bits & 0b111000) << 1)
@@ -73,4 +76,4 @@ def _promote_bits(source: np.ndarray, rows: np.ndarray) -> None:
     rows["classification_flags"] = (
         (flags >> 5) | ((kind == _OVERLAP_CLASS).astype(np.uint8) << np.uint8(3)) | (bits & 0b11000000)
     )
-    rows["scan_angle"] = np.rint(source["scan_angle_rank"] / _ANGLE_UNIT).astype(np.int16)
+    rows["scan_angle"] = np.rint(source["scan_angle_rank"] / ANGLE_UNIT).astype(np.int16)

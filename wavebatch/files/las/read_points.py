@@ -1,4 +1,7 @@
-"""Point records of LAS and LAZ files by their index: each read costs what it returns, never the whole file."""
+"""Point records of LAS and LAZ files, read by index; a read never loads the whole file.
+
+The strip reader and the cloud readers open their points here. Add a new kind of compression in `laz_decode.py`.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +15,18 @@ from wavebatch.files.las.laz_decode import open_laz
 
 
 class PointSource(Protocol):
-    """Reads points by index."""
+    """A reader of points by index."""
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Records [start, stop), a writable structured array."""
-        ...
+        """Return records [start, stop), a writable structured array."""
 
     def close(self) -> None: ...
 
 
 def open_points(checked: CheckedHeader) -> PointSource:
-    """A reader of the strip's points: plain, lazrs, or the laszip backend where lazrs does not know the coding.
+    """Return a reader of the points of a checked file: plain LAS, or LAZ by lazrs or laszip.
 
-    Raises InputError where the compression's own records are damaged or nobody here can decode them.
+    Raises InputError if the records of the compression are damaged or no installed library can decode them.
     """
     return open_laz(checked) if checked.header.compressed else _PlainPoints(checked)
 

@@ -1,16 +1,20 @@
-"""One LAS or LAZ file being written: points in order, then extended records, then a header that tells the truth."""
+"""Writer of one LAS or LAZ file: points in order, then extended records, then the header with true counts and bounds.
+
+The writers of clouds, strips, returns and voxels are built on `PointFile`. The file appears under its name only when
+it is complete; the header is written last, because counts and bounds are known only then.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import WAVEFORM_RECORD_ID, LasHeader, Vlr, encode_evlr_header, has_record
 from wavebatch.files.las.laz_encode import open_encoder
@@ -20,10 +24,12 @@ _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
 
 
 class PointFile:
-    """Writes points of one dtype to `target`; what ends in `.laz` is compressed.
+    """Writes points of one dtype to `target`: `write` in order, then `commit`; `.laz` is compressed.
 
-    header: of the output; counts, bounds and starts are filled in here. records: one per extra dimension of dtype; the
-    VLR that holds them takes the place of one in `header.vlrs`, or is appended.
+    header: of the output; counts, bounds and offsets are filled in here.
+    records: one per extra dimension of dtype; their VLR replaces that in `header.vlrs`, or is appended.
+    As a context manager it aborts unless committed.
+    Raises InputError if the target exists (without overwrite) or cannot be written, ConfigError for another suffix.
     """
 
     def __init__(
@@ -41,6 +47,8 @@ class PointFile:
         if not overwrite:
             refuse_existing(self.target)
         self.draft = Draft(self.target, overwrite=overwrite)
+        self.drafts = [self.draft]
+        """All files that are published together, the point file last."""
         try:
             with self._guarded():
                 self._encoder = open_encoder(self.draft.file, header)
@@ -48,29 +56,35 @@ class PointFile:
             self.draft.discard()
             raise
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.abort()
+
     def write(self, rows: np.ndarray) -> None:
-        """Appends records (m,) of `dtype`."""
+        """Append records (m,) of `dtype`."""
         if rows.dtype != self.dtype:
-            raise InputError(f"{self.target}: rows of another layout than the file's; a bug, please report it")
+            raise InputError(f"{self.target}: rows of another layout than the file's; this is a bug, please report it")
         if not len(rows):
             return
         rows = np.ascontiguousarray(rows)
         self._statistics.add(rows)
         if self._statistics.count >= 2**32 and self._header.version < (1, 4):
-            raise InputError(f"{self.target}: LAS {self._header.version[0]}.{self._header.version[1]} holds at most "
-                             "4294967295 points; promote with --point-format 6")  # fmt: skip
+            version = "{}.{}".format(*self._header.version)
+            raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --point-format 6")
         with self._guarded():
             self._encoder.write(rows)
-            self.draft.file.flush()  # a worker forked now must not inherit bytes that it would write once more
+            self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
 
     def finish_points(self) -> None:
-        """Ends the points; extended records may follow."""
+        """End the points; extended records may follow."""
         with self._guarded():
             self._encoder.finish()
             self.draft.file.seek(0, 2)
 
     def append_record(self, head: bytes, source: BinaryIO, start: int, end: int, *, waveforms: bool = False) -> None:
-        """Copies bytes [start, end) of `source` behind what is there, after the 60 bytes of `head`."""
+        """Append an extended record: the 60 bytes of `head`, then bytes [start, end) of `source`."""
         with self._guarded():
             at = self.draft.file.tell()
             self.draft.file.write(head)
@@ -82,16 +96,31 @@ class PointFile:
             self._header.evlr_count += 1
 
     def finish(self) -> None:
-        """Writes the final header; the draft is then ready to be published."""
+        """Write the final header; the draft is then ready to be published."""
         self._statistics.fill(self._header)
         self._place_extra_bytes(self._statistics.ranged())
         with self._guarded():
             self.draft.file.seek(0)
             self.draft.file.write(self._header.encode())
 
+    def commit(self) -> None:
+        """Complete and publish the file with all that belongs to it; on an error nothing of it remains."""
+        try:
+            self.finish_points()
+            self._append_records()
+            self.finish()
+            publish_together(self.drafts)
+        except BaseException:
+            self.abort()
+            raise
+
+    def _append_records(self) -> None:
+        """Place for subclasses to append extended records and further drafts."""
+
     def abort(self) -> None:
-        """Removes what was written."""
-        self.draft.discard()
+        """Remove all that was written; does nothing after `commit`."""
+        for draft in self.drafts:
+            draft.discard()
 
     def _place_extra_bytes(self, records: Sequence[ExtraRecord] | None = None) -> None:
         records = self._records if records is None else records
@@ -99,7 +128,7 @@ class PointFile:
         places = [index for index, vlr in enumerate(vlrs) if has_record([vlr], *_EXTRA_BYTES)]
         payload = b"".join(record.data for record in records)
         if len(payload) > 65535:
-            raise InputError(f"{self.target}: {len(records)} extra bytes are more than a LAS file can describe")
+            raise InputError(f"{self.target}: a LAS file can describe at most 341 extra bytes, not {len(records)}")
         if places and records:
             old = vlrs[places[0]]
             vlrs[places[0]] = Vlr(old.user_id, old.record_id, payload, old.description, old.reserved)
@@ -110,7 +139,7 @@ class PointFile:
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
-        """One InputError line that names the target, whatever compressor or disk say."""
+        """Turns errors of compressor and disk into one InputError line that names the target."""
         try:
             with reporting(self.target):
                 yield
@@ -121,7 +150,7 @@ class PointFile:
 
 
 class Statistics:
-    """Counts, bounds and extremes over all rows written, for header and extra-bytes records."""
+    """Counts, bounds and extremes of all rows written, for the header and the extra-bytes records."""
 
     def __init__(self, dtype: np.dtype, records: Sequence[ExtraRecord]) -> None:
         self.count = 0
@@ -133,7 +162,7 @@ class Statistics:
         self._extremes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def add(self, rows: np.ndarray) -> None:
-        """Takes the rows into account."""
+        """Count the rows (m,) and widen the extremes."""
         self.count += len(rows)
         self._bits += np.bincount(rows["bit_fields"], minlength=256)
         for name in self._axes:
@@ -162,7 +191,7 @@ class Statistics:
             self._extremes[name] = (least, largest)
 
     def fill(self, header: LasHeader) -> None:
-        """Sets counts and bounds of the header; those of an empty file are 0."""
+        """Set counts and bounds of the header; an empty file gets zeros."""
         header.point_count = self.count
         number = np.arange(256) & ((1 << self._format_bits) - 1)
         by_return = np.bincount(number, self._bits, 16).astype(np.int64)
@@ -178,7 +207,7 @@ class Statistics:
             header.gps_range = (float(largest), float(least))
 
     def ranged(self) -> list[ExtraRecord]:
-        """The records with the extremes of what was written; without any value they declare none."""
+        """Return the records with the extremes of the written values; a column without any value declares none."""
         return [self._range(field, record) for field, record in self._records.items()]
 
     def _range(self, field: str, record: ExtraRecord) -> ExtraRecord:
@@ -191,7 +220,7 @@ class Statistics:
 
 
 def is_compressed(target: Path) -> bool:
-    """Whether the name says LAZ; raises ConfigError where it says neither LAS nor LAZ."""
+    """Whether the name ends in .laz; raises ConfigError if it ends in neither .las nor .laz."""
     suffix = target.suffix.lower()
     if suffix not in (".las", ".laz"):
         raise ConfigError(f"{target}: an output's name must end in .las or .laz")
@@ -199,7 +228,7 @@ def is_compressed(target: Path) -> bool:
 
 
 def copy_bytes(source: BinaryIO, start: int, end: int, target: BinaryIO) -> None:
-    """Copies bytes [start, end) of one open file to the place where the other stands, in bounded memory."""
+    """Copy bytes [start, end) of one open file to the current place of another, in bounded memory."""
     source.seek(start)
     left = end - start
     while left:
@@ -211,5 +240,5 @@ def copy_bytes(source: BinaryIO, start: int, end: int, target: BinaryIO) -> None
 
 
 def waveform_head(length: int) -> bytes:
-    """The 60 bytes in front of the packets, in the cloud itself or in a `.wdp`."""
+    """Return the 60 bytes before the packets, in the cloud itself or in a `.wdp`."""
     return encode_evlr_header(b"LASF_Spec", WAVEFORM_RECORD_ID, length, b"wave packets")

@@ -1,4 +1,7 @@
-"""What the header of a strip claims about its points, against the points."""
+"""Check of the header's claims about the points (counts and bounds) against the points themselves.
+
+`wavebatch inspect` calls it; it reads all points. wavebatch itself uses none of these claims.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
-    """Lines on counts and bounds of the header that the points contradict; wavebatch relies on none of them."""
+    """Yield a line for each count or bound of the header that the points contradict."""
     facts = reader.facts
     claimed = read_header(facts.path)
     true = LasHeader(claimed.version, claimed.point_format, claimed.point_length, claimed.scales, claimed.offsets)
@@ -29,7 +32,7 @@ def audit_header(reader: StripReader, scan: StripScan) -> Iterator[str]:
     known = 15 if claimed.version >= (1, 4) else 5
     if claimed.by_return[:known] != true.by_return[:known]:
         first, really = claimed.by_return[0], true.by_return[0]
-        yield f"counts by return in the header are wrong (first returns: {first}, really {really})"
+        yield f"counts by return in the header are wrong (first returns: {first}, counted: {really})"
     slack = 1.5 * np.abs(claimed.scales)
     outside = (np.array(true.mins) < np.array(claimed.mins) - slack) | (np.array(true.maxs) > claimed.maxs + slack)
     if not np.all(~outside):

@@ -1,4 +1,8 @@
-"""Which points have a usable packet, and what is wrong with the others."""
+"""Check of packets: which points have a usable packet, and why the others have none.
+
+The scan and the reader judge each piece of points. After this check packets are read without any further one, so a
+packet is usable only if all its bytes lie inside the waveform data.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +18,18 @@ from wavebatch.files.strip.packet_vectors import RANGE_RATIO, measure_ratio
 from wavebatch.files.strip.packets import MAX_SAMPLES, refuse_compressed
 
 INDEX_BITS = np.uint64(8)
+"""Bits of the descriptor index in a key; see `Judged.keys`."""
 WHOLE_BITS = (8, 16, 32)
+"""Bits per sample that fill whole bytes; others (12 bits) must be stored in two bytes."""
 MOST_BITS = 32
 MAX_SPACING = 1000.0
-"""Samples farther apart than this are damage [ns]."""
+"""Largest spacing of samples [ns]; digitizers have 0.2 to 10 ns, a larger one is damage."""
 MAX_LOCATION = 1e9
-"""Return locations beyond this are damage [ps]."""
+"""Largest return location [ps]: 1 ms is 150 km of range; a larger one is damage."""
 
 
 class Reason(IntEnum):
-    """Why a point's packet cannot be used."""
+    """Reason why the packet of a point cannot be used."""
 
     USABLE = 0
     NO_WAVEFORM = 1
@@ -41,28 +47,28 @@ REASON_TEXTS = {
     Reason.BAD_DESCRIPTOR: "refer to a descriptor that is empty, too long, without spacing, or of more than 32 bits",
     Reason.EMPTY: "have a packet without a whole sample",
     Reason.OUTSIDE: "have a packet outside the waveform data",
-    Reason.NO_GEOMETRY: "have a return location or a packet vector that cannot be (no number, 0, or absurdly long)",
+    Reason.NO_GEOMETRY: "have an impossible return location or packet vector (not a number, 0, or far too long)",
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
-    Reason.PACKED: "have samples of other than 8, 16 or 32 bits with no gaps between, in an order that LAS leaves open",
+    Reason.PACKED: "have samples of other than 8, 16 or 32 bits with no gaps between, which LAS does not define",
 }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """What can be made of the packets of some points."""
+    """Result of the check for n points."""
 
     reason: np.ndarray
     """u1 (n,): a Reason."""
     n_samples: np.ndarray
-    """Samples of the packet, i4 (n,); 0 where it cannot be used."""
+    """Samples of the packet, i4 (n,); 0 if it cannot be used."""
     keys: np.ndarray
-    """u8 (n,): byte offset and descriptor in one number, the same for all returns of a packet."""
+    """u8 (n,): byte offset and descriptor index in one number, equal for all returns of a packet."""
     short: np.ndarray
-    """bool (n,): usable, but its packet is shorter than the descriptor says."""
+    """bool (n,): usable, but the packet has fewer samples than its descriptor gives."""
 
     @property
     def usable(self) -> np.ndarray:
-        """bool (n,)."""
+        """Whether each packet can be used, bool (n,)."""
         return self.reason == Reason.USABLE
 
     @property
@@ -74,7 +80,7 @@ class Judged:
 
 
 class Judge:
-    """Tells usable packets from missing and broken ones, many points at a time."""
+    """Separates usable packets from missing and broken ones, for many points at a time."""
 
     def __init__(self, facts: StripFacts) -> None:
         self._facts = facts
@@ -93,11 +99,25 @@ class Judge:
         self._end = facts.packet_end - facts.packet_base
 
     def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
-        """What the packets of points (n,) are.
+        """Check the packets of points.
 
-        form: how vectors are stored. overfull: keys that too many points refer to, sorted.
+        Parameters
+        ----------
+        points : structured array (n,)
+            Point records with waveform fields.
+        form : {"stored", "range"}
+            How vectors are stored; see `packet_vectors.Decision`.
+        overfull : u8 (k,) or None
+            Sorted keys of packets that too many points refer to.
 
-        Raises InputError where a point refers to compressed packets.
+        Returns
+        -------
+        Judged
+
+        Raises
+        ------
+        InputError
+            If a point refers to compressed packets.
         """
         index = np.ascontiguousarray(points["wavepacket_index"])
         size = points["wavepacket_size"].astype(np.int64)
@@ -115,7 +135,7 @@ class Judge:
         reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
         reason[~inside] = Reason.OUTSIDE
         reason[n_samples == 0] = Reason.EMPTY
-        # Whether samples of 12 bits have two bytes each, only the packet's size says.
+        # Only the size of the packet shows whether samples of 12 bits have two bytes each.
         reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
         reason[~self._known[index]] = Reason.NO_DESCRIPTOR
@@ -131,7 +151,7 @@ class Judge:
 
 
 def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:
-    """Points whose packet has a place in space: location and vector are numbers that can be."""
+    """Whether return location and vector of points are possible, so that the packet has a place in space."""
     ratio = measure_ratio(points, form)
     location = np.abs(widen(points["return_point_wave_location"]))
     return (ratio > 0) & (ratio <= RANGE_RATIO) & (location <= MAX_LOCATION)

@@ -1,8 +1,8 @@
-"""Which way a strip's packet vectors point and how long they are: decided from the points, never assumed.
+"""Direction and length of a strip's packet vectors: decided from the points, never assumed.
 
-The LAS text has been read both ways. Returns that share a packet settle it: P + L v, the position of sample 0, must be
-the same for all of them where v points toward the sensor, P - L v where it points away. Heights are the second witness:
-an airborne sensor is above its returns.
+Vendors understood the LAS text in two ways (docs/las-waveforms.md 1.4). Returns that share a packet show which: the
+position of sample 0 must be equal for all of them; it is P + L v if v points toward the sensor, P - L v if away.
+Heights are the second evidence: an airborne sensor is above its returns. The scan collects the votes.
 """
 
 from __future__ import annotations
@@ -19,22 +19,27 @@ from wavebatch.files.disk.raw_bytes import widen
 OPTIONS = ("auto", "toward", "away")
 VECTORS = ("x_t", "y_t", "z_t")
 LEAST_RATIO, LARGEST_RATIO = 0.7, 1.02
+"""Outside these limits the length of vectors over c/2 gives a warning; usual files have 0.96 to 1.00."""
 RANGE_RATIO = 100.0
-"""Vectors longer than this many times c/2 are not speeds: Optech wrote the vector from sample 0 to the return."""
+"""Longer vectors, over c/2, are not speeds: Optech wrote the whole path from sample 0 to the return."""
 _APART = 2.0 * PS_PER_NS
+"""Least difference of return locations of a pair [ps]; closer returns give no evidence."""
 _PER_CALL = 256
+"""Most votes of one part, so that each part of the strip counts about the same."""
 _CLEAR, _MOSTLY = 0.95, 0.8
+"""Share of votes that decides: of heights, which terrestrial strips break, and of pairs."""
 _ENOUGH = 3
+"""Fewer pairs than this decide nothing if heights do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What the vectors of a strip mean."""
+    """Meaning of the packet vectors of a strip."""
 
     direction: str
-    """`toward` or `away`: where the vectors point (those as long as the range: once divided by minus the location)."""
+    """`toward` or `away` from the sensor (for the form `range`: after division by minus the location)."""
     form: str
-    """`stored`: metres per picosecond as they stand; `range`: as long as the path they cover (divide by -location)."""
+    """`stored`: metres per picosecond; `range`: the whole path, to be divided by minus the location."""
     ratio: float
     """Median length over c/2; NaN without waveforms."""
     evidence: str
@@ -44,19 +49,19 @@ class Decision:
 
 @dataclass(slots=True)
 class DirectionTally:
-    """Votes for either direction, collected part by part; each part counts with at most a few hundred points."""
+    """Votes for both directions, collected in parts; each part counts with at most a few hundred points."""
 
     form: str
     """See `Decision`."""
     pairs: list[int] = field(default_factory=lambda: [0, 0])
-    """Pairs of returns that say toward, away."""
+    """Pairs of returns that vote for toward, for away."""
     heights: list[int] = field(default_factory=lambda: [0, 0])
     """Vectors that point up, down."""
     ratios: list[np.ndarray] = field(default_factory=list)
     """Lengths over c/2."""
 
     def add_points(self, points: np.ndarray) -> None:
-        """Takes usable points into account: length and height of their vectors."""
+        """Add the votes of usable points (n,): length and height of their vectors."""
         some = _spread(points)
         height = read_toward(some, "toward", self.form)[:, 2]
         self.heights[0] += int((height > 0).sum())
@@ -64,7 +69,7 @@ class DirectionTally:
         self.ratios.append(measure_ratio(some, self.form))
 
     def add_pairs(self, xyz: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-        """Takes pairs of usable points that share a packet into account: xyz f8 (2, n, 3) [m], records (n,) each."""
+        """Add the votes of pairs of usable points that share a packet: xyz f8 (2, n, 3) [m], records (n,)."""
         a, b = widen(first["return_point_wave_location"]), widen(second["return_point_wave_location"])
         use = np.flatnonzero(np.abs(a - b) > _APART)
         use = use[:: max(1, len(use) // _PER_CALL)]
@@ -82,14 +87,14 @@ class DirectionTally:
 
 
 def find_form(points: np.ndarray) -> str:
-    """How the vectors of these points, the strip's first ones, are to be read: `stored` or `range`."""
+    """Return the form of the vectors, `stored` or `range`, from the first points of a strip."""
     ratio = measure_ratio(points, "stored")
     ratio = ratio[np.isfinite(ratio) & (ratio > 0)]
     return "range" if len(ratio) and np.median(ratio) > RANGE_RATIO else "stored"
 
 
 def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
-    """Length of the vectors over c/2, f8 (n,); not finite where there is none."""
+    """Return the length of the vectors over c/2, f8 (n,); not finite if it cannot be computed."""
     vectors = stack_vectors(points)
     length = np.sqrt((vectors * vectors).sum(axis=1)) * (PS_PER_NS / HALF_C)
     if form == "range":
@@ -99,19 +104,19 @@ def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
 
 
 def check_option(option: str) -> str:
-    """The option itself; raises ConfigError where it is none."""
+    """Return the value of --direction; raises ConfigError for an unknown one."""
     if option not in OPTIONS:
-        raise ConfigError(f"direction {option!r}: must be {', '.join(OPTIONS)}")
+        raise ConfigError(f"direction {option!r}: must be one of {', '.join(OPTIONS)}")
     return option
 
 
 def stack_vectors(points: np.ndarray) -> np.ndarray:
-    """The vectors of the records as they stand, f8 (n, 3)."""
+    """Return the vectors of records (n,) as stored, f8 (n, 3)."""
     return np.stack([widen(points[name]) for name in VECTORS], axis=1)
 
 
 def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
-    """Vectors toward the sensor, metres per picosecond, f8 (n, 3), length as the file has it."""
+    """Return vectors toward the sensor [m/ps], f8 (n, 3), with the length of the file."""
     vectors = stack_vectors(points)
     if form == "range":
         vectors /= -widen(points["return_point_wave_location"])[:, None]
@@ -119,10 +124,10 @@ def read_toward(points: np.ndarray, direction: str, form: str) -> np.ndarray:
 
 
 def decide(tally: DirectionTally, option: str) -> Decision:
-    """What the votes say. Where they contradict each other or say nothing, `auto` leaves a problem."""
+    """Return the decision by the votes; with `auto`, contradicting or missing votes are a problem of the strip."""
     if not any(len(part) for part in tally.ratios):
         chosen = "toward" if option == "auto" else option
-        return Decision(chosen, tally.form, float("nan"), "no waveform to judge by", (), ())
+        return Decision(chosen, tally.form, float("nan"), "no waveform to decide from", (), ())
     ratio = float(np.median(np.concatenate(tally.ratios)))
     warnings, problems = list(_judge_length(ratio, tally.form)), []
     (toward, away), (up, down) = tally.pairs, tally.heights
@@ -134,10 +139,10 @@ def decide(tally: DirectionTally, option: str) -> Decision:
     if pairs and heights and pairs != heights:
         problems.append(f"packet vectors contradict each other: {evidence}; pass --direction toward or away")
     elif not (pairs or heights):
-        problems.append(f"where packet vectors point cannot be told: {evidence}; pass --direction toward or away")
+        problems.append(f"the direction of packet vectors is not clear: {evidence}; pass --direction toward or away")
     if option != "auto":
         if chosen != option or problems:
-            warnings.append(f"--direction {option} overrides what the file says: {evidence}")
+            warnings.append(f"--direction {option} overrides the evidence of the file: {evidence}")
         chosen, problems, evidence = option, [], f"given; {evidence}"
     return Decision(chosen, tally.form, ratio, evidence, tuple(warnings), tuple(problems))
 
@@ -145,8 +150,8 @@ def decide(tally: DirectionTally, option: str) -> Decision:
 def _judge_length(ratio: float, form: str) -> Iterator[str]:
     if form == "range":
         yield (
-            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long, so they are taken for whole paths (as "
-            "Optech wrote them) and divided by minus the return location"
+            f"packet vectors are more than {RANGE_RATIO:g} times c/2 long; they are read as whole paths (as Optech "
+            "wrote them) and divided by minus the return location"
         )
     if not LEAST_RATIO <= ratio <= LARGEST_RATIO:
         yield f"packet vectors are {ratio:.4g} times c/2 long (usual: 0.96 to 1.00); new echoes may lie wrong"

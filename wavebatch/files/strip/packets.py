@@ -1,4 +1,8 @@
-"""Where the packets of a strip lie, how their samples were made, and the samples themselves, many at a time."""
+"""Place of a strip's packets, their descriptors, and the samples of many packets at a time.
+
+`find_facts` locates packets and reads descriptors; `StripReader` reads samples through `PacketFile`. Offsets given to
+`PacketFile` must have been checked by `packet_check.Judge`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.raw_bytes import read_exactly
+from wavebatch.files.disk.raw_bytes import damaged, read_exactly
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
@@ -24,21 +28,24 @@ from wavebatch.files.las.header import (
 )
 
 MAX_SAMPLES = 1 << 16
-"""Waveforms longer than this are taken for damage."""
+"""Longer waveforms are damage: digitizers record a few hundred samples."""
 MAX_EVLRS = 4096
+"""Most EVLRs that are looked at: a damaged header can claim 4 billion."""
 BLOCK_BYTES = 1 << 25
-"""Most bytes of samples in one block, whatever number of waveforms was asked for."""
+"""Most bytes of samples in one block, for any number of waveforms."""
 _DESCRIPTOR = struct.Struct("<BBIIdd")
 _FIRST_ID, _LAST_ID = 100, 354
 _SPARSE = 4
-"""A span is read whole when it is at most this many times what is wanted of it."""
+"""A span of bytes is read in one piece if it is at most this many times as long as the wanted packets,"""
 _SPAN = 1 << 22
+"""or at most this long."""
 _GAP = 1 << 14
+"""Gap between packets [bytes] that is read over: a seek costs more than 16 KiB."""
 
 
 @dataclass(frozen=True, slots=True)
 class PacketPlace:
-    """Legal bytes [start, end) of `file`; the packet with byte offset o begins at `base` + o. None: there are none."""
+    """Bytes [start, end) of `file` that packets may use; a packet begins at `base` + its offset. None: no packets."""
 
     file: Path | None
     internal: bool
@@ -50,7 +57,7 @@ class PacketPlace:
 
 @dataclass(frozen=True, slots=True)
 class Descriptors:
-    """The wave packet descriptors of a strip by index."""
+    """The wave packet descriptors of a strip, by index."""
 
     digitizers: dict[int, Digitizer]
     compression: dict[int, int]
@@ -58,7 +65,7 @@ class Descriptors:
 
 
 def read_descriptors(header: LasHeader) -> Descriptors:
-    """Every descriptor among the VLRs, unused and empty ones too; what a file refers to is judged later."""
+    """Return all descriptors among the VLRs, also unused and empty ones; `packet_check` checks those that are used."""
     digitizers: dict[int, Digitizer] = {}
     compression: dict[int, int] = {}
     warnings = []
@@ -67,58 +74,56 @@ def read_descriptors(header: LasHeader) -> Descriptors:
             continue
         index = vlr.record_id - _FIRST_ID + 1
         if len(vlr.payload) < _DESCRIPTOR.size:
-            warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is left out")
+            warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
             continue
         bits, kind, samples, spacing, gain, offset = _DESCRIPTOR.unpack_from(vlr.payload)
         digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
         if index not in digitizers:
             digitizers[index], compression[index] = digitizer, kind
         elif digitizers[index] != digitizer:
-            warnings.append(f"descriptor {index} stands there twice and differs; the first one is used")
+            warnings.append(f"descriptor {index} is there twice with different content; the first one is used")
     return Descriptors(digitizers, compression, tuple(warnings))
 
 
 def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerless: bool) -> PacketPlace:
-    """Where the packets are: inside the strip, or in the .wdp beside it.
+    """Return the place of the packets: in the strip itself, or in the .wdp next to it.
 
-    headerless: take a .wdp that does not begin with the 60 bytes it should; its offsets are counted as if it did.
-    Raises InputError where they are missing, compressed, or in a file that is no .wdp.
+    headerless: accept a .wdp without its 60-byte header; `settle_headerless` finds how its offsets count.
+    Raises InputError if packets are missing, compressed, or in a file that is not a .wdp.
     """
     header, path = checked.header, checked.path
     if compression and all(compression.values()):
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & WAVES_INTERNAL:
         return _locate_internal(checked)
-    beside = _find_beside(path)
+    packet_file = _find_packet_file(path)
     if header.global_encoding & WAVES_EXTERNAL:
-        if beside is None:
-            if _find_beside(path, "wdz") is not None:
+        if packet_file is None:
+            if _find_packet_file(path, "wdz") is not None:
                 raise refuse_compressed(path, 1)
-            raise InputError(
-                f"{path}: its packets are not there: put {path.with_suffix('.wdp').name} beside the strip"
-            )
-        return _locate_external(checked, beside, headerless)
-    warning = "the header does not say where the packets are (global encoding bits 1 and 2)"
+            raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
+        return _locate_external(checked, packet_file, headerless)
+    warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
     if header.waveform_start:
         place = _locate_internal(checked)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are taken from the record in the file"))
-    if beside is not None:
-        place = _locate_external(checked, beside, headerless)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are taken from {beside.name}"))
-    if _find_beside(path, "wdz") is not None:
+        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from the record in the file"))
+    if packet_file is not None:
+        place = _locate_external(checked, packet_file, headerless)
+        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {packet_file.name}"))
+    if _find_packet_file(path, "wdz") is not None:
         raise refuse_compressed(path, 1)
-    return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp beside it",))
+    return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
 
 
 def refuse_compressed(path: Path, kind: int) -> InputError:
-    """The error that says what to run for packets that are compressed."""
+    """Return the error for compressed packets, with the command that decompresses them."""
     return InputError(
         f"{path}: its packets are compressed (type {kind}, LAStools .wdz), which LAS does not define; decompress them "
         f"first: laszip -i {path.name} -o {path.stem}_raw.las -waveform"
     )
 
 
-def _find_beside(path: Path, suffix: str = "wdp") -> Path | None:
+def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
     for candidate in (path.with_suffix(f".{suffix}"), path.with_suffix(f".{suffix.upper()}")):
         if candidate.is_file():
             return candidate
@@ -132,21 +137,18 @@ def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     at, warnings = header.waveform_start, []
     if not at:
         at = next((evlr.start for evlr in evlrs if evlr.record_id == WAVEFORM_RECORD_ID), 0)
-        warnings.append(f"the header does not point at the waveform record; it was found among the EVLRs at byte {at}")
+        warnings.append(f"the header does not point at the waveform record; it was found as an EVLR at byte {at}")
     least = header.offset_to_points if header.compressed else checked.points_end
     if not least <= at <= size - EVLR_HEADER_SIZE:
-        raise InputError(
-            f"{path}: the record of its packets would begin at byte {at}; the points end at {least}, the file at "
-            f"{size}: the file is cut or its header damaged, get it again"
-        )
+        raise damaged(path, f"waveform record at byte {at}, but the points end at {least} and the file at {size}")
     with open(path, "rb") as file:
         file.seek(at)
         head = file.read(EVLR_HEADER_SIZE)
     record_id, length = struct.unpack_from("<HQ", head, 18)
     if record_id != WAVEFORM_RECORD_ID:
         raise InputError(
-            f"{path}: no waveform record at byte {at} (record id {record_id} instead of 65535); the header's pointer "
-            "(byte 227) is wrong: get the file again"
+            f"{path}: no waveform record at byte {at} (record id {record_id} instead of 65535); the pointer in the "
+            "header (byte 227) is wrong: get the file again"
         )
     end = min([size, *(evlr.start for evlr in evlrs if evlr.start > at)])
     if at + EVLR_HEADER_SIZE + length != end:
@@ -154,26 +156,26 @@ def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     return PacketPlace(path, True, at, at + EVLR_HEADER_SIZE, end, tuple(warnings))
 
 
-def _locate_external(checked: CheckedHeader, beside: Path, headerless: bool) -> PacketPlace:
-    size = beside.stat().st_size
-    with open(beside, "rb") as file:
+def _locate_external(checked: CheckedHeader, packet_file: Path, headerless: bool) -> PacketPlace:
+    size = packet_file.stat().st_size
+    with open(packet_file, "rb") as file:
         head = file.read(EVLR_HEADER_SIZE)
     warnings = []
     if len(head) < EVLR_HEADER_SIZE or not head[2:].startswith(b"LAS") or head[18:20] != b"\xff\xff":
         if not headerless:
             raise InputError(
-                f"{checked.path}: {beside.name} does not begin with the 60-byte header of a waveform record; if it "
-                "has none, run again with --headerless, else get it again"
+                f"{checked.path}: {packet_file.name} does not begin with the 60-byte header of a waveform record; "
+                "if it has no header, run again with --headerless, else get it again"
             )
-        return PacketPlace(beside, False, -EVLR_HEADER_SIZE, 0, size, (f"{beside.name} has no header",))
+        return PacketPlace(packet_file, False, -EVLR_HEADER_SIZE, 0, size, (f"{packet_file.name} has no header",))
     (length,) = struct.unpack_from("<Q", head, 20)
     if length not in (0, size - EVLR_HEADER_SIZE):
-        warnings.append(f"{beside.name} claims {length} bytes of packets, {size - EVLR_HEADER_SIZE} are there")
-    return PacketPlace(beside, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
+        warnings.append(f"{packet_file.name} claims {length} bytes of packets, {size - EVLR_HEADER_SIZE} are there")
+    return PacketPlace(packet_file, False, 0, EVLR_HEADER_SIZE, size, tuple(warnings))
 
 
 def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
-    """The place of packets in a .wdp without header: byte offsets below 60 show that they count from its first byte."""
+    """Return the place of packets in a .wdp without header; offsets below 60 count from its first byte."""
     offsets = points["wavepacket_offset"][(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
     if len(offsets) and int(offsets.min()) < EVLR_HEADER_SIZE:
         return replace(place, base=0)
@@ -181,7 +183,7 @@ def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
 
 
 class PacketFile:
-    """Reads samples of many packets at once."""
+    """Reads the samples of many packets at once."""
 
     def __init__(self, place: PacketPlace) -> None:
         self._place = place
@@ -194,12 +196,24 @@ class PacketFile:
                 raise InputError(f"{place.file}: cannot be read: {error.strerror or error}") from error
 
     def close(self) -> None:
-        """Closes the file; harmless twice."""
+        """Close the file; may be called twice."""
         if self._file is not None:
             self._file.close()
 
     def read(self, offsets: np.ndarray, n_samples: int, bits: int) -> np.ndarray:
-        """Raw counts (n, n_samples), u1/u2/u4, read-only, of packets at byte offsets u8 (n,), checked before."""
+        """Return raw counts of packets that were checked before.
+
+        Parameters
+        ----------
+        offsets : u8 (n,)
+            Byte offsets as points have them.
+        n_samples, bits : int
+            Samples per packet, and bits per sample: 8, 16 or 32.
+
+        Returns
+        -------
+        u1, u2 or u4 (n, n_samples), read-only
+        """
         width = n_samples * (bits // 8)
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
         try:
@@ -247,7 +261,7 @@ class PacketFile:
 
 
 def _find_runs(ordered: np.ndarray, width: int) -> Iterator[tuple[int, int]]:
-    """Slices of sorted starts whose gaps are worth reading over."""
+    """Slices of sorted starts with only small gaps."""
     cuts = np.flatnonzero(np.diff(ordered) > width + _GAP) + 1
     edges = [0, *cuts.tolist(), len(ordered)]
     return zip(edges[:-1], edges[1:], strict=True)
@@ -259,5 +273,5 @@ def _pick(buffer: np.ndarray, place: np.ndarray, width: int) -> np.ndarray:
 
 
 def block_rows(size: int, n_samples: int, bits: int) -> int:
-    """Waveforms per block: `size`, fewer where so many would not fit memory."""
+    """Return the waveforms per block: `size`, or fewer if their samples take more than BLOCK_BYTES."""
     return max(1, min(size, BLOCK_BYTES // (n_samples * (bits // 8))))

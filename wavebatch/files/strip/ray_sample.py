@@ -1,4 +1,8 @@
-"""Rays sampled along a strip: a few points of every unit, with their times and where they came from."""
+"""Rays sampled along a strip: a few points of each unit with times and directions.
+
+`surveying/sensor.py` finds the positions of the sensor from them. The sample is the same every time and bounded, for
+strips of any size.
+"""
 
 from __future__ import annotations
 
@@ -13,36 +17,38 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.scanner import locate
 
 MOST_SLICES = 4096
-"""Places of a strip at which rays are taken."""
+"""Most places of a strip at which rays are read."""
 
 SLICE_POINTS, RAYS_PER_SLICE = 2048, 256
-"""Points read at a place, and rays kept of them."""
+"""Points read at one place, and rays kept of them."""
 
 SLICE_SECONDS = 0.5
-"""Time after which another place of the same unit is looked at."""
+"""Time [s] after which another place of the same unit is read: an aircraft moves 30 m in it."""
 
 _SLICES_PER_UNIT = 4
 _LEAST_RATIO, _LARGEST_RATIO = 0.3, 3.0
+"""Vectors with other lengths over c/2 are no directions."""
 _LEAST_PAIR = 2.0
+"""Least distance of two returns [m] that give a direction: returns are placed to a few cm."""
 
 
 class Rays(NamedTuple):
-    """n rays, ordered by time."""
+    """n rays in order of time."""
 
     time: np.ndarray
     """f8 (n,) [s]."""
     point: np.ndarray
-    """Where they struck, f8 (n, 3) [m]."""
+    """Position of the echo, f8 (n, 3) [m]."""
     direction: np.ndarray
     """Away from the sensor, any length, f8 (n, 3)."""
     weight: np.ndarray
-    """Inverse variance of the direction, relative, f8 (n,)."""
+    """Relative weight (inverse variance) of the direction, f8 (n,)."""
 
 
 def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
-    """Rays of a strip from its packets' vectors, and from pulses with two returns; the same ones every time.
+    """Return the rays of a strip from packet vectors, and those from pulses with two returns.
 
-    No more than a few hundred rays at no more than about MOST_SLICES places: bounded memory whatever the strip's size.
+    At most RAYS_PER_SLICE rays at each of about MOST_SLICES places.
     """
     kept, pairs = [], []
 
@@ -69,7 +75,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
-    """Stretches of points [start, stop) all over the strip: its units, or as many of them as may be looked at."""
+    """Units [start, stop) all over the strip, at most MOST_SLICES of them."""
     borders = scan.borders
     if not scan.points:
         return []
@@ -88,7 +94,7 @@ def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: S
 
 
 def _pair_returns(xyz: np.ndarray, time: np.ndarray) -> Rays:
-    """Returns of one pulse that follow each other in the file: the farther apart, the better."""
+    """Rays from neighbouring returns of one pulse; returns far apart get a large weight."""
     place = np.flatnonzero(time[1:] == time[:-1])
     apart = xyz[place + 1] - xyz[place]
     square = (apart * apart).sum(axis=1)

@@ -1,4 +1,8 @@
-"""A full-waveform strip, read unit by unit: points, the packets they refer to, and blocks of their samples."""
+"""Reader of full-waveform strips, unit by unit: points, the packets they refer to, and blocks of their samples.
+
+Survey, batch and tools read strips only through `StripReader`. Units depend only on the file and a packet belongs to
+exactly one of them; results must not depend on blocks or processes.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,13 @@ import numpy as np
 
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_records, widen
-from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.strip.facts import StripFacts, collect_facts
+from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_vectors import check_option, read_toward
-from wavebatch.files.strip.packets import PacketFile, block_rows, locate_packets, read_descriptors, settle_headerless
+from wavebatch.files.strip.packets import PacketFile, PacketPlace, block_rows
 from wavebatch.files.strip.scan_result import StripScan, raise_problem
 from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
@@ -25,27 +29,27 @@ from wavebatch.kernels.signal.signal import recorded_lengths
 __all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
 
 UNIT_POINTS = 50_000
-"""Points per unit of work, one LAZ chunk: fixed by the file, so that results depend on nothing else."""
+"""Points per unit of work, as many as usual in a LAZ chunk, so that a unit decompresses one or two chunks."""
 UNIT_BYTES = 1 << 26
-"""Points with very long records make smaller units."""
+"""Most bytes of points per unit: very long records make smaller units."""
 _SAMPLED_UNITS = 16
-_FIRST_POINTS = 10_000
+"""Units that a sample is read from: enough to cover the strip, few enough to be fast."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PacketTable:
-    """m packets, each once, in the order of their owners."""
+    """m different packets in the order of their owners."""
 
     digitizer: np.ndarray
     """Descriptor index, u1 (m,)."""
     offset: np.ndarray
-    """Byte offset as points have it, u8 (m,)."""
+    """Byte offset as in the points, u8 (m,)."""
     size: np.ndarray
-    """Bytes of the packet as its owner has it, u4 (m,)."""
+    """Bytes of the packet by its owner, u4 (m,)."""
     n_samples: np.ndarray
-    """i4 (m,): as many as descriptor and size allow."""
+    """Samples, as many as descriptor and size allow, i4 (m,)."""
     owner: np.ndarray
-    """First point in the file that refers to the packet, i8 (m,)."""
+    """File index of the first point with this packet, i8 (m,)."""
     owned: np.ndarray
     """Whether the owner lies in this unit, bool (m,)."""
 
@@ -55,70 +59,79 @@ class PacketTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unit:
-    """Some consecutive points of a strip and everything needed to process their packets."""
+    """Consecutive points of a strip, with all that is needed to process their packets."""
 
     number: int
     start: int
     """File index of points[0]."""
     points: np.ndarray
-    """The unit's own records (n,), as they are in the file, under laspy's field names."""
+    """Records (n,) of the unit, unchanged, with laspy's field names."""
     context: np.ndarray
-    """Records (k,) of points of other units that share packets with own points."""
+    """Records (k,) of points of other units that share packets with these points."""
     context_index: np.ndarray
     """Their file indices, i8 (k,), ascending."""
     packets: PacketTable
     packet_of_point: np.ndarray
-    """Row of packets, i4 (n,); -1 where there is none."""
+    """Row of `packets` for each point, i4 (n,); -1: no usable packet."""
     packet_of_context: np.ndarray
-    """Row of packets, i4 (k,)."""
+    """Row of `packets` for each context point, i4 (k,)."""
     point_flags: np.ndarray
-    """u2 (n,): EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0."""
+    """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
     direction: str
     vector_form: str
 
 
-class StripReader:
-    """Reads one strip; opening costs no more than the header. A context manager.
+class StripReader(Closing):
+    """Reads one strip; opening reads only the headers. A context manager.
 
-    path: LAS or LAZ file of point format 4, 5, 9 or 10. direction: where packet vectors point, `auto` lets the file
-    decide. headerless: take a .wdp that lacks its 60-byte header.
-    Raises InputError, in one line, where the strip cannot be read as what it claims to be.
+    Parameters
+    ----------
+    path : Path or str
+        LAS or LAZ file of point format 4, 5, 9 or 10.
+    direction : {"auto", "toward", "away"}
+        Where packet vectors point; "auto" decides from the points.
+    headerless : bool
+        Accept a .wdp without its 60-byte header.
+
+    Raises
+    ------
+    InputError
+        If the strip cannot be read as what it claims to be.
     """
 
     facts: StripFacts
 
     def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
         check_option(direction)
-        checked = read_checked_header(Path(path))
-        found = read_descriptors(checked.header)
-        place = locate_packets(checked, found.compression, headerless)
-        self._points = open_points(checked)
+        self._open(find_facts(Path(path), direction, headerless))
+
+    @classmethod
+    def reopen(cls, facts: StripFacts) -> StripReader:
+        """Return a reader of a strip whose facts are known, so that its headers need not be read and checked again."""
+        reader = cls.__new__(cls)
+        reader._open(facts)
+        return reader
+
+    def _open(self, facts: StripFacts) -> None:
+        self.facts = facts
+        self._points = open_points(facts.checked)
         try:
-            if place.base < 0:
-                some = self._points.read(0, min(checked.header.point_count, _FIRST_POINTS))
-                place = settle_headerless(place, some)
-            self.facts = collect_facts(checked, found, place, direction)
-            self._judge = Judge(self.facts)
-            self._packets = PacketFile(place)
+            self._judge = Judge(facts)
+            place = (facts.packet_file, facts.internal, facts.packet_base, facts.packet_start, facts.packet_end)
+            self._packets = PacketFile(PacketPlace(*place))
         except BaseException:
             self._points.close()
             raise
 
-    def __enter__(self) -> StripReader:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
     def close(self) -> None:
-        """Closes the files; scans stay valid."""
+        """Close the files; scans stay valid."""
         self._points.close()
         self._packets.close()
 
     def scan(self, *, tolerant: bool = False) -> StripScan:
-        """One pass over the point records, never over the samples.
+        """Return the result of one pass over the point records; samples are not read.
 
-        tolerant: leave what keeps the strip from being processed in `problems` instead of raising InputError.
+        tolerant: put reasons against processing into `problems` instead of raising InputError.
         """
         scan = scan_strip(self.facts, self._points, self._unit_points())
         if not tolerant:
@@ -126,18 +139,18 @@ class StripReader:
         return scan
 
     def unit_count(self) -> int:
-        """Units of the strip."""
+        """Return the number of units."""
         return -(-self.facts.point_count // self._unit_points())
 
     def _unit_points(self) -> int:
         return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.point_length))
 
     def read_points(self, start: int, stop: int) -> np.ndarray:
-        """Records [start, stop) of the file."""
+        """Return records [start, stop) of the file."""
         return self._points.read(start, stop)
 
     def read_unit(self, number: int, scan: StripScan) -> Unit:
-        """Unit `number` (0 to unit_count() - 1): its points and their packets; samples are read by `read_blocks`."""
+        """Return unit `number` (from 0): its points and their packets; `read_blocks` reads the samples."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
         points = self._points.read(start, stop)
         judged = self._judge.judge(points, scan.vector_form, scan.overfull)
@@ -167,18 +180,16 @@ class StripReader:
             vector_form=scan.vector_form,
         )
 
-    def read_blocks(
-        self, unit: Unit, size: int, owned_only: bool
-    ) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
-        """Blocks of at most `size` waveforms of one digitizer and one length, each with their rows of unit.packets.
+    def read_blocks(self, unit: Unit, size: int, owned_only: bool) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
+        """Yield blocks of at most `size` waveforms of one digitizer and one length, each with its rows of unit.packets.
 
-        owned_only: leave out packets whose first point lies in another unit.
+        owned_only: skip packets whose first point lies in another unit.
         """
         rows = np.flatnonzero(unit.packets.owned) if owned_only else np.arange(len(unit.packets))
         yield from self.read_rows(unit, rows, size)
 
     def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
-        """About `n_waveforms` waveforms spread evenly over the strip, the same ones every time."""
+        """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time."""
         units = self.unit_count()
         if not units or n_waveforms <= 0:
             return
@@ -197,7 +208,7 @@ class StripReader:
                 return
 
     def read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
-        """As `read_blocks`, of the packets `rows` (k,) of the unit only; zeros that only fill packets are left out."""
+        """Yield blocks of the packets `rows` (k,) of the unit, as `read_blocks`; trailing padding is cut off."""
         geometry = _Geometry(unit, self.facts)
         table = unit.packets
         kinds = (table.digitizer[rows].astype(np.int64) << 32) | table.n_samples[rows]
@@ -222,7 +233,7 @@ class StripReader:
 
 
 class _Geometry:
-    """Where the waveforms of a unit lie, and which returns they have."""
+    """Positions and returns of the waveforms of a unit."""
 
     def __init__(self, unit: Unit, facts: StripFacts) -> None:
         self._unit, self._facts = unit, facts
@@ -236,7 +247,7 @@ class _Geometry:
         self._starts, self._counts = edges[:-1], np.diff(edges)
 
     def build_block(self, rows: np.ndarray, digitizer: Digitizer, samples: np.ndarray) -> WaveformBlock:
-        """The block of packets `rows`; the first return of each is its owner."""
+        """Return the block of packets `rows`; the first return of each packet is its owner."""
         counts = self._counts[rows]
         place = expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
@@ -269,7 +280,7 @@ class _Geometry:
 
 
 def _read_scanner(records: np.ndarray) -> np.ndarray | None:
-    """Scanner channels of records (n,), u1 (n,); None in point formats without."""
+    """Scanner channels of records (n,), u1 (n,); None for point formats 4 and 5."""
     if "classification_flags" not in records.dtype.names:
         return None
     return (records["classification_flags"] >> 4) & 3
@@ -278,7 +289,7 @@ def _read_scanner(records: np.ndarray) -> np.ndarray | None:
 def _collect_packets(
     keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray
 ) -> tuple[PacketTable, np.ndarray]:
-    """The packets of points (n,) in order of their owners, all of them called owned, and the row of each, i4 (n,)."""
+    """Packets of points (n,) in order of their owners, all marked as owned, and the row of each point, i4 (n,)."""
     by_index = np.argsort(index, kind="stable")
     groups = group_keys(keys[by_index])
     lead = by_index[groups.order[groups.starts]]

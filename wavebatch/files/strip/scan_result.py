@@ -1,4 +1,7 @@
-"""What one pass over the points of a strip found, and the lines that say what is wrong with it."""
+"""Result of the pass over the points of a strip, and the messages about what is wrong with it.
+
+`scanner.scan_strip` makes it; reader, survey and reports use it. It is pickled for other processes.
+"""
 
 from __future__ import annotations
 
@@ -9,77 +12,72 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StripScan:
-    """What one pass over the points found; picklable. `close` it (or use `with`) to remove its temporary file."""
+class StripScan(Closing):
+    """Result of one pass over the points; picklable. `close` it (or use `with`) to remove its temporary file."""
 
     points: int
     with_waveform: int
     """Points with a usable packet."""
     without_waveform: int
-    """Points that have none: descriptor index 0 or packet size 0."""
+    """Points without a packet: descriptor index 0 or packet size 0."""
     broken: int
-    """Points with a packet that cannot be used; the three add up to `points`."""
+    """Points with a packet that cannot be used; these three counts add up to `points`."""
     packets: int
     """Different usable packets."""
     short: int
-    """Points whose packet is shorter than its descriptor says."""
+    """Points with a packet of fewer samples than its descriptor gives."""
     reasons: dict[Reason, tuple[int, int]]
-    """Per reason for not using a packet: points, and the first of them."""
+    """For each reason not to use a packet: number of points, and index of the first."""
     by_descriptor: dict[int, int]
-    """Points that refer to a packet, by descriptor index."""
+    """Points with a packet, by descriptor index."""
     reach: int
-    """Largest distance, in points, between two points that share a packet."""
+    """Largest distance in the file, in points, of two points that share a packet."""
     direction: str
     direction_evidence: str
     vector_form: str
     vector_ratio: float
     borders: np.ndarray
-    """First point of every unit, and the number of points, i8 (units + 1,)."""
+    """First point of each unit, then the number of points, i8 (units + 1,)."""
     overfull: np.ndarray
-    """Keys of packets that more points refer to than a pulse can have, u8, sorted."""
+    """Sorted keys, u8, of packets with more points than a pulse can have."""
     context: Spool
-    """Per unit: the points of other units that share packets with it."""
+    """For each unit the points of other units that share packets with it."""
     warnings: tuple[str, ...]
     problems: tuple[str, ...]
-    """What keeps the strip from being processed; empty for scans that `StripReader.scan` returns."""
+    """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether points have packets, but none that can be used."""
+        """Whether points have packets, but none can be used."""
         return self.broken > 0 and not self.with_waveform
 
     @property
     def spool(self) -> Path | None:
-        """Temporary file of shared packets, where there are many."""
+        """Temporary file of shared packets; None if there are few."""
         return self.context.path
 
     def close(self) -> None:
-        """Removes the temporary file."""
+        """Remove the temporary file."""
         self.context.close()
-
-    def __enter__(self) -> StripScan:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
 
 def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
-    """The line on a strip none of whose packets can be used."""
+    """Return the message about a strip without any usable packet."""
     if facts.packet_file is None:
-        beside = facts.path.with_suffix(".wdp").name
-        return f"points refer to packets, which are neither in the file nor beside it: put {beside} beside the strip"
+        name = facts.path.with_suffix(".wdp").name
+        return f"points refer to packets that are neither in the file nor next to it: put {name} next to the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
-    remedy = f"{facts.packet_file.name} is cut, damaged or of another strip: get it again"
+    remedy = f"{facts.packet_file.name} is cut, damaged or belongs to another strip: get it again"
     if reason is Reason.PACKED:
-        remedy = "have them written with 8, 16 or 32 bits"
+        remedy = "write the packets with 8, 16 or 32 bits per sample"
     return (
         f"no packet can be used: {count} of {facts.point_count} points (first: point {first}) {REASON_TEXTS[reason]}; "
         f"{remedy}"
@@ -87,15 +85,15 @@ def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]])
 
 
 def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Iterator[str]:
-    """Lines on what is odd about a strip that can be processed nevertheless."""
+    """Yield warnings about a strip that can be processed."""
     for reason, (count, first) in reasons.items():
-        yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are passed through"
+        yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged"
     if short:
-        yield f"{short} points have packets shorter than their descriptor says; what is there is used"
+        yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
 
 
 def raise_problem(facts: StripFacts, scan: StripScan) -> None:
-    """Raises InputError with what keeps the strip from being processed, if anything does."""
+    """Raise InputError with the first reason why the strip cannot be processed, if there is one."""
     if scan.problems:
         scan.close()
         raise InputError(f"{facts.path}: {scan.problems[0]}")

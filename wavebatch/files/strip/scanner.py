@@ -1,7 +1,12 @@
-"""One pass over the points of a strip: what its packets are, where units begin, which packets cross their borders."""
+"""The pass over the points of a strip: checks packets, sets the borders of units, finds packets that cross borders.
+
+`StripReader.scan` calls it. It never reads samples, and its memory does not grow with the strip. Borders depend only
+on the file, so that results are equal for any number of processes.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -18,16 +23,19 @@ from wavebatch.files.strip.scan_result import StripScan, describe_hopeless, desc
 from wavebatch.files.strip.shared_packets import Groups, NearSharing, find_far, group_keys
 
 LONGEST_RUN = 64
-"""Runs of points with one gps time that are shorter than this are not cut by a border."""
+"""Shorter runs of points with one GPS time (a pulse) are not cut by a border; longer ones are no pulses."""
 _PAIRS, _VOTERS = 4096, 256
+"""Most pairs and points of a unit that vote on the direction of vectors."""
 _FAR_SAMPLES = 32
+"""Units of a shuffled strip that vote again with their context."""
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
 
 def scan_strip(facts: StripFacts, source: PointSource, unit_points: int) -> StripScan:
-    """Scans all points of the strip, `unit_points` per unit before borders are moved; never looks at samples.
+    """Scan all points of a strip.
 
-    Raises InputError where points cannot be read; what keeps the strip from being processed is in `problems`.
+    unit_points: points per unit before borders are moved to the next pulse.
+    Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
     """
     return _Scanner(facts, source, unit_points).run()
 
@@ -65,7 +73,7 @@ class _Scanner:
         self._window: list[_Part] = []
 
     def _take_first(self) -> np.ndarray:
-        """The first points that have packets."""
+        """Those of the first points that have packets."""
         most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.point_length)
         points = self._source.read(0, min(self._facts.point_count, most))
         return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
@@ -93,7 +101,7 @@ class _Scanner:
         return self._finish(packets - len(overfull), reach, overfull)
 
     def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Every unit's first index and points; borders are noted on the way."""
+        """Yields first index and points of each unit, and collects the borders."""
         step, count = self._unit_points, self._facts.point_count
         held = np.empty(0, self._facts.dtype)
         for begin in range(0, count, step):
@@ -140,7 +148,7 @@ class _Scanner:
         self._votes.add_pairs(np.stack([locate(first, self._facts), locate(second, self._facts)]), first, second)
 
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
-        """Finds sharing among the packets of suspect parts wherever their points are, and adds it to the context."""
+        """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
         borders = np.array(self._borders)
         count = int(self._tally.reasons[Reason.USABLE])
         far = find_far(self._suspect_keys(suspects), count, borders)
@@ -153,9 +161,13 @@ class _Scanner:
             far.wants.close()
         return far.packets, far.reach, far.overfull
 
+    def _judge_again(self, overfull: np.ndarray | None = None) -> Iterator[tuple[int, Judged]]:
+        """First index and check of each unit, for passes after the first one."""
+        for start, stop in itertools.pairwise(self._borders):
+            yield start, self._judge.judge(self._source.read(start, stop), self._form, overfull)
+
     def _suspect_keys(self, suspects: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            judged = self._judge.judge(self._source.read(start, stop), self._form)
+        for start, judged in self._judge_again():
             rows = np.flatnonzero(judged.usable)
             rows = rows[self._near.is_suspect(judged.keys[rows], suspects)]
             yield judged.keys[rows], start + rows
@@ -167,7 +179,7 @@ class _Scanner:
         self._context.append(wants["unit"], entries)
 
     def _vote_far(self) -> None:
-        """In a shuffled strip the returns of a packet meet only through the context: some units are asked again."""
+        """Some units vote again with their context: in a shuffled strip only there the returns of a packet meet."""
         units = len(self._borders) - 1
         for unit in range(0, units, max(1, units // _FAR_SAMPLES)):
             start, stop = self._borders[unit], self._borders[unit + 1]
@@ -181,11 +193,11 @@ class _Scanner:
             self._vote(group_keys(parts.keys), parts, np.ones(len(rows), bool))
 
     def _count_overfull(self, overfull: np.ndarray) -> None:
-        for start, stop in zip(self._borders[:-1], self._borders[1:], strict=True):
-            reason = self._judge.judge(self._source.read(start, stop), self._form, overfull).reason
-            many = int((reason == Reason.OVERFULL).sum())
+        for start, judged in self._judge_again(overfull):
+            here = judged.reason == Reason.OVERFULL
+            many = int(here.sum())
             if many and self._tally.first[Reason.OVERFULL] < 0:
-                self._tally.first[Reason.OVERFULL] = start + int(np.argmax(reason == Reason.OVERFULL))
+                self._tally.first[Reason.OVERFULL] = start + int(np.argmax(here))
             self._tally.reasons[Reason.OVERFULL] += many
             self._tally.reasons[Reason.USABLE] -= many
 
@@ -220,18 +232,18 @@ class _Scanner:
 
 
 class _Part:
-    """Usable points of one unit, as far as they matter to the next ones."""
+    """Usable points of one unit that following units may share packets with."""
 
     def __init__(self, keys: np.ndarray, index: np.ndarray, unit: int, points: np.ndarray, start: int) -> None:
         self.keys, self.index, self.unit = keys, index, unit
         self._points, self._start = points, start
 
     def take(self, rows: np.ndarray) -> np.ndarray:
-        """Records of the usable points `rows`."""
+        """Returns the records of the usable points `rows`."""
         return take_records(self._points, self.index[rows] - self._start)
 
     def tail(self, least: int) -> _Part:
-        """The part from file index `least` on; copied where that frees memory."""
+        """The part from file index `least` on; a copy if that frees memory."""
         at = int(np.searchsorted(self.index, least))
         if not at:
             return self
@@ -241,7 +253,7 @@ class _Part:
 
 
 class _Parts:
-    """Several parts one after the other."""
+    """Several parts in one sequence."""
 
     def __init__(self, parts: list[_Part]) -> None:
         self.keys = np.concatenate([part.keys for part in parts])
@@ -251,7 +263,7 @@ class _Parts:
         self._parts = parts
 
     def take(self, rows: np.ndarray) -> np.ndarray:
-        """Records at `rows` of all parts."""
+        """Returns the records at `rows` of the whole sequence."""
         taken, places = [], []
         for start, stop, part in zip(self._starts[:-1], self._starts[1:], self._parts, strict=True):
             here = np.flatnonzero((rows >= start) & (rows < stop))
@@ -263,22 +275,22 @@ class _Parts:
 
 
 def _find_cut(before: np.ndarray, after: np.ndarray) -> int:
-    """How many points behind a border belong to the unit before it, because they are of the pulse that it would cut."""
+    """Number of points after a border that belong to the pulse before it, and so to the unit before it."""
     time = before[-1]
     head = np.flatnonzero(after != time)
     tail = np.flatnonzero(before[::-1] != time)
-    behind = int(head[0]) if len(head) else len(after)
-    ahead = int(tail[0]) if len(tail) else len(before)
-    return behind if behind + ahead < LONGEST_RUN else 0
+    after_border = int(head[0]) if len(head) else len(after)
+    before_border = int(tail[0]) if len(tail) else len(before)
+    return after_border if after_border + before_border < LONGEST_RUN else 0
 
 
 def locate(points: np.ndarray, facts: StripFacts) -> np.ndarray:
-    """Coordinates of records (n,), f8 (n, 3) [m]."""
+    """Return coordinates of records (n,), f8 (n, 3) [m]."""
     axes = zip("XYZ", facts.scales, facts.offsets, strict=True)
     return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
 
 
 def unique_entries(entries: np.ndarray) -> np.ndarray:
-    """Context entries by file index, each once: what crosses a border nearby may be found twice."""
+    """Return context entries by file index, each once; near and far search may both find the same point."""
     _, first = np.unique(entries["index"], return_index=True)
     return entries[first]

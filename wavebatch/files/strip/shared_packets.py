@@ -1,9 +1,9 @@
-"""Which points share a packet: looked for near the borders of the units first, over the whole strip only where needed.
+"""Search for points of different units that share a packet: near the borders first, over the whole strip if needed.
 
-A unit needs the points of other units that share packets with its own: its context. While the strip is read in order,
-points within a window before each border are compared with the unit behind it. At the same time every part of the
-packet file remembers the first and the last point that refers to it; where these lie closer together than the window,
-nothing can have been missed. Only packets in other parts go through the disk.
+The scan uses it. A unit needs the points of other units that share packets with its points: its context. The near
+search compares each unit with a window of points before it. It also notes, for each bin of the packet file, the first
+and the last point that refers to it: if these are closer than the window, nothing was missed. Only packets of the
+other, suspect bins go through a sort on disk. Both searches must find the same groups; the tests compare them.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.packet_check import INDEX_BITS
 
 WINDOW = 16_384
-"""Points before a border among which shared packets are found while reading on."""
+"""Points before a border that are compared with the unit after it; vendors write returns of a pulse together."""
 MAX_RETURNS = 32
-"""More points than this on one packet are damage: LAS knows 15 returns."""
+"""More points on one packet are damage: LAS has at most 15 returns."""
 BINS = 1 << 18
+"""Bins of the packet file: 5 MiB of memory."""
 _LEAST_BIN = 64
 _PER_BUCKET = 500_000
+"""Keys that are sorted at a time, about 20 MB."""
 _KEY = np.dtype([("key", "<u8"), ("index", "<i8")])
 _WANT = np.dtype([("index", "<i8"), ("unit", "<i8")])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Groups:
-    """Entries sorted by key, then place: group g is order[starts[g]:starts[g] + counts[g]]."""
+    """Entries sorted by key, then by place: group g is order[starts[g] : starts[g] + counts[g]]."""
 
     order: np.ndarray
     starts: np.ndarray
@@ -38,7 +40,7 @@ class Groups:
 
 
 def group_keys(keys: np.ndarray) -> Groups:
-    """Groups of equal keys (n,)."""
+    """Return the groups of equal keys (n,)."""
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     new = np.ones(len(keys), bool)
@@ -48,16 +50,16 @@ def group_keys(keys: np.ndarray) -> Groups:
 
 
 def expand(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """All of start, start + 1 ... start + count - 1 for every pair, one after the other."""
+    """Return start, start + 1, ..., start + count - 1 of all pairs in one array."""
     total = int(counts.sum())
     begin = np.cumsum(counts) - counts
     return np.arange(total) + np.repeat(starts - begin, counts)
 
 
 def cross_units(groups: Groups, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (unit, entry): the entry shares a key with entries of that unit, but lies in another.
+    """Return pairs (unit, entry): the entry shares a key with entries of that unit, but lies in another unit.
 
-    unit: of every entry (n,), growing within a group.
+    unit: unit of each entry (n,), ascending within a group.
     """
     lead = groups.starts
     last = lead + groups.counts - 1
@@ -76,7 +78,7 @@ def cross_units(groups: Groups, unit: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 class NearSharing:
-    """Follows the strip unit by unit and collects what is shared across borders within the window."""
+    """Near search: takes the strip unit by unit and collects what is shared across borders within the window."""
 
     def __init__(self, low: int, high: int, context: Spool) -> None:
         self._low = np.uint64(low)
@@ -90,9 +92,18 @@ class NearSharing:
         self.overfull: list[np.ndarray] = []
 
     def add(self, keys: np.ndarray, index: np.ndarray, unit: np.ndarray, own: np.ndarray, records: Callable) -> Groups:
-        """Takes one unit with the window before it: keys (n,), ascending file index, unit and whether it is this one's.
+        """Take one unit with the window before it and return the groups of its keys.
 
-        records(rows) gives the entries of `context` for some of the n points. Returns the groups.
+        Parameters
+        ----------
+        keys : u8 (n,)
+            Keys of usable packets; see `packet_check.Judged`.
+        index, unit : i8 (n,)
+            Ascending file index, and number of the unit.
+        own : bool (n,)
+            Whether the point belongs to this unit, not to the window.
+        records : function
+            From row numbers to the entries of these points for the context.
         """
         groups = group_keys(keys)
         first, last = groups.order[groups.starts], groups.order[groups.starts + groups.counts - 1]
@@ -120,31 +131,31 @@ class NearSharing:
         return (((keys >> INDEX_BITS) - self._low) // self._width).astype(np.int64)
 
     def suspects(self) -> np.ndarray:
-        """Parts of the packet file whose points lie too far apart for the window: bool per part."""
+        """Return for each bin whether its points lie too far apart for the window."""
         return (self._last - self._first) >= WINDOW
 
     def is_suspect(self, keys: np.ndarray, suspects: np.ndarray) -> np.ndarray:
-        """Whether keys (n,) lie in such a part."""
+        """Return whether keys (n,) lie in suspect bins, bool (n,)."""
         return suspects[self._bin(keys)]
 
     def count_packets(self, suspects: np.ndarray) -> int:
-        """Different packets in all other parts."""
+        """Return the number of different packets in all other bins."""
         return int(self._new[~suspects].sum())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FarSharing:
-    """What the packets of suspect parts turned out to be."""
+    """Result of the far search."""
 
     wants: Spool
-    """Per unit: which of its points which other unit needs."""
+    """For each unit: which of its points which other unit needs."""
     packets: int
     reach: int
     overfull: np.ndarray
 
 
 def find_far(units: Iterable[tuple[np.ndarray, np.ndarray]], count: int, borders: np.ndarray) -> FarSharing:
-    """Sharing among all keys that `units` give as (keys, file index), `count` in all, in bounded memory."""
+    """Far search among all keys of `units`, as (keys, file index), `count` in all, in bounded memory."""
     buckets = count // _PER_BUCKET + 1
     spool = Spool(buckets, _KEY)
     wants = Spool(len(borders) - 1, _WANT)
@@ -181,7 +192,7 @@ def _append_wants(wants: Spool, groups: Groups, index: np.ndarray, borders: np.n
 
 
 def _read_bucket(spool: Spool, bucket: int) -> np.ndarray:
-    """Entries of a bucket in file order; of packets with too many points only the first few, enough to know that."""
+    """Entries of a bucket in file order; of overfull packets only the first ones, enough to know them."""
     held = np.empty(0, _KEY)
     for part in spool.pieces(bucket):
         held = np.concatenate([held, part])

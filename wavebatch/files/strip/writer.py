@@ -1,4 +1,8 @@
-"""Full-waveform strips written from arrays: points with packets, inside the file or in a .wdp beside it."""
+"""Writer of full-waveform strips from arrays: points with packets, in the file itself or in a .wdp next to it.
+
+`wavebatch simulate` and `wavebatch slice` write strips with it, and so do the tests. Vectors of points are passed
+toward the sensor; `toward=False` stores them the other way round.
+"""
 
 from __future__ import annotations
 
@@ -7,41 +11,52 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
+from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import (
-    EVLR_HEADER_SIZE,
-    WAVES_EXTERNAL,
-    WAVES_INTERNAL,
-    WKT_BIT,
-    LasHeader,
-    Vlr,
-    build_wkt,
-)
+from wavebatch.files.las.header import EVLR_HEADER_SIZE, WAVES_EXTERNAL, WAVES_INTERNAL, LasHeader, Vlr
 from wavebatch.files.las.write_points import PointFile, waveform_head
 
 _FORMATS = {(1, 3): (4, 5), (1, 4): (4, 5, 9, 10), (1, 5): (9, 10)}
 _DESCRIPTOR = np.dtype(
     [("bits", "u1"), ("compression", "u1"), ("samples", "<u4"), ("ps", "<u4"), ("gain", "<f8"), ("offset", "<f8")]
 )
-_CREATION = (1, 2025)
-"""Day and year in every header: the same input gives the same bytes on any day."""
 
 
-class FullwaveWriter:
-    """Streams a full-waveform strip: `write_packets`, `write_points` with the offsets it returned, then `commit`.
+class FullwaveWriter(PointFile):
+    """Writes a full-waveform strip: `write_packets`, `write_points` with the offsets it returned, then `commit`.
 
-    target: its suffix says LAS or LAZ. version: "1.3", "1.4" or "1.5". point_format: 4, 5, 9 or 10 (9, 10 from 1.4 on).
-    internal: packets in the file itself (spooled beside it until commit), else in a .wdp of its name.
-    digitizers: with 8, 16 or 32 bits; the index of one is what its points carry. wkt: CRS, or None.
-    extra_bytes: one ExtraRecord per extra dimension. records: further VLRs, as they are. toward: how the vectors
-    x_t, y_t, z_t are stored; points are always handed in with vectors toward the sensor, and turned round here when
-    this is False.
-    As a context manager it aborts itself unless committed. Raises ConfigError and InputError as CloudWriter does.
+    Parameters
+    ----------
+    target : Path
+        The strip; its suffix selects LAS or LAZ.
+    version : str
+        "1.3", "1.4" or "1.5".
+    point_format : int
+        4, 5, 9 or 10; 9 and 10 need version 1.4 or 1.5.
+    internal : bool
+        Packets go into the strip itself (until `commit` they are in a file next to it), else into a .wdp of its name.
+    digitizers : sequence of Digitizer
+        With 8, 16 or 32 bits; points refer to a digitizer by its index.
+    scales, offsets : sequence of 3 floats
+        Of the stored coordinates [m].
+    wkt : str or None
+        The CRS.
+    extra_bytes : sequence of ExtraRecord
+        One per extra dimension.
+    records : sequence of Vlr
+        Further VLRs, written unchanged.
+    toward : bool
+        Whether the vectors x_t, y_t, z_t are stored toward the sensor.
+
+    Raises
+    ------
+    ConfigError
+        For a version, point format or digitizer that no strip can have.
+    InputError
+        If the target exists (without overwrite) or cannot be written.
     """
 
     def __init__(
@@ -60,43 +75,38 @@ class FullwaveWriter:
         toward: bool = True,
         overwrite: bool = False,
     ) -> None:
-        self.target = Path(target)
-        numbers = _check_version(self.target, version, point_format)
-        self._digitizers = {digitizer.index: digitizer for digitizer in _check_digitizers(self.target, digitizers)}
-        self.dtype = build_dtype(point_format, extra_bytes)
+        target = Path(target)
+        numbers = _check_version(target, version, point_format)
+        _check_digitizers(target, digitizers)
+        self._digitizers = {digitizer.index: digitizer for digitizer in digitizers}
         self._internal, self._toward = internal, toward
-        header = _build_header(numbers, point_format, internal, digitizers, wkt)
-        header.vlrs += records
-        header.scales, header.offsets = tuple(map(float, scales)), tuple(map(float, offsets))
-        self._file = PointFile(self.target, header, self.dtype, extra_bytes, overwrite=overwrite)
-        beside = self.target.with_suffix(".wdp")
+        header = LasHeader.new(
+            numbers, point_format, scales, offsets, wkt, WAVES_INTERNAL if internal else WAVES_EXTERNAL
+        )
+        header.vlrs = [*map(_build_descriptor, digitizers), *header.vlrs, *records]
+        super().__init__(target, header, build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
+        packet_file = target.with_suffix(".wdp")
         try:
             if not (internal or overwrite):
-                refuse_existing(beside)
-            self._packets = Draft(beside, overwrite=overwrite)
+                refuse_existing(packet_file)
+            self._packets = Draft(packet_file, overwrite=overwrite)
         except InputError:
-            self._file.abort()
+            self.abort()
             raise
+        self.drafts.insert(0, self._packets)
         with reporting(self.target):
             self._packets.file.write(waveform_head(0))
         self._end = EVLR_HEADER_SIZE
-        self._open = True
-
-    def __enter__(self) -> FullwaveWriter:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.abort()
 
     def write_packets(self, samples: np.ndarray, digitizer: int) -> np.ndarray:
-        """Appends packets of raw counts (n, s), s at most the digitizer's samples; returns byte offsets, u8 (n,).
+        """Append packets of raw counts (n, s), s at most the digitizer's samples; return their byte offsets, u8 (n,).
 
-        The size to put in a point is s times the digitizer's bytes per sample.
+        The packet size of a point is s times the digitizer's bytes per sample.
         """
         known = self._digitizers.get(digitizer)
         samples = np.asarray(samples)
         if known is None or samples.ndim != 2 or samples.shape[1] > known.n_samples:
-            raise ConfigError(f"{self.target}: samples {samples.shape} do not suit digitizer {digitizer}")
+            raise ConfigError(f"{self.target}: samples of shape {samples.shape} do not fit digitizer {digitizer}")
         if samples.size and (samples.dtype.kind not in "ui" or samples.min() < 0 or samples.max() > known.max_count):
             raise ConfigError(f"{self.target}: samples must be whole numbers from 0 to {known.max_count}")
         stored = np.ascontiguousarray(samples, dtype=f"<u{known.bits // 8}")
@@ -109,88 +119,45 @@ class FullwaveWriter:
         return offsets
 
     def write_points(self, points: np.ndarray) -> None:
-        """Appends points of `dtype`, their vectors toward the sensor."""
+        """Append points (n,) of `dtype`, with vectors toward the sensor."""
         if not self._toward:
             points = points.copy()
             for name in ("x_t", "y_t", "z_t"):
                 points[name] = -points[name]
-        self._file.write(points)
+        self.write(points)
 
-    def commit(self) -> None:
-        """Completes and publishes the strip (and its .wdp, first); on an error nothing of it remains."""
-        length = self._end - EVLR_HEADER_SIZE
-        try:
-            self._file.finish_points()
-            with reporting(self.target):
-                self._packets.file.seek(0)
-                self._packets.file.write(waveform_head(length))
-            if self._internal:
-                source = self._packets.file
-                self._file.append_record(waveform_head(length), source, EVLR_HEADER_SIZE, self._end, waveforms=True)
-            self._file.finish()
-        except BaseException:
-            self.abort()
-            raise
+    def _append_records(self) -> None:
+        head = waveform_head(self._end - EVLR_HEADER_SIZE)
+        with reporting(self.target):
+            self._packets.file.seek(0)
+            self._packets.file.write(head)
         if self._internal:
+            self.append_record(head, self._packets.file, EVLR_HEADER_SIZE, self._end, waveforms=True)
             self._packets.discard()
-            publish_together([self._file.draft])
-        else:
-            publish_together([self._packets, self._file.draft])
-        self._open = False
-
-    def abort(self) -> None:
-        """Removes what was written so far; harmless after commit."""
-        if self._open:
-            self._packets.discard()
-            self._file.abort()
-            self._open = False
+            self.drafts.remove(self._packets)
 
 
 def _check_version(target: Path, version: str, point_format: int) -> tuple[int, int]:
     numbers = tuple(int(part) for part in version.split(".") if part.isdigit())
     if point_format not in _FORMATS.get(numbers, ()):
         raise ConfigError(
-            f"{target}: LAS {version} with point format {point_format} is no waveform file; 1.3 takes 4 and 5, "
-            "1.4 takes 4, 5, 9 and 10, 1.5 takes 9 and 10"
+            f"{target}: LAS {version} has no waveforms in point format {point_format}; choose format 4 or 5 for 1.3; "
+            "4, 5, 9 or 10 for 1.4; 9 or 10 for 1.5"
         )
     return numbers
 
 
-def _check_digitizers(target: Path, digitizers: Sequence[Digitizer]) -> Sequence[Digitizer]:
+def _check_digitizers(target: Path, digitizers: Sequence[Digitizer]) -> None:
     indices = [digitizer.index for digitizer in digitizers]
     if not indices or len(set(indices)) < len(indices) or not all(1 <= index <= 255 for index in indices):
         raise ConfigError(f"{target}: digitizers need different indices from 1 to 255, got {indices}")
     for digitizer in digitizers:
         if digitizer.bits not in (8, 16, 32):
             raise ConfigError(f"{target}: digitizer {digitizer.index} has {digitizer.bits} bits, not 8, 16 or 32")
-    return digitizers
 
 
-def _build_header(
-    version: tuple[int, int], point_format: int, internal: bool, digitizers: Sequence[Digitizer], wkt: str | None
-) -> LasHeader:
-    encoding = 1 | (WAVES_INTERNAL if internal else WAVES_EXTERNAL)
-    return LasHeader(
-        version=version,
-        point_format=point_format,
-        point_length=0,
-        scales=(0.001,) * 3,
-        offsets=(0.0,) * 3,
-        vlrs=_build_vlrs(digitizers, wkt),
-        global_encoding=encoding | (WKT_BIT if point_format >= 6 or (wkt and version >= (1, 4)) else 0),
-        system_identifier=b"OTHER",
-        generating_software=f"wavebatch {__version__}".encode(),
-        creation=_CREATION,
-    )
-
-
-def _build_vlrs(digitizers: Sequence[Digitizer], wkt: str | None) -> list[Vlr]:
-    vlrs = []
-    for digitizer in digitizers:
-        spacing = round(digitizer.spacing * PS_PER_NS)
-        values = (digitizer.bits, 0, digitizer.n_samples, spacing, digitizer.gain, digitizer.offset)
-        payload = np.array([values], _DESCRIPTOR).tobytes()
-        vlrs.append(Vlr(b"LASF_Spec", 99 + digitizer.index, payload, b"wave packet descriptor"))
-    if wkt:
-        vlrs.append(build_wkt(wkt))
-    return vlrs
+def _build_descriptor(digitizer: Digitizer) -> Vlr:
+    spacing = round(digitizer.spacing * PS_PER_NS)
+    values = (digitizer.bits, 0, digitizer.n_samples, spacing, digitizer.gain, digitizer.offset)
+    payload = np.array([values], _DESCRIPTOR).tobytes()
+    return Vlr(b"LASF_Spec", 99 + digitizer.index, payload, b"wave packet descriptor")

@@ -1,4 +1,4 @@
-"""The system pulse learned from isolated echoes: aligned, stacked, fitted by a sum of Gaussians (docs/algorithms.md R2)."""
+"""The system pulse from isolated echoes: aligned, stacked, fitted by a sum of Gaussians (docs/algorithms.md R2)."""
 
 from __future__ import annotations
 

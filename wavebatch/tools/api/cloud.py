@@ -62,7 +62,7 @@ class _TableReader(ColumnReader):
         try:
             found = {name: self._find(stored) for name, stored in chosen.items()}
         except BaseException:
-            self._file.close()
+            self.close()
             raise
         self._readers = {name: read for name, (_, read) in found.items()}
         self._stored = {name: facts.name for name, (facts, _) in found.items()}
@@ -71,7 +71,7 @@ class _TableReader(ColumnReader):
     def _name_columns(self) -> dict[str, str]:
         """Name of every column in the table -> its name in the file."""
         known = self.list_columns()
-        extra = [one for one in self._header.point_format.extra_dimensions if one.num_elements == 1]
+        extra = [one for one in self._format.extra_dimensions if one.num_elements == 1]
         ours = {one.name: name for name, one in find_columns(extra, COLUMNS).items() if name not in known}
         axes = {axis: axis for axis in "xyz"}
         standard = {name: name for name in known if name not in axes and name not in {one.name for one in extra}}
@@ -80,15 +80,16 @@ class _TableReader(ColumnReader):
     def _choose_dtype(self, stored: str) -> np.dtype:
         if stored in ("x", "y", "z", "scan_angle"):
             return np.dtype(np.float64)
-        dimension = self._header.point_format.dimension_by_name(stored)
+        dimension = self._format.dimension_by_name(stored)
         dtype = np.dtype(dimension.dtype if dimension.dtype is not None else np.uint8)  # bit fields have none
         is_whole = dtype.kind != "f" and dimension.scales is None and dimension.no_data is None
         return dtype if is_whole or dtype.kind == "f" and dimension.scales is None else np.dtype(np.float64)
 
-    def _convert(self, points) -> np.ndarray:
-        rows = np.empty(len(points), self.dtype)
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        rows = np.empty(len(raw), self.dtype)
         for name, read in self._readers.items():
+            stored = self._stored[name]
             # Integers without no-data are copied: those above 2^53 are no floating-point numbers.
-            whole = self.dtype[name].kind in "ui"
-            rows[name] = np.asarray(points[self._stored[name]]) if whole else read(points)
+            whole = self.dtype[name].kind in "ui" and stored in raw.dtype.names
+            rows[name] = raw[stored] if whole else read(raw)
         return rows

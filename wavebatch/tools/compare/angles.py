@@ -71,7 +71,7 @@ def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0)
     if b is None:
         with AngleReader(a) as cloud:
             _demand(cloud, WIDTHS, NORMALS)
-            for rows in cloud.read_angles():
+            for rows in cloud.read_pieces():
                 tally.add(rows, rows)
         return tally.finish(str(a), None)
     with AngleReader(a) as first, AngleReader(b) as second:
@@ -98,7 +98,7 @@ def _pair(widths: AngleReader, normals: AngleReader, reach: float, tally: _Tally
     number = count_buckets(max(widths.point_count, normals.point_count))
     with Buckets(ANGLE_DTYPE, number) as first, Buckets(ANGLE_DTYPE, number) as second:
         for cloud, buckets in ((widths, first), (normals, second)):
-            for rows in cloud.read_angles():
+            for rows in cloud.read_pieces():
                 finite = np.isfinite(rows["gps_time"]) & np.isfinite(rows["xyz"]).all(axis=1)
                 buckets.add(rows[finite], lambda part: sort_by_time(part["gps_time"], number))
         for bucket in range(number):

@@ -22,6 +22,9 @@ FARTHEST = 1e-3
 MOST = 24
 """Most waveforms of a picture: more would be too small to read."""
 
+MOST_ON_SHEET = 100
+"""Most waveforms of a contact sheet."""
+
 _BLOCK = 4096
 """Waveforms that run through the chain at once when flags are searched."""
 
@@ -40,6 +43,17 @@ class Wanted:
     """EchoFlag bits: the first waveforms with an echo that has one of them."""
     most: int = 6
     """Most waveforms with flags, or spread evenly."""
+    random: int = 0
+    """Number of packets to draw at random; 0: none."""
+    seed: int = 0
+    """Seed of the random packets."""
+    sheet: bool = False
+    """Whether the picture is a contact sheet."""
+
+    @property
+    def limit(self) -> int:
+        """Most waveforms of the picture."""
+        return MOST_ON_SHEET if self.sheet else MOST
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +73,7 @@ def find_places(
     """Places of the wanted waveforms, each once: packets, then points, then times, in the given order.
 
     run: gives the echoes of a block; only used to search for flags. Raises ConfigError for packets, points and times
-    that the strip does not have and for more than MOST waveforms, InputError if the strip has no waveform.
+    that the strip does not have and for more waveforms than fit, InputError if the strip has no waveform.
     """
     path = reader.facts.path
     if not scan.packets:
@@ -69,8 +83,8 @@ def find_places(
     searches = [_Number(number) for number in _list_numbers(scan, wanted, str(path))]
     searches += [_Point(point) for point in wanted.points]
     searches += [_Time(time) for time in wanted.times]
-    if len(searches) > MOST:
-        raise ConfigError(f"{path}: {len(searches)} waveforms are too many for a picture; {MOST} fit")
+    if len(searches) > wanted.limit:
+        raise ConfigError(f"{path}: {len(searches)} waveforms are too many for a picture; {wanted.limit} fit")
     for point in wanted.points:
         if not 0 <= point < scan.points:
             raise ConfigError(f"{path}: there is no point {point}; points are 0 to {scan.points - 1}")
@@ -85,15 +99,18 @@ def find_places(
 
 def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
     """Numbers of the wanted packets; by default a few, spread evenly."""
+    if wanted.random:
+        number = min(wanted.random, scan.packets)
+        return np.sort(np.random.default_rng(wanted.seed).choice(scan.packets, number, replace=False)).tolist()
     if not (wanted.packets or wanted.points or wanted.times):
-        return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, MOST)).round().astype(int)).tolist()
+        return np.unique(np.linspace(0, scan.packets - 1, min(wanted.most, wanted.limit)).round().astype(int)).tolist()
     numbers: list[int] = []
     for first, end in wanted.packets:
         end = scan.packets if end is None else end
         if not 0 <= first < end <= scan.packets:
             span = str(first) if end == first + 1 else f"{first}:{end}"
             raise ConfigError(f"{path}: there is no packet {span}; packets are 0 to {scan.packets - 1}")
-        numbers += range(first, min(end, first + MOST + 1))
+        numbers += range(first, min(end, first + wanted.limit + 1))
     return numbers
 
 
@@ -183,7 +200,7 @@ def _find_flagged(
 ) -> list[Place]:
     """The first waveforms in the file with an echo that has one of the flags."""
     found: list[Place] = []
-    most = min(wanted.most, MOST)
+    most = min(wanted.most, wanted.limit)
     for unit, base in _read_units(reader, scan):
         rows = np.flatnonzero(unit.packets.owned)
         for begin in range(0, len(rows), _BLOCK):

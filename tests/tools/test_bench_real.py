@@ -1,0 +1,221 @@
+"""`wavebatch bench --real` on simulated strips, where what it should report is known, and on the real ones."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.signal import lfilter
+from strips import make_raw
+
+from wavebatch.cli import main
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.surveying import Survey
+from wavebatch.tools.bench.real import measure_real
+from wavebatch.tools.bench.real.agreement import compare_solvers
+from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
+from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, read_pool
+from wavebatch.tools.bench.real.report import format_report
+from wavebatch.tools.bench.real.templates import learn_templates
+from wavebatch.tools.simulate import simulate_strip
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    """Mostly single echoes, Gaussian pulse, white noise of 1 DN before rounding."""
+    path = tmp_path_factory.mktemp("real") / "urban.las"
+    simulate_strip("urban", path, pulses=3000, seed=3)
+    return path
+
+
+@pytest.fixture(scope="module")
+def report(strip):
+    return measure_real(strip)
+
+
+def correlated(n, s, rho=0.6, std=0.9, seed=1):
+    """Values of first-order autoregressive noise."""
+    white = np.random.default_rng(seed).normal(0, std * np.sqrt(1 - rho**2), (n, s + 50))
+    return lfilter([1], [1, -rho], white, axis=1)[:, 50:]
+
+
+def make_pool(samples, path="made.las"):
+    return Pool(path, (WaveformBlock.from_samples(samples),), ())
+
+
+def level_solver(**system):
+    return Solver.of_blocks([], lambda blocks: Survey(SystemPulse(**system), 0, {}, ()))
+
+
+def test_strong_echoes_are_found_and_weak_ones_are_not(report):
+    rows = {row.low: row for row in report.quiet_by_sigma}
+    assert rows[10.0].recall > 0.99 and rows[20.0].recall > 0.99 and rows[5.0].recall > 0.95
+    assert rows[3.0].recall < 0.97
+    near = [row for row in report.near_by_separation if abs(row.apart[0]) >= 2 and row.low >= 10 and row.injected]
+    assert sum(row.found for row in near) > 0.97 * sum(row.injected for row in near) > 100
+    close = [row for row in report.near_by_separation if abs(row.apart[0]) == 0.5 and row.low == 5 and row.injected]
+    assert sum(row.found for row in close) < 0.5 * sum(row.injected for row in close)
+    assert report.split.extra < 0.02 * report.split.injected
+
+
+def test_reported_errors_are_right_where_the_noise_is_white(report):
+    whole = [row for row in report.calibration if (row.where, row.high) == ("quiet", np.inf)][-1]
+    assert whole.low == 8.0 and whole.echoes > 2000 and whole.gross < 0.01
+    assert whole.ratio == pytest.approx((1, 1, 1), abs=0.1)
+    assert np.abs(whole.bias) == pytest.approx(0, abs=0.1) and abs(whole.bias[0]) < 0.01
+
+
+def test_few_false_echoes_and_surveys_that_agree(report):
+    false = report.false_echoes
+    assert false.correctness > 0.995 and false.before.length > 1e4
+    for part in (false.before, false.after):
+        assert part.echoes < 1e-4 * part.length + 3 and part.mirrored < 1e-4 * part.length + 3
+    assert [row.parts for row in report.agreement] == ["even/odd", "first/last", "west/east", "in order/shuffled"]
+    for row in report.agreement:
+        assert row.differ < 0.02 and row.apart < 0.02 and abs(row.amplitude_ratio - 1) < 0.005
+        assert row.packets == report.waveforms
+
+
+def test_noise_and_templates_are_those_that_were_simulated(report):
+    assert report.noise.std == pytest.approx(np.hypot(1.0, 12**-0.5), rel=0.03)
+    assert np.abs(report.noise.correlation).max() < 0.03
+    assert report.templates.gain == pytest.approx(1, abs=0.01)
+    assert report.templates.widened == pytest.approx(1, abs=0.02)
+    assert report.templates.fwhm == pytest.approx(report.survey.fwhm, rel=0.05)
+
+
+def test_seed_decides_all_and_json_holds_it(strip):
+    few = {"injections": 300, "stability": False, "waveforms": 1200}
+    one, same, other = (replace(measure_real(strip, seed=seed, **few), seconds={}) for seed in (1, 1, 2))
+    assert one == same and one.quiet_by_sigma != other.quiet_by_sigma
+    assert json.loads(json.dumps(one.to_json()))["seed"] == 1 and one.agreement == []
+    assert "misses a goal" in format_report(one)
+
+
+def test_another_survey_can_be_measured(strip, report):
+    def deaf(blocks):
+        survey = Solver.of_blocks(blocks).survey
+        return replace(survey, system=replace(survey.system, noise_std=4 * survey.system.noise_std))
+
+    found = measure_real(strip, injections=2000, stability=False, survey_of=deaf)
+    rows = [{row.low: row.recall for row in each.quiet_by_sigma} for each in (report, found)]
+    assert rows[0][6.0] > 0.99 and rows[1][6.0] < 0.5
+    assert found.noise.std == pytest.approx(report.noise.std, rel=0.06)
+
+
+def test_values_before_rounding_keep_variance_and_correlation():
+    true = 20 + correlated(400, 120)
+    counts = np.rint(true).astype(np.uint8)
+    autocovariance = [np.mean((true[:, k:] - 20) * (true[:, : 120 - k] - 20)) for k in range(5)]
+    std = float(np.sqrt(autocovariance[0] + 1 / 12))
+    noise = QuietNoise(std, tuple(value / std**2 for value in autocovariance[1:]), counts.size)
+    drawn = unround(counts, np.full(counts.shape, 20.0), noise, np.random.default_rng(2))
+    assert np.abs(drawn - counts).max() <= 0.5
+    again = [np.mean((drawn[:, k:] - 20) * (drawn[:, : 120 - k] - 20)) for k in range(5)]
+    assert again == pytest.approx(autocovariance, rel=0.04)
+
+
+def test_noise_of_short_quiet_stretches_is_not_too_small():
+    samples = np.rint(20 + correlated(3000, 8)).astype(np.uint8)
+    pool = make_pool(samples)
+    found = measure_noise(pool, level_solver(sigma_ref=2.0, baseline=20.0), [EchoTable.empty()])
+    assert found.std == pytest.approx(np.hypot(0.9, 12**-0.5), rel=0.12)
+    assert found.correlation[0] == pytest.approx(0.6 * 0.81 / (0.81 + 1 / 12), abs=0.1)
+
+
+def test_signal_is_added_as_if_the_digitizer_had_seen_it():
+    rng = np.random.default_rng(4)
+    exact = 20 + rng.normal(0, 1, (2000, 40))
+    samples = np.rint(exact).astype(np.uint8)
+    signal = np.where(np.arange(40) < 20, 0.0, 3.3) * np.ones((2000, 1))
+    added = add_signal(samples, exact, signal, 255.0)
+    assert np.array_equal(added[:, :20], samples[:, :20])
+    assert added[:, 20:].mean() == pytest.approx(23.3, abs=0.02)
+    assert added[:, 20:].std() == pytest.approx(np.hypot(1, 12**-0.5), rel=0.01)
+    clipped = add_signal(samples, exact, 400 * signal, 60.0)
+    assert clipped.max() == 60
+
+
+def test_gaps_of_fill_are_seen_and_left_alone(strip):
+    samples = np.rint(20 + correlated(50, 100)).astype(np.uint8)
+    samples[:25, 40:60] = 0
+    fill = find_fill(samples)
+    assert fill[:25, 40:60].all() and fill.sum() == 25 * 20
+    assert not find_fill(np.zeros((3, 50), np.uint8)).any()
+    assert not find_fill((samples > 30).astype(np.uint8) + 5).any()
+
+    pool = read_pool(strip)
+    solver = Solver.of_blocks(pool.surveyed)
+    echoes = [solver.run(block) for block in pool.blocks]
+    noise = measure_noise(pool, solver, echoes)
+    templates = learn_templates(pool, solver, echoes, noise.std, np.random.default_rng(1))
+    counts = pool.blocks[0].samples[:200].copy()
+    counts[:, :] = np.rint(12 + correlated(200, counts.shape[1]))
+    counts[:, 25:] = 0
+    gapped = WaveformBlock.from_samples(counts)
+    gapped = replace(gapped, digitizer=pool.blocks[0].digitizer)
+    none = EchoTable.empty()
+    made = inject_echoes(
+        replace(pool, blocks=(gapped,)), solver, [none], templates, noise, 300, np.random.default_rng(3)
+    )
+    assert 0 < len(made) <= 150 and not made.near.any()
+
+
+def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp_path):
+    assert report.clipped is None
+    path = tmp_path / "shore.las"
+    simulate_strip("shore", path, pulses=2000, seed=3)
+    found = measure_real(path, injections=3000, stability=False)
+    assert found.clipped.injected > 50 and found.clipped.recall > 0.98
+    assert found.clipped.extra < 0.05 * found.clipped.injected
+
+
+def test_agreement_sees_a_survey_that_is_off(strip):
+    pool = read_pool(strip, 500)
+    one = Solver.of_blocks(pool.blocks)
+    wide = replace(one.survey, system=replace(one.system, noise_std=8.0, acceptance=120.0))
+    row = compare_solvers("made", one, Solver(wide, one.chain), pool.blocks)
+    assert row.differ > 0.01 and row.surveys[1].noise == 8.0
+    assert compare_solvers("same", one, one, pool.blocks).differ == 0
+
+
+def test_a_strip_of_five_packets_gives_one_line(tmp_path):
+    small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
+    with pytest.raises(InputError, match="too few to inject from; at least 16"):
+        measure_real(small)
+    result = CliRunner().invoke(main, ["bench", "--real", str(small)])
+    assert result.exit_code == 1 and result.stderr.count("\n") == 1, result.output
+    assert "five.las" in result.stderr and "name a larger strip" in result.stderr
+
+
+def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path):
+    small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
+    words = ["bench", "--real", str(small), str(strip), "--no-stability", "-o", str(tmp_path / "out")]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 1 and "== urban.las" in result.stdout and "five.las" in result.stderr
+    assert "error / reported error" in result.stdout and "surveys of parts" not in result.stdout
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"real-urban.json", "real-urban.txt"} <= names
+    document = json.loads((tmp_path / "out" / "real-urban.json").read_text("utf-8"))
+    assert document["false_echoes"]["echoes"] > 0
+    result = CliRunner().invoke(main, ["bench", "--real", str(strip), "--no-stability", "--json"])
+    assert result.exit_code == 0 and json.loads(result.stdout)["strips"][0]["strip"] == "urban.las"
+
+
+@pytest.mark.parametrize(("words", "message"), [("--real", "needs strips"), ("--real x.las fast.toml", "chain")])
+def test_wrong_usage_is_one_line(words, message):
+    result = CliRunner().invoke(main, ["bench", *words.split()])
+    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_real_strips(riegl, leica):
+    for path in (riegl, leica):
+        found = measure_real(path, injections=3000, stability=False)
+        strong = [row for row in found.quiet_by_count if row.low >= 9]
+        assert sum(row.found for row in strong) > 0.99 * sum(row.injected for row in strong) > 500
+        assert 0.5 < found.noise.std < 1.5 and found.noise.correlation[0] > 0.3
+        assert found.false_echoes.correctness > 0.95

@@ -1,0 +1,291 @@
+"""Pulses of a strip's clear echoes: many echoes of like width, aligned by their fits, make a smooth curve.
+
+Averaging takes the noise of the single echoes away ("optimal subtraction"), and a spline through samples of all
+sub-sample phases can be shifted by any delay without interpolation errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import BSpline, make_lsq_spline
+
+from wavebatch.core.echoes import UNCLEAN, EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+
+BEFORE, AFTER = 4.5, 12.5
+"""What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""
+
+LEAST_SNR = 20.0
+"""Amplitude of an echo that templates are made of, in noise standard deviations."""
+
+NEIGHBOUR = 0.05
+"""Other echoes near it are at most this share of it: after-pulses that the chain takes for echoes."""
+
+GROUP = 32
+"""Echoes in a template: they bring its noise to a sixth of one echo's."""
+
+MOST_TEMPLATES = 40
+
+TIERS = 3
+"""Classes of amplitude that templates are made for."""
+
+ALONE = 256
+"""Copies of a template that are fitted alone."""
+
+LEAST_ECHOES = 16
+"""Without so many clear echoes nothing can be injected."""
+
+TAPER = 0.15
+"""Share of either side over which a template fades to zero."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Template:
+    """The pulse of some echoes, and what the chain makes of it where nothing disturbs it.
+
+    A learned pulse never is exactly that of an echo; a fit's amplitude, time and width of this very pulse without
+    noise, on a level baseline, is therefore what injected echoes are held against.
+    """
+
+    curve: BSpline
+    """1 at its peak; 0 ns is about there."""
+    first: float
+    """Covers [first, last] [ns]."""
+    last: float
+    fwhm: float
+    """Full width at half maximum of the curve [ns]."""
+    amplitude: float
+    """Median height of its echoes [DN]."""
+    tier: int
+    """Templates of stronger echoes have a higher one: receivers are not quite linear."""
+    echoes: int
+    kind: tuple
+    """Digitizers that record alike have the same one."""
+    gain: float = 1.0
+    """Amplitude that the chain finds, over the height."""
+    delay: float = 0.0
+    """Time that it finds [ns]."""
+    sigma: float = 0.0
+    """Width that it finds [ns]."""
+
+    def evaluate(self, lag: np.ndarray) -> np.ndarray:
+        """The pulse at times after its peak [ns], any shape; it fades to 0 at both ends."""
+        inside = np.clip(lag, self.first, self.last)
+        fade = np.ones_like(inside)
+        for end in (self.first, self.last):
+            part = np.clip((end - inside) / (TAPER * end), 0.0, 1.0)
+            fade *= 0.5 - 0.5 * np.cos(np.pi * part)
+        return self.curve(inside) * fade
+
+
+@dataclass(frozen=True, slots=True)
+class TemplateSummary:
+    """The templates of a strip; medians."""
+
+    templates: int
+    echoes: int
+    """Clear echoes that they were made of."""
+    fwhm: float
+    """Of the curves themselves [ns]."""
+    gain: float
+    """Amplitude that the chain finds, over the height of the curve."""
+    widened: float
+    """Width that it finds, over that of the curve."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Donors:
+    """Clear echoes of digitizers that record alike; samples one after the other."""
+
+    lag: list[np.ndarray]
+    value: list[np.ndarray]
+    sigma: list[float]
+    amplitude: list[float]
+
+
+def digitizer_kind(block: WaveformBlock) -> tuple:
+    """What makes digitizers record alike; the number of samples does not."""
+    digitizer = block.digitizer
+    return digitizer.bits, digitizer.spacing, digitizer.gain, digitizer.offset
+
+
+def learn_templates(
+    pool: Pool, solver: Solver, echoes: Iterable[EchoTable], noise: float, rng: np.random.Generator
+) -> list[Template]:
+    """Templates of all digitizers of a strip.
+
+    echoes: of the pool's blocks. noise: standard deviation of a quiet sample [DN]. Raises InputError where there are
+    too few clear echoes.
+    """
+    kinds: dict[tuple, _Donors] = {}
+    number = 0
+    for block, table in zip(pool.blocks, echoes, strict=True):
+        donors = kinds.setdefault(digitizer_kind(block), _Donors([], [], [], []))
+        number += _collect(donors, block, table, solver, noise)
+    most = max(len(donors.sigma) for donors in kinds.values()) if kinds else 0
+    if most < LEAST_ECHOES:
+        raise InputError(
+            f"{pool.path}: {number} clear single echoes in {len(pool)} waveforms are too few to inject from; "
+            f"at least {LEAST_ECHOES} of one digitizer are needed: name a larger strip"
+        )
+    templates = []
+    for kind, donors in kinds.items():
+        largest = max((b for b in pool.blocks if digitizer_kind(b) == kind), key=lambda b: b.samples.size)
+        made = _make_templates(kind, donors, largest.spacing, solver)
+        templates += [_fit_alone(template, largest, solver, noise, rng) for template in made]
+    return templates
+
+
+def _collect(donors: _Donors, block: WaveformBlock, table: EchoTable, solver: Solver, noise: float) -> int:
+    """Adds the clear echoes of a block; how many there are."""
+    sigma, spacing, s = solver.system.sigma_ref, block.spacing, block.samples.shape[1]
+    fill = find_fill(block.samples)
+    limit = clip_level(block, solver.system.of(block))
+    time = np.arange(s) * spacing
+    rows = find_clear(table, solver, noise)
+    rows = rows[(table.time[rows] > BEFORE * sigma) & (table.time[rows] < time[-1] - 0.4 * AFTER * sigma)]
+    added = 0
+    for row in rows:
+        lag = time - table.time[row]
+        near = (lag > -BEFORE * sigma) & (lag < AFTER * sigma)
+        samples = block.samples[table.waveform[row]].astype(np.float64)
+        quiet = (lag < -BEFORE * sigma) & ~fill[table.waveform[row]]
+        if samples[near].max() >= limit or fill[table.waveform[row], near].any() or quiet.sum() < 4:
+            continue
+        level = samples[quiet]
+        kept = level[np.abs(level - np.median(level)) < 3 * noise + 1]
+        donors.lag.append(lag[near])
+        donors.value.append((samples[near] - kept.mean()) / table.amplitude[row])
+        donors.sigma.append(float(table.sigma[row]))
+        donors.amplitude.append(float(table.amplitude[row]))
+        added += 1
+    return added
+
+
+def find_clear(table: EchoTable, solver: Solver, noise: float) -> np.ndarray:
+    """Rows of strong, clean echoes without others near them."""
+    sigma = solver.system.sigma_ref
+    left, right = np.full(len(table), -np.inf), np.full(len(table), np.inf)
+    strong_left, strong_right = np.zeros(len(table)), np.zeros(len(table))
+    same = np.flatnonzero(table.waveform[1:] == table.waveform[:-1])
+    left[same + 1], right[same] = table.time[same], table.time[same + 1]
+    strong_left[same + 1], strong_right[same] = table.amplitude[same], table.amplitude[same + 1]
+    lone = (table.time - left > AFTER * sigma) | (strong_left < NEIGHBOUR * table.amplitude)
+    lone &= (right - table.time > AFTER * sigma) | (strong_right < NEIGHBOUR * table.amplitude)
+    clean = (table.flags & np.uint16(UNCLEAN)) == 0
+    return np.flatnonzero(lone & clean & (table.amplitude > LEAST_SNR * noise))
+
+
+def _make_templates(kind: tuple, donors: _Donors, spacing: float, solver: Solver) -> list[Template]:
+    """Templates of groups of like amplitude and width; the widest tenth, plants and slopes, is left out."""
+    sigma, amplitude = np.array(donors.sigma), np.array(donors.amplitude)
+    if len(sigma) < LEAST_ECHOES:
+        return []
+    order = np.argsort(sigma, kind="stable")
+    order = order[int(0.02 * len(order)) : max(int(0.9 * len(order)), LEAST_ECHOES)]
+    number = int(np.clip(len(order) // GROUP, 1, MOST_TEMPLATES))
+    tiers = 1 if number < 2 * TIERS else TIERS
+    templates = []
+    for tier, part in enumerate(np.array_split(order[np.argsort(amplitude[order], kind="stable")], tiers)):
+        part = part[np.argsort(sigma[part], kind="stable")]
+        for rows in np.array_split(part, max(number // tiers, 1)):
+            templates.append(_make_template(kind, donors, rows, spacing, tier, solver.system.sigma_ref))
+    return templates
+
+
+def _make_template(kind: tuple, donors: _Donors, rows: np.ndarray, spacing: float, tier: int, width: float) -> Template:
+    """A cubic spline through the samples of some echoes, scaled to a peak of 1. width: of the system pulse [ns]."""
+    lag = np.concatenate([donors.lag[row] for row in rows])
+    value = np.concatenate([donors.value[row] for row in rows])
+    weight = np.concatenate([np.full(len(donors.lag[row]), donors.amplitude[row]) for row in rows])
+    order = np.argsort(lag, kind="stable")
+    lag, value, weight = lag[order], value[order], weight[order]
+    first, last = _covered(lag, spacing, len(rows))
+    inside = (lag >= first) & (lag <= last)
+    curve = _fit_spline(lag[inside], value[inside], weight[inside], max(0.5 * spacing, width / 3))
+    fine = np.linspace(first, last, 4096)
+    height = float(curve(fine).max())
+    above = fine[curve(fine) > 0.5 * height]
+    amplitude = height * float(np.median(np.array(donors.amplitude)[rows]))
+    curve = BSpline(curve.t, curve.c / height, 3)
+    return Template(curve, first, last, float(above[-1] - above[0]), amplitude, tier, len(rows), kind)
+
+
+def _fit_alone(
+    template: Template, block: WaveformBlock, solver: Solver, noise: float, rng: np.random.Generator
+) -> Template:
+    """The template with what the chain makes of it, alone on a level baseline at any sub-sample phase.
+
+    Where the chain takes most copies for several echoes, the strongest one counts.
+    """
+    system = solver.system.of(block)
+    s = block.samples.shape[1]
+    end = (s - 1) * block.spacing
+    middle = np.clip(0.5 * end, -template.first, max(end - template.last, -template.first))
+    time = middle + rng.uniform(-0.5, 0.5, ALONE) * block.spacing
+    signal = template.amplitude * template.evaluate(np.arange(s) * block.spacing - time[:, None])
+    # Some noise, because chains expect it; the mean of many fits has little of it.
+    samples = np.rint(system.baseline + signal + rng.normal(0.0, noise, signal.shape))
+    top = min(clip_level(block, system) - 1, np.iinfo(block.samples.dtype).max)
+    found = solver.run(bare_block(block, np.clip(samples, 0, top).astype(block.samples.dtype)))
+    best = np.full(ALONE, -1)
+    order = np.lexsort((found.amplitude, found.waveform))
+    best[found.waveform[order]] = order
+    hit = best >= 0
+    delay = found.time[best[hit]] - time[hit]
+    if not hit.any():
+        return replace(template, sigma=template.fwhm / FWHM_PER_SIGMA)
+    return replace(
+        template,
+        gain=float(np.median(found.amplitude[best[hit]])) / template.amplitude,
+        delay=float(np.median(delay)),
+        sigma=float(np.median(found.sigma[best[hit]])),
+    )
+
+
+def summarize(templates: Sequence[Template]) -> TemplateSummary:
+    """How many templates there are, and what a chain makes of them."""
+    fwhm = np.array([template.fwhm for template in templates])
+    found = FWHM_PER_SIGMA * np.array([template.sigma for template in templates])
+    gain = float(np.median([template.gain for template in templates]))
+    number = sum(template.echoes for template in templates)
+    return TemplateSummary(len(templates), number, float(np.median(fwhm)), gain, float(np.median(found / fwhm)))
+
+
+def bare_block(block: WaveformBlock, samples: np.ndarray) -> WaveformBlock:
+    """A block of other samples without geometry, of the same digitizer."""
+    bare = WaveformBlock.from_samples(samples, spacing=block.spacing, bits=block.digitizer.bits)
+    return replace(bare, digitizer=block.digitizer)
+
+
+def _fit_spline(lag: np.ndarray, value: np.ndarray, weight: np.ndarray, step: float) -> BSpline:
+    """Cubic spline with knots `step` apart; wider where the echoes' phases leave gaps, as synchronous triggers do."""
+    while True:
+        inner = np.linspace(lag[0], lag[-1], max(round((lag[-1] - lag[0]) / step), 2))
+        knots = np.r_[[lag[0]] * 3, inner, [lag[-1]] * 3]
+        try:
+            curve = make_lsq_spline(lag, value, knots, k=3, w=weight)
+            for _ in range(2):
+                deviation = np.abs(value - curve(lag)) * weight
+                use = deviation < 5 * (MAD_TO_STD * np.median(deviation) + 1e-9)
+                curve = make_lsq_spline(lag[use], value[use], knots, k=3, w=weight[use])
+            return curve
+        except (np.linalg.LinAlgError, ValueError):
+            if len(inner) <= 2:
+                raise
+            step *= 1.5
+
+
+def _covered(lag: np.ndarray, spacing: float, echoes: int) -> tuple[float, float]:
+    """The stretch in which at least half of the echoes have samples."""
+    edges = np.arange(np.floor(lag[0] / spacing), np.ceil(lag[-1] / spacing) + 1) * spacing
+    number, _ = np.histogram(lag, edges)
+    full = np.flatnonzero(number >= 0.5 * echoes)
+    return max(float(edges[full[0]]), float(lag[0])), min(float(edges[full[-1] + 1]), float(lag[-1]))

@@ -1,0 +1,142 @@
+"""A contact sheet: many small pictures of waveforms with fit, residual and echoes, to look over by eye."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.tools.plots.draw_waveform import CLIPPED, ECHO, FIT, GREY, INK, PULSE, VENDOR
+from wavebatch.tools.plots.waveform import WaveformView
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CELL = (2.3, 1.9)
+"""Width and height of a small picture [inch]."""
+
+SHARE = 0.28
+"""Of a small picture's height for the residual."""
+
+RESIDUAL = 4.0
+"""Half the height of every residual panel [noise std]; larger residuals are drawn at its edge in red."""
+
+BEFORE, AFTER = 4.0, 8.0
+"""What is shown before the first and after the last echo [widths of the widest echo]."""
+
+VISIBLE = 5.0
+"""Samples this far above the baseline are always shown [noise std]."""
+
+QUIET_FLAGS = EchoFlag.OVERLAPPED | EchoFlag.WEAK
+"""Flags that are too common to be named."""
+
+
+def draw_sheet(
+    views: Sequence[WaveformView],
+    target: Path,
+    *,
+    strip: str,
+    chain: str,
+    times: tuple[float, float] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Writes a contact sheet, row by row in the order of `views`.
+
+    Each picture is scaled to its samples; its title gives packet, strongest amplitude and flags. times: part to show
+    in all [ns]; None: each is cut to its echoes and returns. Raises as figure_file.open_picture does.
+    """
+    columns = math.ceil(math.sqrt(len(views)))
+    rows = -(-len(views) // columns)
+    size = (CELL[0] * columns, CELL[1] * rows + 0.7)
+    with open_picture(target, size, overwrite=overwrite) as figure:
+        # A layout for 200 axes takes a minute; a grid needs none.
+        figure.set_layout_engine("none")
+        title = f"{plain_text(strip)}   {plain_text(chain, 40)}   {len(views)} waveforms"
+        figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=11, weight="bold")
+        for number, view in enumerate(views):
+            row, column = divmod(number, columns)
+            left = (column * CELL[0] + 0.3) / size[0]
+            bottom = (size[1] - 0.45 - (row + 1) * CELL[1] + 0.25) / size[1]
+            _draw_cell(figure, view, times, (left, bottom, (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1]))
+        legend = (
+            "dots: samples (triangles: saturated); dark line: fit; light: single echoes; diamonds: echoes; dashed: "
+            f"returns of the file; below: residual, -{RESIDUAL:g} to {RESIDUAL:g} noise std; time in ns"
+        )
+        figure.text(0.1 / size[0], 0.06 / size[1], legend, va="bottom", fontsize=7, color=GREY)
+
+
+def _draw_cell(
+    figure: Figure,
+    view: WaveformView,
+    times: tuple[float, float] | None,
+    place: tuple[float, float, float, float],
+) -> None:
+    left, bottom, width, height = place
+    upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
+    lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
+    low, high = times or _find_span(view)
+    _draw_signal(upper, view, low, high)
+    _draw_residual(lower, view)
+    upper.set_xlim(low, high)
+    for axes in (upper, lower):
+        axes.tick_params(labelsize=5.5, length=2, pad=1)
+        axes.grid(False)
+    upper.tick_params(labelbottom=False)
+    lower.set_yticks([])
+    upper.set_title(_title(view), fontsize=6.5, pad=2)
+
+
+def _find_span(view: WaveformView) -> tuple[float, float]:
+    """The part that holds all echoes, returns and visible samples."""
+    seen = view.time[view.samples > view.baseline + VISIBLE * view.std]
+    marks = np.concatenate([view.echoes.time, view.returns, seen])
+    end = float(view.time[-1])
+    if not len(marks):
+        return 0.0, max(end, 1.0)
+    sigma = float(view.echoes.sigma.max()) if len(view.echoes) else 2 * view.spacing
+    low = max(float(marks.min()) - BEFORE * FWHM_PER_SIGMA * sigma, -0.5 * view.spacing)
+    return low, max(min(float(marks.max()) + AFTER * sigma, end + 0.5 * view.spacing), low + 1.0)
+
+
+def _draw_signal(axes: Axes, view: WaveformView, low: float, high: float) -> None:
+    axes.axhline(view.baseline, color=GREY, linewidth=0.5)
+    for place in view.returns:
+        axes.axvline(place, color=VENDOR, linewidth=0.6, linestyle=(0, (4, 2)))
+    for curve in view.curves:
+        axes.plot(view.fine, view.baseline + curve, color=PULSE, linewidth=0.6)
+    if view.fit is not None:
+        axes.plot(view.fine, view.fit, color=FIT, linewidth=0.8)
+    free = ~view.clipped
+    axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=1.2, zorder=3)
+    axes.plot(view.time[view.clipped], view.samples[view.clipped], "^", color=CLIPPED, markersize=2.5, zorder=3)
+    peak = view.baseline + view.echoes.amplitude.astype(np.float64)
+    axes.plot(view.echoes.time, peak, "D", color=ECHO, markersize=3, markerfacecolor="none", markeredgewidth=0.7)
+    shown = view.samples[(view.time >= low) & (view.time <= high)]
+    bottom, top = min(shown.min(initial=view.baseline), view.baseline), max(shown.max(initial=0), peak.max(initial=0))
+    span = max(top - bottom, 6 * view.std)
+    axes.set_ylim(bottom - 0.06 * span, bottom + 1.1 * span)
+
+
+def _draw_residual(axes: Axes, view: WaveformView) -> None:
+    axes.axhspan(-1, 1, color="#e6e6e6", zorder=0)
+    axes.set_ylim(-RESIDUAL, RESIDUAL)
+    if view.residual is None:
+        return
+    residual = np.clip(view.residual, -RESIDUAL, RESIDUAL)
+    large = np.abs(view.residual) > RESIDUAL
+    axes.vlines(view.time, 0, residual, color=np.where(large, ECHO, FIT), linewidth=0.7)
+
+
+def _title(view: WaveformView) -> str:
+    name = f"packet {view.packet}" if view.packet >= 0 else f"point {view.point}"
+    strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
+    flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
+    names = ", ".join(flag.name for flag in flags)
+    return f"{name}   {strongest}" + (f"\n{names[:38]}" if names else "")
