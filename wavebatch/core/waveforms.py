@@ -153,9 +153,8 @@ class WaveformBlock:
             returns = ReturnTable(at[keep], returns.time[keep], returns.point[keep], returns.xyz[keep])
         samples = self.samples[index]
         samples.flags.writeable = False
-        given = {
-            name: getattr(self, name) for name in ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing")
-        }
+        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing")
+        given = {name: getattr(self, name) for name in names}
         parts = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first
         return replace(self, samples=samples, first=first, returns=returns, **parts)

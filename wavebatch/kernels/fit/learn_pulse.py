@@ -83,7 +83,7 @@ class PulseFit(NamedTuple):
 
 
 def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> list[PulseFit]:
-    """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more as long as the misfit falls by a tenth or more."""
+    """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more."""
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
     fits: list[PulseFit] = []
