@@ -37,6 +37,9 @@ SAMPLE = 8192
 REFINEMENTS = 3
 """Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
 
+LEAST_LEVELS = 5
+"""Waveforms of a descriptor from which its level can be told from that of others."""
+
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
 
@@ -227,7 +230,7 @@ def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
 def _compare_levels(own: _Level, rest: list[_Level], noise: float) -> str:
     """Why a descriptor is a stranger among the rest; empty where it is none."""
     rest = [level for level in rest if level.waveforms]
-    if own.waveforms < FEW or not rest:
+    if own.waveforms < LEAST_LEVELS or not rest:
         return ""
     weights = np.array([level.waveforms for level in rest], np.float64)
     mean = float(np.average([level.mean for level in rest], weights=weights))
