@@ -75,11 +75,17 @@ LEAST_WINDOW = 6
 OUTSIDE_REACH = 3.0
 """Widths of an echo around it that are its own, not noise."""
 
+SAME_NOISE = 1.1
+"""Ratio of the noise of quiet samples and of residuals up to which they are the same noise."""
+
 LEAST_QUIET = 0.15
 """Share of quiet samples below which noise comes from residuals of good fits."""
 
 MISFIT_QUANTILE = 0.8
 """Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
+
+SCATTERED = 1.4
+"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
 
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
@@ -335,8 +341,8 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
     kinds = {**system.noise_by_kind, "outside": std, "outside_pulse": seen}
     # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
-    # samples is corrected for that: it is the floor.
-    floor = kinds["quiet_pulse"] if kinds["quiet"] else 0.0
+    # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
+    floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
     return replace(system, noise_std=max(seen, std, hidden, floor), noise_by_kind=kinds, correlation=correlation)
 
 
@@ -408,7 +414,9 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     ratio = fitted.amplitude.astype(np.float64) / system.noise_std
     energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
     share = (promise - NOISE_PROMISE) / energy
-    misfit = float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0))) if len(share) >= FEW else 0.0
+    misfit = 0.0
+    if len(share) >= FEW:
+        misfit = SCATTERED * float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0)))
     return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
 
 

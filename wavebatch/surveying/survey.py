@@ -190,13 +190,13 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     """
     facts = {block.digitizer.index: _describe_level(block, plain) for block in members}
     strangers = {}
-    for index, own in facts.items():
+    # The rarest first; the commonest is never a stranger to the few.
+    for index in list(facts)[:0:-1]:
+        own = facts[index]
         rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
         reason = _compare_levels(own, rest, plain.noise_std)
         if reason:
             strangers[index] = reason
-    # The commonest is never a stranger to the few.
-    strangers.pop(members[0].digitizer.index, None)
     return strangers
 
 
