@@ -134,6 +134,7 @@ def _gaussian_system(block: WaveformBlock, width: float, saturation: float | Non
         sigma_ref=width * block.spacing,
         baseline=noise.level,
         baseline_spread=noise.spread,
+        recovery=float(noise.recovery * block.spacing),
         noise_std=max(seen, noise.std, hidden),
         noise_by_kind={"quiet": known, "quiet_smoothed": noise.smoothed_std, "quiet_pulse": seen},
         correlation=correlation,

@@ -302,7 +302,7 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
         return own.system
     noise = measure_gaussian(block, system.sigma_ref / block.spacing)
-    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "correlation", "saturation")
+    kept = ("baseline", "baseline_spread", "recovery", "noise_std", "noise_by_kind", "correlation", "saturation")
     return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
 
 
