@@ -37,6 +37,9 @@ SAMPLE = 8192
 REFINEMENTS = 3
 """Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
 
+LEAST_QUIET_SAMPLES = 4
+"""Samples before the strongest echo from which a waveform has a level."""
+
 LEAST_LEVELS = 5
 """Waveforms of a descriptor from which its level can be told from that of others."""
 
@@ -214,11 +217,14 @@ class _Level(NamedTuple):
 def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
-    level, quiet, number = find_levels(signal, plain.noise_std, int(np.ceil(3 * plain.sigma_ref / block.spacing)))
+    reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
+    _, quiet, _ = find_levels(signal, plain.noise_std, reach)
     if block.missing is not None:
         quiet &= ~block.missing.T
-        _, number = quiet_mean(signal, quiet)
-    used = number >= 8
+    # Only what comes before the strongest echo: tails are as high as the targets, which long packets see more of.
+    quiet &= np.arange(len(signal))[:, None] < np.argmax(signal, axis=0) - reach
+    level, number = quiet_mean(signal, quiet)
+    used = number >= LEAST_QUIET_SAMPLES
     deviation = np.where(quiet, signal - level, np.float32(0))[:, used]
     freedom = max(int((number[used] - 1).sum()), 1)
     std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
