@@ -188,6 +188,11 @@ class Noise:
         """Level without signal, float32 (n, 1), or (n, s) where it differs between the recordings of a packet."""
         return self.baseline[:, None] if self.of_sample is None else self.of_sample
 
+    @property
+    def for_fits(self) -> np.ndarray:
+        """The same as `kernels.fit.cluster.cut_windows` takes it, float32 (n,) or (n, s)."""
+        return self.baseline if self.of_sample is None else self.of_sample
+
     def rows(self, rows: np.ndarray) -> Noise:
         """The noise of the waveforms at `rows`."""
         return Noise(self.baseline[rows], self.std[rows], None if self.of_sample is None else self.of_sample[rows])

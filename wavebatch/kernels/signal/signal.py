@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.signal.runs import find_stretches
+
 SMOOTH_GAIN = np.sqrt(6.0) / 4.0
 """Standard deviation of white noise after one pass of the [1 2 1]/4 filter (0.61237)."""
 
@@ -94,10 +96,7 @@ def find_fill(samples: np.ndarray, *tops: int) -> np.ndarray | None:
 def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
     """Runs of one count in samples (n, s) that are fill, bool (n, s)."""
     n, s = samples.shape
-    at = np.zeros((n, s + 2), np.int8)
-    at[:, 1:-1] = samples == value
-    edge = np.diff(at, axis=1)
-    (row, start), (_, end) = np.nonzero(edge == 1), np.nonzero(edge == -1)
+    row, start, end = find_stretches(samples == value)
     long = end - start >= LEAST_PADDING
     row, start, end = row[long], start[long], end[long]
     good = _steps(samples, row, start, -1, value) & _steps(samples, row, end - 1, 1, value)
