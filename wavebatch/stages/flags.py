@@ -8,6 +8,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.pulse_tables import clip_level
 
 NEIGHBOURS = 5
@@ -51,6 +52,9 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
     last = (block.samples.shape[1] - 1) * block.spacing
     table = table.with_flags(EchoFlag.WEAK, table.amplitude < 5 * noise.std[table.waveform])
     edge = np.minimum(table.time, last - table.time) < table.sigma
+    if block.missing is not None:
+        away = gap_distance(block.missing, table.waveform, table.time / block.spacing)
+        edge |= away * block.spacing < table.sigma
     table = table.with_flags(EchoFlag.NEAR_EDGE, edge)
     narrow = table.sigma + 3 * np.nan_to_num(table.sigma_err) < system.sigma_ref
     table = table.with_flags(EchoFlag.NARROW, narrow & (table.sigma < 0.93 * system.sigma_ref))

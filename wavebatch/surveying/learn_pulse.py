@@ -158,7 +158,7 @@ def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
     """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
     noise = pooled_noise(block, system)
-    signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
+    signal = block.samples[main.waveform] - noise.level[main.waveform]
     if block.missing is not None:
         signal[block.missing[main.waveform]] = np.nan
     return _learn(block, system, main, signal, figures, FIRST_COMPONENTS)

@@ -261,7 +261,7 @@ def subtract_echoes(block: WaveformBlock, system: SystemPulse, echoes: EchoTable
         Samples above the baseline less the echoes [count]; NaN where a sample was not recorded.
     """
     noise = pooled_noise(block, system)
-    residual = block.samples - noise.baseline[:, None]
+    residual = block.samples - noise.level
     residual -= render_own(block, system, echoes, echoes.waveform, len(block))
     if block.missing is not None:
         residual[block.missing] = np.nan
@@ -432,7 +432,7 @@ def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Ech
     middle = np.rint(whole[:, 1]).astype(np.int64)
     low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
     windows, begin = cut_windows(
-        part.samples, noise.baseline, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
+        part.samples, noise.for_fits, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
         clip_level(part, system), system.noise_gain, part.missing,
     )  # fmt: skip
     main[:, 1] -= begin

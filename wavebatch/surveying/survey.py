@@ -61,6 +61,8 @@ class Part(StrEnum):
     WEIGHTS = "signal-dependent weights"
     WIDTH = "echo width"
     ANGLE = "incidence angle"
+    INVERTED = "inverted waveforms"
+    """Only where they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,6 +374,7 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
         "spacing_ns": block.spacing,
         "n_samples": float(block.samples.shape[1]),
         "bits": float(block.digitizer.bits),
+        "inverted": float(block.digitizer.inverted),
         "least_count": float(block.samples.min(initial=block.digitizer.max_count)),
         "largest_count": float(block.samples.max(initial=0)),
         "empty_share": float((number == 0).mean()),
@@ -391,7 +394,9 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
     share = figures["overlapped_share"]
     strongest = figures["amplitude_99"]
     learned = len(system.components)
+    inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
+        *((Decision(Part.INVERTED, True, inverted),) if figures.get("inverted") else ()),
         Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),
