@@ -55,9 +55,21 @@ QUANTITIES: dict[str, Quantity] = {
 COMPONENT_LIMITS = ((-10.0, 10.0), (-1e4, 1e4), (1e-3, 1e4))
 """Allowed weight, delay [ns] and sigma [ns] of a component."""
 
+CORRELATION_LIMITS = ((-1.0, 1.0),)
+"""Allowed correlation of the noise at a lag."""
+
+TAIL_LIMITS = ((-1e5, 1e5), (0.0, 10.0))
+"""Allowed lag [ns] and share of the misfit of a tail."""
+
+MOST_LAGS = 1024
+"""Lags that the correlation and the tail of a pulse in a file may have; a survey finds fewer than 64."""
+
 _NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
+_CORRELATION, _TAIL = "correlation", "tail_misfit"
 _HEADING = "What a survey found: `wavebatch run --system` takes it for a strip of the same sensor and settings."
 _ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
+_ABOUT_CORRELATION = "of the noise of two samples 1, 2, ... spacings apart; empty: white noise"
+_ABOUT_TAIL = "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes"
 _REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
 
 
@@ -85,7 +97,9 @@ def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
     return {
         **{key: None if value is None else float(value) for key, value in values.items()},
         _NOISE: {kind: float(value) for kind, value in system.noise_by_kind.items()},
+        _CORRELATION: [float(value) for value in system.correlation],
         _COMPONENTS: [[float(value) for value in component] for component in system.components],
+        _TAIL: [[float(value) for value in row] for row in system.tail_misfit],
     }
 
 
@@ -102,7 +116,8 @@ def format_survey(saved: SavedSurvey) -> str:
         "decision": [{**asdict(decision), "needed": bool(decision.needed)} for decision in survey.decisions] or None,
         "fingerprint": saved.fingerprint or None,
     }
-    meanings = {**{key: quantity.meaning for key, quantity in QUANTITIES.items()}, _COMPONENTS: _ABOUT_COMPONENTS}
+    meanings = {key: quantity.meaning for key, quantity in QUANTITIES.items()}
+    meanings |= {_COMPONENTS: _ABOUT_COMPONENTS, _CORRELATION: _ABOUT_CORRELATION, _TAIL: _ABOUT_TAIL}
     places = ("system", f"system.{_DIGITIZERS}")
     comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
     comments[places[1]] = "a digitizer that records otherwise"
@@ -166,31 +181,47 @@ def _read_system(table: TomlTable) -> SystemPulse:
 def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     """A pulse from a table that may hold one extra key."""
     needed = (*(key for key, quantity in QUANTITIES.items() if not quantity.optional), _COMPONENTS, _NOISE)
-    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, extra), needed, _REMEDY)
+    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, extra), needed, _REMEDY)
     values = {
         quantity.field: table.number(key, quantity.low, quantity.high)
         for key, quantity in QUANTITIES.items()
         if key in table.values
     }
+    correlation = _read_rows(table, _CORRELATION, CORRELATION_LIMITS, "numbers")
     return SystemPulse(
-        **values, noise_by_kind=_read_numbers(table.table(_NOISE), low=0.0), components=_read_components(table)
+        **values,
+        noise_by_kind=_read_numbers(table.table(_NOISE), low=0.0),
+        correlation=tuple(row[0] for row in correlation),
+        components=_read_components(table),
+        tail_misfit=_read_rows(table, _TAIL, TAIL_LIMITS, "[lag, share]"),
     )
 
 
-def _read_components(table: TomlTable) -> tuple[tuple[float, float, float], ...]:
-    where, rows = f"{table.where}: {_COMPONENTS}", table.values[_COMPONENTS]
-    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise ConfigError(f"{where} must be a list of [weight, delay, sigma], it is {shorten(rows)}")
-    if len(rows) == 1 or len(rows) > MOST_COMPONENTS:
-        raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(rows)}")
-    components = tuple(
-        tuple(check_number(value, *limits, f"{where} row {number}")
-              for value, limits in zip(row, COMPONENT_LIMITS, strict=True))
-        for number, row in enumerate(rows, 1)
-    )  # fmt: skip
+def _read_components(table: TomlTable) -> tuple[tuple[float, ...], ...]:
+    components = _read_rows(table, _COMPONENTS, COMPONENT_LIMITS, "[weight, delay, sigma]")
+    where = f"{table.where}: {_COMPONENTS}"
+    if len(components) == 1 or len(components) > MOST_COMPONENTS:
+        raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(components)}")
     if components and components[0][0] < 0.01:
         raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
     return components
+
+
+def _read_rows(
+    table: TomlTable, key: str, limits: tuple[tuple[float, float], ...], form: str
+) -> tuple[tuple[float, ...], ...]:
+    """The rows of a list, empty where it is missing; a row has a number within each of the limits."""
+    where, rows = f"{table.where}: {key}", table.values.get(key, [])
+    if isinstance(rows, list) and len(limits) == 1:
+        rows = [[value] for value in rows]
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == len(limits) for row in rows):
+        raise ConfigError(f"{where} must be a list of {form}, it is {shorten(rows)}")
+    if len(rows) > MOST_LAGS:
+        raise ConfigError(f"{where} holds {len(rows)} rows, at most {MOST_LAGS} are read")
+    return tuple(
+        tuple(check_number(value, *pair, f"{where} row {number}") for value, pair in zip(row, limits, strict=True))
+        for number, row in enumerate(rows, 1)
+    )
 
 
 def _read_numbers(table: TomlTable, low: float = -math.inf) -> dict[str, float]:
