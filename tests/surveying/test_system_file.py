@@ -14,7 +14,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
-    QUANTITIES,
     SYSTEM_SCHEMA,
     SavedSurvey,
     describe_system,
@@ -23,6 +22,7 @@ from wavebatch.surveying.system_file import (
     parse_survey,
     write_survey,
 )
+from wavebatch.surveying.systems.system_table import QUANTITIES
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,
