@@ -30,6 +30,7 @@ from wavebatch.surveying.measure import (
     measure_residuals,
     thin_block,
 )
+from wavebatch.surveying.systems.known_systems import find_source, take_pulse
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -318,6 +319,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures["isolated_echoes"] = len(main)
         if len(main) >= ENOUGH_TO_LEARN:
             system = learn_pulse(block, system, main, figures)
+        else:
+            taken = take_pulse(block, system, guess=len(main) < FEW)
+            system = taken.system
+            figures.update(taken.figures)
         part = thin_block(block, RESIDUAL_LOOK)
         for _ in range(REFINEMENTS):
             last = system.sigma_ref
@@ -413,6 +418,11 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
     """Why the pulse is, or is not, a sum of Gaussians."""
+    source = find_source(system)
+    if source is not None:
+        known, gaussian = (figures.get(f"known_pulse_{name}", 0.0) for name in ("misfit", "gaussian_misfit"))
+        misfits = f"it misses strong echoes by {known:.4f} of the amplitude, a Gaussian by {gaussian:.4f}"
+        return f"pulse from the shipped {source.name}: {misfits}"
     if "misfit_1_gaussians" not in figures:
         return f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
     one = figures["misfit_1_gaussians"]
