@@ -186,11 +186,11 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     errors and a factor STRANGE_NOISE, or if it is clipped at another count. STRANGE is 6: among 24 descriptors chance
     does so once in 10^7 strips. Widths are no evidence: long packets see other targets.
     """
-    facts = {block.digitizer.index: _describe_level(block, plain) for block in members}
+    facts = {block.digitizer.index: describe_level(block, plain) for block in members}
     strangers = {}
     for index, own in facts.items():
         rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
-        reason = _compare_levels(own, rest, plain.noise_std)
+        reason = compare_levels(own, rest, plain.noise_std)
         if reason:
             strangers[index] = reason
     # The commonest is never a stranger to the few.
@@ -198,7 +198,7 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     return strangers
 
 
-class _Level(NamedTuple):
+class Level(NamedTuple):
     """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
 
     waveforms: int
@@ -209,7 +209,7 @@ class _Level(NamedTuple):
     clip: float | None
 
 
-def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
+def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
     level, quiet, number = find_levels(signal, plain.noise_std, int(np.ceil(3 * plain.sigma_ref / block.spacing)))
@@ -222,10 +222,10 @@ def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
     std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
     mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
     clip = find_saturation(block.samples, block.digitizer.max_count)
-    return _Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
+    return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
 
 
-def _compare_levels(own: _Level, rest: list[_Level], noise: float) -> str:
+def compare_levels(own: Level, rest: list[Level], noise: float) -> str:
     """Why a descriptor is a stranger among the rest; empty where it is none."""
     rest = [level for level in rest if level.waveforms]
     if own.waveforms < FEW or not rest:

@@ -95,8 +95,8 @@ def _load(path: Path) -> KnownSystem:
     return KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system")))
 
 
-def find_lone(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """The strongest single echoes of a block by Gaussian fits: at most MOST_ECHOES, one per waveform, not clipped."""
+def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES) -> EchoTable:
+    """Return the strongest single echoes of a block by Gaussian fits: at most `most`, one per waveform, not clipped."""
     noise = pooled_noise(block, system)
     echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
     rows, second = find_strongest(echoes, len(block))
@@ -104,7 +104,7 @@ def find_lone(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     good = echoes.amplitude > LEAST_SNR * system.noise_std
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     rows = np.flatnonzero(keep_lone(good, echoes.amplitude, second))
-    return echoes.take(np.sort(rows[np.argsort(-echoes.amplitude[rows], kind="stable")[:MOST_ECHOES]]))
+    return echoes.take(np.sort(rows[np.argsort(-echoes.amplitude[rows], kind="stable")[:most]]))
 
 
 def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -258,8 +258,8 @@ class Likeness(NamedTuple):
     """As `compare_pulses` measures it."""
 
     def describe(self) -> str:
-        """Return one sentence for people."""
-        return f"looks like {self.known.sensor}; it differs by {100 * self.difference:.2g} %"
+        """Return the sentence for people."""
+        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1g} %"
 
 
 def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
