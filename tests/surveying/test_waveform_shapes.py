@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES

@@ -15,7 +15,6 @@ from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
 
-
 LEAST_QUIET, LEAST_QUIET_SHARE = 16, 0.3
 """Quiet samples from which the level of one recording of a packet counts: canopy may fill a short recording."""
 
