@@ -1,4 +1,4 @@
-"""What receivers do to waveforms besides noise: tails, undershoot, spikes, transients, patterns, slopes, clipped tops."""
+"""What receivers do to waveforms besides noise: tails, spikes, transients, patterns, slopes, clipped tops."""
 
 import numpy as np
 import pytest
