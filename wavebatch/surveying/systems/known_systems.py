@@ -259,7 +259,7 @@ class Likeness(NamedTuple):
 
     def describe(self) -> str:
         """Return the sentence for people."""
-        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1g} %"
+        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1f} %"
 
 
 def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
