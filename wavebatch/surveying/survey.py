@@ -38,6 +38,12 @@ SAMPLE = 8192
 REFINEMENTS = 3
 """Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
 
+LEAST_QUIET_SAMPLES = 4
+"""Samples before the strongest echo from which a waveform has a level."""
+
+LEAST_LEVELS = 5
+"""Waveforms of a descriptor from which its level can be told from that of others."""
+
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
 
@@ -56,6 +62,8 @@ class Part(StrEnum):
     WEIGHTS = "signal-dependent weights"
     WIDTH = "echo width"
     ANGLE = "incidence angle"
+    INVERTED = "inverted waveforms"
+    """Only where they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,13 +196,13 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     """
     facts = {block.digitizer.index: describe_level(block, plain) for block in members}
     strangers = {}
-    for index, own in facts.items():
+    # The rarest first; the commonest is never a stranger to the few.
+    for index in list(facts)[:0:-1]:
+        own = facts[index]
         rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
         reason = compare_levels(own, rest, plain.noise_std)
         if reason:
             strangers[index] = reason
-    # The commonest is never a stranger to the few.
-    strangers.pop(members[0].digitizer.index, None)
     return strangers
 
 
@@ -212,11 +220,14 @@ class Level(NamedTuple):
 def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
-    level, quiet, number = find_levels(signal, plain.noise_std, int(np.ceil(3 * plain.sigma_ref / block.spacing)))
+    reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
+    _, quiet, _ = find_levels(signal, plain.noise_std, reach)
     if block.missing is not None:
         quiet &= ~block.missing.T
-        _, number = quiet_mean(signal, quiet)
-    used = number >= 8
+    # Only what comes before the strongest echo: tails are as high as the targets, which long packets see more of.
+    quiet &= np.arange(len(signal))[:, None] < np.argmax(signal, axis=0) - reach
+    level, number = quiet_mean(signal, quiet)
+    used = number >= LEAST_QUIET_SAMPLES
     deviation = np.where(quiet, signal - level, np.float32(0))[:, used]
     freedom = max(int((number[used] - 1).sum()), 1)
     std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
@@ -228,7 +239,7 @@ def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
 def compare_levels(own: Level, rest: list[Level], noise: float) -> str:
     """Why a descriptor is a stranger among the rest; empty where it is none."""
     rest = [level for level in rest if level.waveforms]
-    if own.waveforms < FEW or not rest:
+    if own.waveforms < LEAST_LEVELS or not rest:
         return ""
     weights = np.array([level.waveforms for level in rest], np.float64)
     mean = float(np.average([level.mean for level in rest], weights=weights))
@@ -300,7 +311,7 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
         return own.system
     noise = measure_gaussian(block, system.sigma_ref / block.spacing)
-    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "correlation", "saturation")
+    kept = ("baseline", "baseline_spread", "recovery", "noise_std", "noise_by_kind", "correlation", "saturation")
     return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
 
 
@@ -368,6 +379,7 @@ def _describe(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> d
         "spacing_ns": block.spacing,
         "n_samples": float(block.samples.shape[1]),
         "bits": float(block.digitizer.bits),
+        "inverted": float(block.digitizer.inverted),
         "least_count": float(block.samples.min(initial=block.digitizer.max_count)),
         "largest_count": float(block.samples.max(initial=0)),
         "empty_share": float((number == 0).mean()),
@@ -387,7 +399,9 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
     share = figures["overlapped_share"]
     strongest = figures["amplitude_99"]
     learned = len(system.components)
+    inverted = "the signal goes down from its baseline: counts are mirrored when they are read"
     return (
+        *((Decision(Part.INVERTED, True, inverted),) if figures.get("inverted") else ()),
         Decision(Part.PULSE, learned > 1, _explain_pulse(system, figures)),
         Decision(Part.SKEW, system.kappa != 0, _explain_skew(system, figures)),
         Decision(Part.GROWTH, share >= 0.02, f"{100 * share:.1f} % of the waveforms hold overlapping echoes"),

@@ -32,6 +32,7 @@ QUANTITIES: dict[str, Quantity] = {
     "sigma_ref_ns": Quantity("sigma_ref", 1e-3, 1e4, "Gaussian standard deviation of the echo of a flat target"),
     "baseline_dn": Quantity("baseline", -1e10, 1e10, "level without signal"),
     "baseline_spread_dn": Quantity("baseline_spread", 0.0, 1e10, "its standard deviation between waveforms"),
+    "recovery_ns": Quantity("recovery", 0.0, 1e9, "after strong signal, until the level is back", optional=True),
     "noise_std_dn": Quantity("noise_std", 1e-3, 1e10, "noise of one sample, for thresholds and errors"),
     "noise_gain": Quantity("noise_gain", 0.0, 1e6, "growth of the noise's variance per count of signal"),
     "kappa": Quantity("kappa", -0.9, 0.9, "skew of the pulse; 0 is a Gaussian"),
