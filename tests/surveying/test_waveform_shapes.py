@@ -1,9 +1,8 @@
-"""What receivers do to waveforms besides noise: tails, undershoot, spikes, transients, patterns, slopes, clipped tops."""
+"""What receivers do to waveforms besides noise: tails, spikes, transients, patterns, slopes, clipped tops."""
 
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES
