@@ -19,7 +19,8 @@ from wavebatch.tools.simulate import PulseModel, find_pulse
 def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
     system = survey_block(make_block(scene, 3000, seed=3)[0]).system
-    assert system.sigma_ref == pytest.approx(sigma, rel=0.03)
+    # Half a sample is less than a width can be measured with (0.85): there it only has to be found.
+    assert system.sigma_ref == pytest.approx(sigma, rel=0.03 if sigma > 0.5 else 0.05)
     assert system.noise_std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
 
 
@@ -60,13 +61,18 @@ def test_signal_dependent_noise_and_clipping_are_found():
     assert needed["censored fit"] and needed["signal-dependent weights"]
 
 
-def test_the_largest_group_of_one_length_decides():
+def test_waveforms_of_several_lengths_are_surveyed_together():
     flat, other = make_block("flat", 1000, seed=6)[0], make_block(make_scene("flat", n_samples=40), 1500, seed=6)[0]
     ends = [(other, 0, 700), (flat, 0, 600), (other, 700, 1500), (flat, 600, 1000)]
     parts = [block.rows(slice(start, stop)) for block, start, stop in ends]
-    joined = join_digitizers(parts)
-    assert len(joined) == 1 and np.array_equal(joined[0].samples, flat.samples)
-    assert survey_blocks(parts) == survey_blocks([flat])
+    (joined,) = join_digitizers(parts)
+    long = np.r_[700:1300, 2100:2500]
+    assert joined.samples.shape == (2500, 80) and np.array_equal(joined.samples[long], flat.samples)
+    assert not joined.missing[long].any() and joined.missing[:700, 40:].all() and not joined.missing[:700, :40].any()
+    both, alone = survey_blocks(parts), survey_blocks([flat])
+    assert both.waveforms == 2500 and both.system.digitizers == {}
+    assert both.system.sigma_ref == pytest.approx(alone.system.sigma_ref, rel=0.01)
+    assert both.system.noise_std == pytest.approx(alone.system.noise_std, rel=0.02)
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 

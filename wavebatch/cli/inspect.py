@@ -92,11 +92,15 @@ def _list_lines(facts: dict[str, Any]) -> list[str]:
         read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
         values = f"{samples['least']} to {samples['largest']}"
         lines.append(f"samples        {values} in {read} of {lengths} samples; {limited} at the limit")
+        if samples["waveforms_with_gaps"]:
+            gaps = count(samples["waveforms_with_gaps"], "waveform")
+            lines.append(f"gaps           {gaps} with fill between recordings, which is no sample")
     lines.append(f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}")
     if ratio is not None:
         lines.append(f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
     if facts["extra_dimensions"]:
         lines.append(f"extra bytes    {', '.join(facts['extra_dimensions'])}")
+    lines += [f"note           {line}" for line in facts["notes"]]
     lines += [f"warning        {line}" for line in facts["warnings"]]
     return lines + [f"problem        {line}" for line in facts["problems"]]
 

@@ -31,6 +31,8 @@ class Digitizer:
     """Volts per count [V]."""
     offset: float = 0.0
     """Volts at count zero [V]."""
+    inverted: bool = False
+    """Whether the counts of the file go down where the light rises; blocks hold mirrored counts, with this gain."""
 
     @property
     def width(self) -> int:
@@ -41,6 +43,10 @@ class Digitizer:
     def max_count(self) -> int:
         """Largest raw value that the bits can hold."""
         return (1 << self.bits) - 1
+
+    def mirrored(self) -> Digitizer:
+        """The digitizer of mirrored counts, largest count - count: the same volts, with the other sign of the gain."""
+        return replace(self, gain=-self.gain, offset=self.offset + self.gain * self.max_count, inverted=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +92,9 @@ class WaveformBlock:
     scanner: np.ndarray | None = None
     """Scanner channel of each pulse, uint8 (n,); None where the points have no such field: all are channel 0."""
     missing: np.ndarray | None = None
-    """Samples that were not recorded (fill between two recordings of a packet), bool (n, s); None where all were."""
+    """Samples that were not recorded (fill between two recordings of a packet), bool (n, s); None where all were.
+    `samples` then hold a low count of the waveform there, which is no signal.
+    """
 
     def __len__(self) -> int:
         """Number of waveforms."""
@@ -168,10 +176,26 @@ class Noise:
     """Level without signal, float32 (n,), count."""
     std: np.ndarray
     """Standard deviation of one recorded sample, float32 (n,), count; never below QUANTISATION_STD."""
+    of_sample: np.ndarray | None = None
+    """Level at each sample, float32 (n, s), count, where recordings of one packet differ in level; else None."""
 
     def __len__(self) -> int:
         """Number of waveforms."""
         return len(self.baseline)
+
+    @property
+    def level(self) -> np.ndarray:
+        """Level without signal, float32 (n, 1), or (n, s) where it differs between the recordings of a packet."""
+        return self.baseline[:, None] if self.of_sample is None else self.of_sample
+
+    @property
+    def for_fits(self) -> np.ndarray:
+        """The same as `kernels.fit.cluster.cut_windows` takes it, float32 (n,) or (n, s)."""
+        return self.baseline if self.of_sample is None else self.of_sample
+
+    def rows(self, rows: np.ndarray) -> Noise:
+        """The noise of the waveforms at `rows`."""
+        return Noise(self.baseline[rows], self.std[rows], None if self.of_sample is None else self.of_sample[rows])
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -10,8 +11,15 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
+from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
+
+LEAST_QUIET, LEAST_QUIET_SHARE = 16, 0.3
+"""Quiet samples from which the level of one recording of a packet counts: canopy may fill a short recording."""
+
+APART = 4.0
+"""Standard errors from which recordings of one packet have levels of their own: 1 in 16,000 waveforms by chance."""
 
 
 @stage("noise")
@@ -60,14 +68,53 @@ def pooled(
         mean, number = quiet_mean(signal, quiet)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.baseline + trust * mean
-    return Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
+    noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
+    return noise if block.missing is None else _split_levels(block, noise, system, reach, limit)
+
+
+def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, reach: int, limit: float) -> Noise:
+    """The noise with a level for each recording of the waveforms whose recordings differ in level.
+
+    The level of a recording is that of its quiet samples, found from itself; it counts if they are at least
+    LEAST_QUIET, and a share LEAST_QUIET_SHARE of the recording. Recordings differ if one is APART standard errors from
+    the mean of all.
+    """
+    row, start, end = find_stretches(~block.missing)
+    several = np.bincount(row, minlength=len(block))[row] > 1
+    row, start, end = row[several], start[several], end[several]
+    if not len(row):
+        return noise
+    s, length = block.samples.shape[1], end - start
+    # Each recording as a column, repeated up to the length of the waveform, so that quantiles stay what they are.
+    signal = block.samples[row, start + np.arange(s)[:, None] % length].astype(np.float32)
+    std = float(noise.std[0])
+    level, quiet, _ = find_levels(signal, std, reach, limit)
+    number = (quiet & (np.arange(s)[:, None] < length)).sum(axis=0)
+    known = (number >= LEAST_QUIET) & (number >= LEAST_QUIET_SHARE * length)
+    weight = np.where(known, number, 0).astype(np.float64)
+    total = np.maximum(np.bincount(row, weight, len(block)), 1e-9)
+    mean = (np.bincount(row, weight * level, len(block)) / total)[row]
+    # The mean of correlated samples scatters more than that of as many independent ones.
+    spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.correlation))))
+    error = spread * np.sqrt(1 / np.maximum(weight, 1) + 1 / total[row])
+    apart = known & (np.abs(level - mean) > APART * error)
+    differs = np.zeros(len(block), bool)
+    differs[row[apart]] = True
+    if not differs.any():
+        return noise
+    of_sample = np.repeat(noise.baseline[:, None], s, axis=1)
+    chosen = np.flatnonzero(differs[row] & known)
+    run, place = list_samples(*(row[chosen] * s + edge[chosen] for edge in (start, end)))
+    of_sample.reshape(-1)[place] = level[chosen][run]
+    return replace(noise, of_sample=of_sample)
 
 
 @stage("noise")
 def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, Range(2, 65_535)] = 16) -> Noise:
     """Baseline and standard deviation of each waveform from its last samples.
 
-    For sensors whose baseline drifts and whose waveforms end without signal. The standard deviation is never less than
+    For sensors whose baseline drifts and whose waveforms end without signal. Samples that were not recorded do not
+    count. The standard deviation is never less than
     the strip's.
 
     Parameters
@@ -77,10 +124,24 @@ def tail(block: WaveformBlock, system: SystemPulse, *, samples: Annotated[int, R
     """
     if samples < 2:
         raise ConfigError(f"samples must be at least 2, got {samples}")
-    end = transpose_samples(block.samples[:, -samples:])
-    baseline = np.median(end, axis=0)
-    deviation = end - baseline
-    std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
+    if block.missing is None:
+        end = transpose_samples(block.samples[:, -samples:])
+        baseline = np.median(end, axis=0)
+        deviation = end - baseline
+        std = np.sqrt(sum_samples(deviation * deviation) / max(len(end) - 1, 1))
+    else:
+        baseline, std = _tail_of_recorded(block, samples)
     return Noise(
         baseline.astype(np.float32), np.maximum(std, max(system.noise_std, QUANTISATION_STD)).astype(np.float32)
     )
+
+
+def _tail_of_recorded(block: WaveformBlock, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Median and standard deviation (n,) of the last recorded samples of each waveform."""
+    behind = np.cumsum(~block.missing[:, ::-1], axis=1)[:, ::-1]
+    end = np.where(~block.missing & (behind <= samples), block.samples, np.float32(np.nan)).T.astype(np.float32)
+    number = np.isfinite(end).sum(axis=0)
+    end[:, number == 0] = block.samples[number == 0].T
+    baseline = np.nanmedian(end, axis=0)
+    deviation = np.nan_to_num(end - baseline)
+    return baseline, np.sqrt(sum_samples(deviation * deviation) / np.maximum(number - 1, 1))

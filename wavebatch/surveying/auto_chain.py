@@ -82,7 +82,11 @@ def chain_text(survey: Survey) -> str:
         "",
         format_step("noise.pooled", {}),
         format_step("detect.maximum", {}),
-        *(_comment(decision) for part, decision in decisions.items() if part not in (Part.WIDTH, Part.ANGLE)),
+        *(
+            _comment(decision)
+            for part, decision in decisions.items()
+            if part not in (Part.WIDTH, Part.ANGLE, Part.INVERTED)
+        ),
         format_step("decompose.adaptive", {} if decisions[Part.GROWTH].needed else {"max_echoes": 1}),
         format_step("attribute.amplitude", {}),
     ]

@@ -19,7 +19,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.attribute.radiometry import is_alone, level_angle
 from wavebatch.stages.attribute.width_angle import added_variance
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample, find_mode
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
@@ -64,7 +64,7 @@ def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing:
 
 def _find_level(variance: np.ndarray, error: np.ndarray) -> float:
     """The mode of variances (n,), then the weighted mean of those within two errors of it, until it stays."""
-    level = find_mode(variance)
+    level = _find_mode(variance)
     for _ in range(ROUNDS):
         near = np.abs(variance - level) < 2.0 * error
         if np.count_nonzero(near) < ENOUGH_TO_LEARN:
@@ -88,3 +88,12 @@ def _measure(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     level = spread_of_angle(level_angle(block)[row], distance, divergence)
     known = np.isfinite(variance) & np.isfinite(level) & (error > 0)
     return (variance - level * level)[known], error[known]
+
+
+def _find_mode(values: np.ndarray) -> float:
+    """Centre of the shortest interval that holds a third of the values, which slopes and plants do not move."""
+    ordered = np.sort(values.astype(np.float64))
+    hold = max(len(ordered) // 3, 2)
+    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
+    first = int(np.argmin(span))
+    return float(np.median(ordered[first : first + hold]))

@@ -78,6 +78,7 @@ def describe_strip(path: Path | str, *, direction: str = "auto", headerless: boo
                 "length_over_half_c": without_nan(scan.vector_ratio),
                 "form": scan.vector_form,
             },
+            "notes": list(scan.notes),
             "warnings": [*facts.warnings, *scan.warnings],
             "problems": list(scan.problems),
         }
@@ -128,7 +129,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
         _describe_samples(reader, scan)
     except InputError as error:
         problems.append(_without_name(path, error))
-    notes = [*_note_descriptors(facts, scan), *audit_header(reader, scan)]
+    notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
     summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
     return Findings(str(path), tuple(problems), tuple(notes), summary)
 
@@ -153,13 +154,15 @@ def _describe_samples(reader: StripReader, scan: StripScan) -> dict[str, Any]:
     for block in reader.sample_blocks(scan, _SAMPLED) if scan.with_waveform else ():
         at_limit = (block.samples == block.digitizer.max_count).any(axis=1)
         extremes = int(block.samples.min()), int(block.samples.max())
-        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), block.samples.shape[1]))
-    numbers, least, largest, limited, lengths = zip(*rows, strict=True) if rows else ((),) * 5
+        gaps = 0 if block.missing is None else int(block.missing.any(axis=1).sum())
+        rows.append((len(block), *extremes, int(np.count_nonzero(at_limit)), gaps, block.samples.shape[1]))
+    numbers, least, largest, limited, gaps, lengths = zip(*rows, strict=True) if rows else ((),) * 6
     return {
         "waveforms_read": sum(numbers),
         "least": min(least, default=None),
         "largest": max(largest, default=None),
         "waveforms_at_limit": sum(limited),
+        "waveforms_with_gaps": sum(gaps),
         "lengths": sorted(set(lengths)),
     }
 
@@ -197,13 +200,14 @@ def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
         "bytes": facts.packet_end - facts.packet_start,
         "shorter_than_descriptor": scan.short,
         "farthest_shared": scan.reach,
-        "descriptors": [_describe_descriptor(facts, index, count) for index, count in used.items()],
+        "descriptors": [_describe_descriptor(facts, scan, index, count) for index, count in used.items()],
         "descriptors_unused": len(facts.digitizers) - len(used),
     }
 
 
-def _describe_descriptor(facts: StripFacts, index: int, points: int) -> dict[str, Any]:
+def _describe_descriptor(facts: StripFacts, scan: StripScan, index: int, points: int) -> dict[str, Any]:
     digitizer = facts.digitizers[index]
+    form = scan.forms.get(index)
     return {
         "index": index,
         "points": points,
@@ -212,4 +216,5 @@ def _describe_descriptor(facts: StripFacts, index: int, points: int) -> dict[str
         "spacing_ns": digitizer.spacing,
         "gain": without_nan(digitizer.gain),
         "offset": without_nan(digitizer.offset),
+        "inverted": form is not None and form.inverted,
     }

@@ -129,12 +129,12 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
 
 
 def find_strong(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """The strongest two fifths of the isolated echoes that are neither clipped nor widened by their target."""
+    """The strongest fifth of the isolated echoes that are neither clipped nor widened by their target."""
     echoes = _find_clear(block, system, most=1.0)
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.6)))
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.8)))
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
@@ -158,7 +158,7 @@ def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
     """The simplest pulse model that reaches the noise: Gaussian, skewed, or a sum of Gaussians (R1, R2)."""
     noise = pooled_noise(block, system)
-    signal = block.samples[main.waveform] - noise.baseline[main.waveform][:, None]
+    signal = block.samples[main.waveform] - noise.level[main.waveform]
     if block.missing is not None:
         signal[block.missing[main.waveform]] = np.nan
     return _learn(block, system, main, signal, figures, FIRST_COMPONENTS)

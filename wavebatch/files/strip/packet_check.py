@@ -20,7 +20,9 @@ from wavebatch.files.strip.packets import MAX_SAMPLES, refuse_compressed
 INDEX_BITS = np.uint64(8)
 """Bits of the descriptor index in a key; see `Judged.keys`."""
 WHOLE_BITS = (8, 16, 32)
-"""Bits per sample that fill whole bytes; others (12 bits) must be stored in two bytes."""
+"""Bits per sample that fill whole bytes; others (12 bits) are stored in two bytes, or packed."""
+PACKED_BITS = (10, 12)
+"""Bits per sample that are also read where they follow each other without a gap."""
 MOST_BITS = 32
 MAX_SPACING = 1000.0
 """Largest spacing of samples [ns]; digitizers have 0.2 to 10 ns, a larger one is damage."""
@@ -49,7 +51,8 @@ REASON_TEXTS = {
     Reason.OUTSIDE: "have a packet outside the waveform data",
     Reason.NO_GEOMETRY: "have an impossible return location or packet vector (not a number, 0, or far too long)",
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
-    Reason.PACKED: "have samples of other than 8, 16 or 32 bits with no gaps between, which LAS does not define",
+    Reason.PACKED: "have samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
+    "nor packed samples of 10 or 12 bits",
 }
 
 
@@ -65,6 +68,8 @@ class Judged:
     """u8 (n,): byte offset and descriptor index in one number, equal for all returns of a packet."""
     short: np.ndarray
     """bool (n,): usable, but the packet has fewer samples than its descriptor gives."""
+    packed: np.ndarray
+    """bool (n,): samples follow each other without a gap; see `sample_form.unpack_samples`."""
 
     @property
     def usable(self) -> np.ndarray:
@@ -86,7 +91,7 @@ class Judge:
         self._facts = facts
         self._known, self._good, self._compressed = (np.zeros(256, bool) for _ in range(3))
         self._width, self._samples = np.ones(256, np.int64), np.zeros(256, np.int64)
-        self._odd = np.zeros(256, bool)
+        self._odd, self._packed = np.zeros(256, bool), np.full(256, -1, np.int64)
         for index, digitizer in facts.digitizers.items():
             self._known[index] = True
             self._good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
@@ -95,6 +100,8 @@ class Judge:
             if self._good[index]:
                 self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
                 self._odd[index] = digitizer.bits not in WHOLE_BITS
+                if digitizer.bits in PACKED_BITS:
+                    self._packed[index] = packed_bytes(digitizer.n_samples, digitizer.bits)
         self._least = facts.packet_start - facts.packet_base
         self._end = facts.packet_end - facts.packet_base
 
@@ -125,7 +132,10 @@ class Judge:
         has = (index > 0) & (size > 0)
         self._refuse_compressed(index[has])
         n_samples = np.minimum(self._samples[index], size // self._width[index])
-        room = self._end - n_samples * self._width[index]
+        # Only the size of the packet shows whether samples of 12 bits have two bytes each.
+        packed = size == self._packed[index]
+        n_samples = np.where(packed, self._samples[index], n_samples)
+        room = self._end - np.where(packed, size, n_samples * self._width[index])
         inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64)) & (offset >= np.uint64(self._least))
         keys = (offset << INDEX_BITS) | index
         reason = np.zeros(len(points), np.uint8)
@@ -135,19 +145,23 @@ class Judge:
         reason[~_has_geometry(points, form)] = Reason.NO_GEOMETRY
         reason[~inside] = Reason.OUTSIDE
         reason[n_samples == 0] = Reason.EMPTY
-        # Only the size of the packet shows whether samples of 12 bits have two bytes each.
         reason[self._odd[index] & (n_samples < self._samples[index])] = Reason.PACKED
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
         reason[~self._known[index]] = Reason.NO_DESCRIPTOR
         reason[~has] = Reason.NO_WAVEFORM
         good = reason == Reason.USABLE
         short = good & (n_samples < self._samples[index])
-        return Judged(reason, np.where(good, n_samples, 0).astype(np.int32), keys, short)
+        return Judged(reason, np.where(good, n_samples, 0).astype(np.int32), keys, short, packed)
 
     def _refuse_compressed(self, index: np.ndarray) -> None:
         bad = self._compressed[index]
         if bad.any():
             raise refuse_compressed(self._facts.path, self._facts.compression[int(index[np.argmax(bad)])])
+
+
+def packed_bytes(n_samples: int, bits: int) -> int:
+    """Return the bytes of a packet of packed samples."""
+    return -(-n_samples * bits // 8)
 
 
 def _has_geometry(points: np.ndarray, form: str) -> np.ndarray:

@@ -214,16 +214,18 @@ class PacketFile:
         -------
         u1, u2 or u4 (n, n_samples), read-only
         """
-        width = n_samples * (bits // 8)
+        samples = self.read_bytes(offsets, n_samples * (bits // 8)).view(f"<u{bits // 8}")
+        samples.flags.writeable = False
+        return samples
+
+    def read_bytes(self, offsets: np.ndarray, width: int) -> np.ndarray:
+        """Return the first `width` bytes of packets that were checked before, u1 (n, width)."""
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
         try:
-            rows = self._gather(starts, width)
+            return self._gather(starts, width)
         except OSError as error:
             text = error.strerror or str(error)
             raise InputError(f"{self._place.file}: packets cannot be read: {text}; check the disk") from error
-        samples = rows.view(f"<u{bits // 8}")
-        samples.flags.writeable = False
-        return samples
 
     def _gather(self, starts: np.ndarray, width: int) -> np.ndarray:
         n = len(starts)

@@ -6,7 +6,7 @@ exactly one of them; results must not depend on blocks or processes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,10 +21,11 @@ from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_vectors import check_option, read_toward
 from wavebatch.files.strip.packets import PacketFile, PacketPlace, block_rows
+from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_samples
 from wavebatch.files.strip.scan_result import StripScan, raise_problem
 from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
-from wavebatch.kernels.signal.signal import recorded_lengths
+from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 
 __all__ = ["UNIT_POINTS", "PacketTable", "StripFacts", "StripReader", "StripScan", "Unit"]
 
@@ -52,6 +53,8 @@ class PacketTable:
     """File index of the first point with this packet, i8 (m,)."""
     owned: np.ndarray
     """Whether the owner lies in this unit, bool (m,)."""
+    packed: np.ndarray
+    """Whether samples follow each other without a gap, bool (m,)."""
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -79,6 +82,8 @@ class Unit:
     """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
     direction: str
     vector_form: str
+    forms: Mapping[int, SampleForm]
+    """How samples are stored, by descriptor index; see `StripScan.forms`."""
 
 
 class StripReader(Closing):
@@ -129,11 +134,11 @@ class StripReader(Closing):
         self._packets.close()
 
     def scan(self, *, tolerant: bool = False) -> StripScan:
-        """Return the result of one pass over the point records; samples are not read.
+        """Return the result of one pass over the point records; samples of a few packets are read.
 
         tolerant: put reasons against processing into `problems` instead of raising InputError.
         """
-        scan = scan_strip(self.facts, self._points, self._unit_points())
+        scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
         if not tolerant:
             raise_problem(self.facts, scan)
         return scan
@@ -157,12 +162,14 @@ class StripReader(Closing):
         entries = unique_entries(scan.context.read(number))
         near = self._judge.judge(entries["record"], scan.vector_form, scan.overfull)
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
+        packed = near.packed[near.usable]
         own = np.flatnonzero(judged.usable)
         index = np.concatenate([start + own, entries["index"]])
         keys = np.concatenate([judged.keys[own], keys])
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
-        packets, packet_of = _collect_packets(keys, index, sizes, n_samples)
+        packed = np.concatenate([judged.packed[own], packed])
+        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, packed)
         packets = replace(packets, owned=(packets.owner >= start) & (packets.owner < stop))
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
@@ -178,6 +185,7 @@ class StripReader(Closing):
             point_flags=judged.flags,
             direction=scan.direction,
             vector_form=scan.vector_form,
+            forms=scan.forms,
         )
 
     def read_blocks(self, unit: Unit, size: int, owned_only: bool) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
@@ -189,7 +197,11 @@ class StripReader(Closing):
         yield from self.read_rows(unit, rows, size)
 
     def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
-        """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time."""
+        """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time.
+
+        Within a unit the packets are taken in the order of their bytes, and blocks come in that order: a survey of the
+        strip does not change where its points are sorted in another way.
+        """
         units = self.unit_count()
         if not units or n_waveforms <= 0:
             return
@@ -198,6 +210,7 @@ class StripReader(Closing):
         for position, number in enumerate(chosen):
             unit = self.read_unit(number, scan)
             rows = np.flatnonzero(unit.packets.owned)
+            rows = rows[np.lexsort((unit.packets.digitizer[rows], unit.packets.offset[rows]))]
             share = -(-left // (len(chosen) - position))
             if len(rows) > share:
                 rows = rows[np.linspace(0, len(rows) - 1, share).round().astype(int)]
@@ -208,28 +221,36 @@ class StripReader(Closing):
                 return
 
     def read_rows(self, unit: Unit, rows: np.ndarray, size: int) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
-        """Yield blocks of the packets `rows` (k,) of the unit, as `read_blocks`; trailing padding is cut off."""
+        """Yield blocks of the packets `rows` (k,) of the unit, as `read_blocks`.
+
+        Trailing padding is cut off, other fill is marked as missing, counts of inverted waveforms are mirrored.
+        """
         geometry = _Geometry(unit, self.facts)
         table = unit.packets
-        kinds = (table.digitizer[rows].astype(np.int64) << 32) | table.n_samples[rows]
+        kinds = (table.digitizer[rows].astype(np.int64) << 32) | (table.packed[rows].astype(np.int64) << 31)
+        kinds |= table.n_samples[rows]
         groups = group_keys(kinds)
         for group in np.argsort(groups.order[groups.starts]).tolist():
             start = groups.starts[group]
             same = rows[groups.order[start : start + groups.counts[group]]]
-            digitizer = self.facts.digitizers[int(table.digitizer[same[0]])]
-            digitizer = replace(digitizer, bits=8 * digitizer.width)
-            n_samples = int(table.n_samples[same[0]])
-            step = block_rows(size, n_samples, digitizer.bits)
+            stored = self.facts.digitizers[int(table.digitizer[same[0]])]
+            packed, n_samples = bool(table.packed[same[0]]), int(table.n_samples[same[0]])
+            form = unit.forms.get(stored.index, PLAIN)
+            digitizer = form.digitizer(stored, packed)
+            step = block_rows(size, n_samples, 8 * digitizer.width)
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
-                samples = self._packets.read(table.offset[chosen], n_samples, digitizer.bits)
+                samples = read_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
                 length = recorded_lengths(samples)
                 for recorded in np.unique(length).tolist():
                     part = np.flatnonzero(length == recorded)
                     kept = samples if len(part) == len(chosen) else samples[part]
                     kept = np.ascontiguousarray(kept[:, :recorded])
+                    missing = find_fill(kept, stored.max_count, digitizer.max_count)
+                    if missing is not None:
+                        kept = quiet_fill(kept, missing)
                     kept.flags.writeable = False
-                    yield geometry.build_block(chosen[part], digitizer, kept), chosen[part]
+                    yield geometry.build_block(chosen[part], digitizer, kept, missing), chosen[part]
 
 
 class _Geometry:
@@ -246,7 +267,9 @@ class _Geometry:
         edges = np.searchsorted(packet_of[self._entry], np.arange(len(unit.packets) + 1))
         self._starts, self._counts = edges[:-1], np.diff(edges)
 
-    def build_block(self, rows: np.ndarray, digitizer: Digitizer, samples: np.ndarray) -> WaveformBlock:
+    def build_block(
+        self, rows: np.ndarray, digitizer: Digitizer, samples: np.ndarray, missing: np.ndarray | None
+    ) -> WaveformBlock:
         """Return the block of packets `rows`; the first return of each packet is its owner."""
         counts = self._counts[rows]
         place = expand(self._starts[rows], counts)
@@ -268,6 +291,7 @@ class _Geometry:
                 np.repeat(np.arange(len(rows), dtype=np.int32), counts), location / PS_PER_NS, self._index[place], xyz
             ),
             scanner=_read_scanner(records[owner]),
+            missing=missing,
         )
 
     def _take(self, entries: np.ndarray) -> np.ndarray:
@@ -287,7 +311,7 @@ def _read_scanner(records: np.ndarray) -> np.ndarray | None:
 
 
 def _collect_packets(
-    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray
+    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray, packed: np.ndarray
 ) -> tuple[PacketTable, np.ndarray]:
     """Packets of points (n,) in order of their owners, all marked as owned, and the row of each point, i4 (n,)."""
     by_index = np.argsort(index, kind="stable")
@@ -306,5 +330,6 @@ def _collect_packets(
         n_samples=n_samples[lead],
         owner=index[lead],
         owned=np.ones(len(lead), bool),
+        packed=packed[lead],
     )
     return table, packet_of

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
+from wavebatch.files.strip.sample_form import SampleForm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +53,13 @@ class StripScan(Closing):
     warnings: tuple[str, ...]
     problems: tuple[str, ...]
     """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
+    forms: Mapping[int, SampleForm]
+    """How samples are stored, by descriptor index; only descriptors whose counts are not simply read as they are."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know about how samples are stored, one line each."""
+        return tuple(note for form in self.forms.values() for note in form.notes)
 
     @property
     def is_hopeless(self) -> bool:

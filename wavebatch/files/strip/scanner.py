@@ -1,7 +1,7 @@
 """The pass over the points of a strip: checks packets, sets the borders of units, finds packets that cross borders.
 
-`StripReader.scan` calls it. It never reads samples, and its memory does not grow with the strip. Borders depend only
-on the file, so that results are equal for any number of processes.
+`StripReader.scan` calls it. It reads the samples of a few packets only, and its memory does not grow with the strip.
+Borders depend only on the file, so that results are equal for any number of processes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from wavebatch.files.strip import shared_packets
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Judge, Judged, Reason
 from wavebatch.files.strip.packet_vectors import DirectionTally, decide, find_form
+from wavebatch.files.strip.packets import PacketFile
+from wavebatch.files.strip.sample_form import FormSample, find_forms
 from wavebatch.files.strip.scan_result import StripScan, describe_hopeless, describe_oddities
 from wavebatch.files.strip.shared_packets import Groups, NearSharing, find_far, group_keys
 
@@ -31,13 +33,13 @@ _FAR_SAMPLES = 32
 _FIRST_POINTS, _FIRST_BYTES = 10_000, 1 << 26
 
 
-def scan_strip(facts: StripFacts, source: PointSource, unit_points: int) -> StripScan:
+def scan_strip(facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> StripScan:
     """Scan all points of a strip.
 
     unit_points: points per unit before borders are moved to the next pulse.
     Raises InputError if points cannot be read; other reasons against processing are in the scan's `problems`.
     """
-    return _Scanner(facts, source, unit_points).run()
+    return _Scanner(facts, source, packets, unit_points).run()
 
 
 @dataclass(slots=True)
@@ -60,8 +62,9 @@ class _Tally:
 
 
 class _Scanner:
-    def __init__(self, facts: StripFacts, source: PointSource, unit_points: int) -> None:
+    def __init__(self, facts: StripFacts, source: PointSource, packets: PacketFile, unit_points: int) -> None:
         self._facts, self._source, self._unit_points = facts, source, unit_points
+        self._packets, self._sample = packets, FormSample()
         self._judge = Judge(facts)
         self._form = find_form(self._take_first())
         self._tally, self._votes = _Tally(), DirectionTally(self._form)
@@ -128,6 +131,8 @@ class _Scanner:
         parts = _Parts([*self._window, part])
         own = np.arange(len(parts.keys)) >= len(parts.keys) - len(rows)
         groups = self._near.add(parts.keys, parts.index, parts.unit, own, lambda rows: self._entries(parts, rows))
+        first = groups.order[groups.starts] - (len(parts.keys) - len(rows))
+        self._sample.add(judged, rows[first[first >= 0]])
         if len(rows):
             self._votes.add_points(take_records(points, rows[:: max(1, len(rows) // _VOTERS)]))
             self._vote(groups, parts, own)
@@ -228,6 +233,7 @@ class _Scanner:
             context=self._context,
             warnings=(*describe_oddities(reasons, tally.short), *decision.warnings),
             problems=tuple(problems),
+            forms=find_forms(facts.digitizers, self._packets, self._sample),
         )
 
 

@@ -166,8 +166,10 @@ def cut_windows(
     ----------
     samples : uint (n, s), count
         Raw counts, contiguous.
-    baseline, std : float32 (n,), count
-        Level and noise of each waveform.
+    baseline : float32 (n,) or (n, s), count
+        Level of each waveform, or of each sample.
+    std : float32 (n,), count
+        Noise of each waveform.
     waveform, low, high : int64 (m,)
         Row of each window, its first sample and its end.
     length : int, samples
@@ -196,7 +198,10 @@ def cut_windows(
         clipped = y >= clip
         if not clipped.any():
             clipped = None
-    y -= baseline[waveform][:, None]
+    if baseline.ndim == 1:
+        y -= baseline[waveform][:, None]
+    else:
+        y -= np.lib.stride_tricks.sliding_window_view(baseline.reshape(-1), length)[waveform * s + begin]
     position = np.arange(length, dtype=np.float32)
     outside = position < (low - begin).astype(np.float32)[:, None]
     outside |= position >= (high - begin).astype(np.float32)[:, None]

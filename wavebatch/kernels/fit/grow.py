@@ -65,8 +65,10 @@ def decompose_clusters(
     ----------
     samples : uint (n, s), count
         Raw counts, contiguous.
-    baseline, std : float32 (n,), count
-        Level and noise of each waveform.
+    baseline : float32 (n,) or (n, s), count
+        Level of each waveform, or of each sample.
+    std : float32 (n,), count
+        Noise of each waveform.
     candidates : Candidates
         Start values.
     clusters : Clusters

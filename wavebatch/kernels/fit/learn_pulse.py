@@ -28,6 +28,9 @@ EARLIEST = 2.0
 """Widths of the pulse before its peak where a component may still lie: what comes earlier is a layer of constant height
 above the ground (canopy, crop), which looks like a pulse before the pulse."""
 
+LOBE = 3.0
+"""Widths of the pulse around its peak that a skewed pulse is fitted to."""
+
 ONSET = 4.0
 """Widths of the pulse before its peak before which no component may begin, two of its sigmas before its centre: a broad
 one describes a tail, and would lift what comes before the pulse (by 1.7 DN on a strip of RIEGL)."""
@@ -106,8 +109,10 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> li
 def fit_skewed(stack: Stack, width: float) -> PulseFit:
     """The skewed pulse of section 0 fitted to the stack."""
     weight = _weights(stack)
+    # A tail is no skew: the main lobe decides, all of the stack says how well it fits.
+    lobe = np.where(np.abs(stack.lag) < LOBE * width, weight, 0.0)
 
-    def misfit(p: np.ndarray) -> np.ndarray:
+    def misfit(p: np.ndarray, weight: np.ndarray = lobe) -> np.ndarray:
         t, s = np.array([p[1]]), np.array([p[2]])
         pulse = evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s)[0][:, 0]
         return (p[0] * pulse - stack.value) * weight
@@ -115,7 +120,7 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
     low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
     result = scipy.optimize.least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
     amplitude, delay, sigma, kappa = result.x
-    rms = float(np.sqrt(np.mean((misfit(result.x) / weight) ** 2)))
+    rms = float(np.sqrt(np.mean(misfit(result.x, np.ones_like(weight)) ** 2)))
     return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
 
 

@@ -129,3 +129,41 @@ def walk_down(signal: np.ndarray, waveform: np.ndarray, sample: np.ndarray, leve
         going, here, value = (field[falls & ~crosses] for field in (going, here, after))
         place[going] = here
     return place
+
+
+def find_stretches(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, first samples and ends of the stretches of true samples in mask (n, s), in order: int64 (k,) each."""
+    padded = np.zeros((mask.shape[0], mask.shape[1] + 2), np.int8)
+    padded[:, 1:-1] = mask
+    edge = np.diff(padded, axis=1)
+    row, start = np.nonzero(edge == 1)
+    return row, start, np.nonzero(edge == -1)[1]
+
+
+def gap_distance(missing: np.ndarray, waveform: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """How far times lie from the nearest gap of their waveform, inside of what was recorded.
+
+    Parameters
+    ----------
+    missing : bool (n, s)
+        Samples that were not recorded.
+    waveform : int (m,)
+        Rows.
+    time : float (m,), samples
+
+    Returns
+    -------
+    float64 (m,), samples
+        0 at the recorded sample next to a gap, negative inside of one; inf where the waveform has none.
+    """
+    row, start, end = find_stretches(missing)
+    distance = np.full(len(waveform), np.inf)
+    if not len(row):
+        return distance
+    width = missing.shape[1] + 2.0
+    place = np.searchsorted(row * width + start, waveform * width + np.clip(time, -1, width - 2), side="right")
+    for near in (place - 1, place):
+        gap = np.clip(near, 0, len(row) - 1)
+        away = np.maximum(start[gap] - 1 - time, time - end[gap])
+        distance = np.where((near == gap) & (row[gap] == waveform), np.minimum(distance, away), distance)
+    return distance

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.signal.runs import find_stretches
+
 SMOOTH_GAIN = np.sqrt(6.0) / 4.0
 """Standard deviation of white noise after one pass of the [1 2 1]/4 filter (0.61237)."""
 
@@ -15,6 +17,11 @@ SMOOTH_GAIN = np.sqrt(6.0) / 4.0
 LEAST_PADDING, LEAST_RECORDED, LEAST_LEVEL = 8, 16, 3
 """Zeros at the end of a waveform are padding if there are at least LEAST_PADDING of them, after at least LEAST_RECORDED
 samples that are all at least LEAST_LEVEL.
+"""
+
+STEP_FROM_ZERO, STEP_FROM_TOP = 3 / 4, 15 / 16
+"""Share of the way from fill to the level of the recording beside it that the first recorded sample must go. From the
+largest count it is more: a clipped echo of 8 samples falls by up to three quarters from one sample to the next.
 """
 
 
@@ -44,6 +51,99 @@ def recorded_lengths(samples: np.ndarray) -> np.ndarray:
         padded = (real < s) & (real >= LEAST_RECORDED) & ~low.any(axis=1)
         length[rows[padded]] = real[padded]
     return length
+
+
+def find_fill(samples: np.ndarray, *tops: int) -> np.ndarray | None:
+    """Samples that only fill a packet, between two recordings or before the first.
+
+    Fill is a run of at least LEAST_PADDING zeros or largest counts to which the waveform steps within one sample:
+    echoes, also clipped ones, and waveforms that are cut off at a threshold come near it on their flanks. Zeros are
+    fill only where no recorded sample of the waveform is near zero. On both sides of a run at least LEAST_RECORDED
+    samples are recorded, or the waveform ends.
+
+    Parameters
+    ----------
+    samples : uint (n, s), count
+        Raw counts.
+    *tops : int, count
+        Largest counts: of the digitizer, of the bytes of a sample.
+
+    Returns
+    -------
+    bool (n, s) or None
+        None where nothing is fill.
+    """
+    n, s = samples.shape
+    if s < LEAST_RECORDED + LEAST_PADDING or not n:
+        return None
+    # Every long run has a sample in these columns: an ordinary block costs an eighth of a pass.
+    seen = samples[:, LEAST_PADDING - 1 :: LEAST_PADDING]
+    least, largest = seen.min(), seen.max()
+    fill = None
+    for value in {0, *tops}:
+        if least > 0 if value == 0 else largest < value:
+            continue
+        rows = np.flatnonzero((seen == value).any(axis=1))
+        if value == 0 and len(rows):
+            rows = rows[(seen[rows] - 1 >= LEAST_LEVEL - 1).all(axis=1)]
+        found = _find_fill_rows(samples[rows], value) if len(rows) else None
+        if found is not None and found.any():
+            fill = np.zeros(samples.shape, bool) if fill is None else fill
+            fill[rows] |= found
+    return fill
+
+
+def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
+    """Runs of one count in samples (n, s) that are fill, bool (n, s)."""
+    n, s = samples.shape
+    row, start, end = find_stretches(samples == value)
+    long = end - start >= LEAST_PADDING
+    row, start, end = row[long], start[long], end[long]
+    good = _steps(samples, row, start, -1, value) & _steps(samples, row, end - 1, 1, value)
+    good &= (start > 0) | (end < s)
+    if value == 0:
+        marks = _mark_runs(row, start, end, n, s)
+        low = ((samples < LEAST_LEVEL) & ~marks).any(axis=1)
+        low[row[~good]] = True
+        good &= ~low[row]
+    return _mark_runs(row[good], start[good], end[good], n, s)
+
+
+def _steps(samples: np.ndarray, row: np.ndarray, last: np.ndarray, side: int, value: int) -> np.ndarray:
+    """Whether a waveform steps from the run that ends at sample `last` (k,) to its level beside it, bool (k,).
+
+    side: 1 after the run, -1 before it. The level is the lower quartile of the next LEAST_RECORDED samples. Also true
+    where the waveform ends with the run.
+    """
+    s = samples.shape[1]
+    at = last[:, None] + side * np.arange(1, LEAST_RECORDED + 1)
+    ends = (at[:, 0] < 0) | (at[:, 0] >= s)
+    inside = (at[:, -1] >= 0) & (at[:, -1] < s)
+    near = samples[row[:, None], np.clip(at, 0, s - 1)].astype(np.float64)
+    level = np.partition(near, LEAST_RECORDED // 4 - 1, axis=1)[:, LEAST_RECORDED // 4 - 1]
+    if value == 0:
+        step = near[:, 0] >= STEP_FROM_ZERO * level
+    else:
+        step = (value - near[:, 0] >= STEP_FROM_TOP * (value - level)) & (near[:, 0] <= 0.5 * value)
+    return ends | (inside & step)
+
+
+def _mark_runs(row: np.ndarray, start: np.ndarray, end: np.ndarray, n: int, s: int) -> np.ndarray:
+    """True from start to end (k,) in rows (k,) of a bool (n, s)."""
+    count = np.zeros((n, s + 1), np.int8)
+    count[row, start] = 1
+    count[row, end] -= 1
+    return np.cumsum(count[:, :-1], axis=1, dtype=np.int8) > 0
+
+
+def quiet_fill(samples: np.ndarray, fill: np.ndarray) -> np.ndarray:
+    """Samples (n, s) with the lower quartile of each waveform's recorded samples in place of fill, as a copy."""
+    quiet = samples.copy()
+    rows = np.flatnonzero(fill.any(axis=1))
+    part = np.sort(np.where(fill[rows], np.iinfo(samples.dtype).max, samples[rows]), axis=1)
+    level = part[np.arange(len(rows)), np.count_nonzero(~fill[rows], axis=1) // 4]
+    quiet[rows] = np.where(fill[rows], level[:, None], samples[rows])
+    return quiet
 
 
 def transpose_samples(samples: np.ndarray) -> np.ndarray:

@@ -84,11 +84,14 @@ def _read_single(
     samples, s = block.samples.ravel(), block.samples.shape[1]
     first = waveform.astype(np.int64)[:, None] * s
     amplitude, time, width = model.astype(np.float32).T[..., None]
+    level, missing = (None if values is None else values.ravel() for values in (noise.of_sample, block.missing))
 
     def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         values = samples[first[part] + at].astype(np.float32)
-        values -= noise.baseline[waveform[part], None]
+        values -= noise.baseline[waveform[part], None] if level is None else level[first[part] + at]
         values -= amplitude[part] * evaluate_pulse(shape, at.astype(np.float32), time[part], width[part])[0]
+        if missing is not None:
+            values[missing[first[part] + at]] = 0
         return values
 
     return read
@@ -99,8 +102,10 @@ def _read_several(
 ) -> _Read:
     """Reader of residuals of echoes (k,) that share their waveforms: the model is computed for the whole waveform."""
     rows, place = np.unique(waveform, return_inverse=True)
-    residual = block.samples[rows] - noise.baseline[rows, None]
+    residual = block.samples[rows] - noise.level[rows]
     residual -= render_echoes(shape, len(rows), block.samples.shape[1], place, model[:, 1], model[:, 0], model[:, 2])
+    if block.missing is not None:
+        residual[block.missing[rows]] = 0
 
     def read(part: np.ndarray | slice, at: np.ndarray) -> np.ndarray:
         return residual[place[part][:, None], at].astype(np.float32)

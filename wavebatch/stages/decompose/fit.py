@@ -19,6 +19,7 @@ from wavebatch.kernels.fit.cluster import Clusters
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import WidthPrior
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
@@ -211,7 +212,7 @@ def fit_candidates(
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
     solutions = decompose_clusters(
-        block.samples, noise.baseline, noise.std, candidates, clusters, settings, block.missing
+        block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
     )
     return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
 
@@ -259,6 +260,8 @@ def describe_solutions(
     last = block.samples.shape[1] - 1
     keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
     keep &= np.isfinite(errors).all(axis=1)
+    if block.missing is not None:
+        keep &= gap_distance(block.missing, waveform, time) >= -0.5 * width
     amplitude, time, width = parameters[keep].T
     amplitude_err, time_err, width_err = errors[keep].T
     spacing = block.spacing
@@ -299,7 +302,10 @@ def _start_closed_form(
     reach = min(int(np.ceil(2.5 * ref)), s)
     at = peak[:, None] + np.arange(-reach, reach + 1)
     inside = (at >= 0) & (at < s)
-    y = block.samples[waveform[:, None], np.clip(at, 0, s - 1)] - noise.baseline[waveform][:, None]
+    row, at = waveform[:, None], np.clip(at, 0, s - 1)
+    y = block.samples[row, at] - (noise.baseline[row] if noise.of_sample is None else noise.of_sample[row, at])
+    if block.missing is not None:
+        inside &= ~block.missing[row, at]
     amplitude, shift, width, holds = fit_closed_form(np.where(inside, y, 0.0), fraction)
     holds &= (width > 0.7 * ref) & (width < 4.0 * ref)
     return replace(

@@ -63,7 +63,7 @@ def find_clusters(
     candidates, tail = _explain_tails(candidates, noise, settings)
     present, row = np.unique(candidates.waveform, return_inverse=True)
     signal = transpose_samples(block.samples[present])
-    signal -= noise.baseline[present]
+    signal -= noise.level[present].T
     if block.missing is not None:
         signal[block.missing[present].T] = 0
     ref = system.sigma_ref / block.spacing

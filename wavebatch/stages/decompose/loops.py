@@ -69,7 +69,7 @@ def residual_loop(
         echoes = join_tables(kept, added)
         echoes = _renumber(echoes, np.searchsorted(at, echoes.waveform))
         rows, before, varies, block = rows[at], number[at], varies[at], block.rows(at)
-        noise = Noise(noise.baseline[at], noise.std[at])
+        noise = noise.rows(at)
     return join_tables(*parts)
 
 
@@ -80,9 +80,11 @@ def _renumber(table: EchoTable, waveform: np.ndarray) -> EchoTable:
 def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarray:
     """Waveforms without their echoes, float32 (n, s)."""
     n, s = block.samples.shape
-    residual = block.samples - noise.baseline[:, None]
+    residual = block.samples - noise.level
     sigma = table.sigma / np.float32(block.spacing)
     residual -= render_echoes(GAUSSIAN, n, s, table.waveform, table.time / block.spacing, table.amplitude, sigma)
+    if block.missing is not None:
+        residual[block.missing] = 0
     return residual.astype(np.float32)
 
 
@@ -118,7 +120,7 @@ def asdf_only(
     rows = np.flatnonzero(differ)
     chosen = echoes.take(np.flatnonzero(differ[echoes.waveform]))
     chosen = _renumber(chosen, np.searchsorted(rows, chosen.waveform))
-    fitted = gaussian(block.rows(rows), Noise(noise.baseline[rows], noise.std[rows]), system, chosen)
+    fitted = gaussian(block.rows(rows), noise.rows(rows), system, chosen)
     agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
     return join_tables(agreed, _renumber(fitted, rows[fitted.waveform]))
 

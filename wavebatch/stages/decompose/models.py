@@ -187,7 +187,9 @@ def generalized_gaussian(
         factor = half_width_factor(power)
         widths = {name: getattr(plain, name) / factor for name in ("width_ref", "width_low", "width_high")}
         settings = plain._replace(shape=PulseShape(power=power), **widths)
-        solutions = decompose_clusters(block.samples, noise.baseline, noise.std, candidates, clusters, settings)
+        solutions = decompose_clusters(
+            block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
+        )
         found.append([_as_half_width(solution, factor) for solution in solutions])
         for solution in found[-1]:
             better = solution.cost < best[solution.cluster]
@@ -263,7 +265,8 @@ def _solve_undamped(
     low, high = clusters.low[rows], clusters.high[rows]
     length = min(-(-int((high - low).max()) // 8) * 8, block.samples.shape[1])
     windows, begin = cut_windows(
-        block.samples, noise.baseline, noise.std, clusters.waveform[rows], low, high, length, settings.clip
+        block.samples, noise.for_fits, noise.std, clusters.waveform[rows], low, high, length, settings.clip,
+        missing=block.missing,
     )
     member = clusters.first[rows][:, None] + np.arange(clusters.number[rows[0]])
     start = np.stack([candidates.amplitude[member], candidates.time[member], candidates.width[member]], axis=1)

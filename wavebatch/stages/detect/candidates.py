@@ -6,6 +6,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import transpose_samples
 
 
@@ -25,7 +26,7 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
         Signal above the baseline [count]; waveforms lie along the last axis, as kernels need it.
     """
     signal = transpose_samples(block.samples)
-    signal -= noise.baseline
+    signal -= noise.level.T
     if block.missing is not None:
         signal[block.missing.T] = 0
     return signal
@@ -34,7 +35,9 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
 def make_table(
     block: WaveformBlock, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray
 ) -> EchoTable:
-    """Turn candidates in samples into a table in ns; constant waveforms have none, whatever filters make of their ends.
+    """Turn candidates in samples into a table in ns.
+
+    Constant waveforms have none, whatever filters make of their ends, and gaps between two recordings have none.
 
     Parameters
     ----------
@@ -58,6 +61,8 @@ def make_table(
     """
     rows, row = np.unique(waveform, return_inverse=True)
     varies = find_varying(block.samples[rows])[row]
+    if block.missing is not None:
+        varies &= gap_distance(block.missing, waveform, time) > -1.0
     columns = (waveform, time * block.spacing, amplitude, width * block.spacing)
     return EchoTable.build(*(columns if varies.all() else (values[varies] for values in columns)))
 

@@ -66,7 +66,7 @@ def fit_leastsq(block: WaveformBlock, noise: Noise, system: SystemPulse) -> Peer
     from scipy.optimize import leastsq
 
     candidates = maximum(block, noise, system)
-    signal = block.samples - noise.baseline[:, None].astype(np.float64)
+    signal = block.samples - noise.level.astype(np.float64)
     x = np.arange(signal.shape[1]) * block.spacing
     ends = np.cumsum(candidates.count(len(block)))
     starts = np.stack([candidates.amplitude, candidates.time, candidates.sigma], axis=1).astype(np.float64)
@@ -115,7 +115,7 @@ def _run_gdecomp(block: WaveformBlock, noise: Noise) -> PeerResult:
     n = len(block)
     with tempfile.TemporaryDirectory() as folder:
         signal, results = Path(folder, "signal.npy"), Path(folder, "results.npy")
-        np.save(signal, block.samples - noise.baseline[:, None].astype(np.float64))
+        np.save(signal, block.samples - noise.level.astype(np.float64))
         np.save(results, np.full((n, 2 + 3 * MOST), np.nan))
         failures = _drive_gdecomp(signal, results, n, HEIGHT * float(noise.std[0]))
         done = np.load(results)

@@ -223,8 +223,11 @@ class _Found:
         sample = np.rint(returns.time / block.spacing)
         inside = np.flatnonzero((sample >= 0) & (sample < block.samples.shape[1]))
         waveform = returns.waveform[inside]
-        count = block.samples[waveform, sample[inside].astype(np.int64)]
-        rows["amplitude"][inside] = count - self.noise.baseline[waveform]
+        at = sample[inside].astype(np.int64)
+        level = np.broadcast_to(self.noise.level, block.samples.shape)[waveform, at]
+        rows["amplitude"][inside] = block.samples[waveform, at] - level
+        if block.missing is not None:
+            rows["amplitude"][inside[block.missing[waveform, at]]] = np.nan
         return rows
 
 

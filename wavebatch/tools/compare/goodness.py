@@ -41,8 +41,10 @@ def measure_fit(
     if model is None:
         return np.full(len(block), np.nan), np.full(len(block), np.nan)
     used = block.samples < clip_level(block, system)
+    if block.missing is not None:
+        used &= ~block.missing
     model = np.where(used, model.astype(np.float64), 0.0)
-    residual = np.where(used, block.samples - noise.baseline[:, None].astype(np.float64) - model, 0.0)
+    residual = np.where(used, block.samples - noise.level.astype(np.float64) - model, 0.0)
     energy = np.square(model).sum(axis=1)
     energy[energy <= 0] = np.nan
     floor = np.count_nonzero(used, axis=1) * np.square(noise.std.astype(np.float64))

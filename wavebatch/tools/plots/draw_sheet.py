@@ -12,7 +12,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.plots.draw_waveform import CLIPPED, ECHO, FIT, GREY, INK, PULSE, VENDOR
+from wavebatch.tools.plots.draw_waveform import CLIPPED, ECHO, FIT, GREY, INK, PULSE, VENDOR, shade_gaps
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -107,18 +107,19 @@ def _find_span(view: WaveformView) -> tuple[float, float]:
 
 def _draw_signal(axes: Axes, view: WaveformView, low: float, high: float) -> None:
     axes.axhline(view.baseline, color=GREY, linewidth=0.5)
+    shade_gaps(axes, view)
     for place in view.returns:
         axes.axvline(place, color=VENDOR, linewidth=0.6, linestyle=(0, (4, 2)))
     for curve in view.curves:
-        axes.plot(view.fine, view.baseline + curve, color=PULSE, linewidth=0.6)
+        axes.plot(view.fine, view.fine_level + curve, color=PULSE, linewidth=0.6)
     if view.fit is not None:
         axes.plot(view.fine, view.fit, color=FIT, linewidth=0.8)
     free = ~view.clipped
     axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=1.2, zorder=3)
     axes.plot(view.time[view.clipped], view.samples[view.clipped], "^", color=CLIPPED, markersize=2.5, zorder=3)
-    peak = view.baseline + view.echoes.amplitude.astype(np.float64)
+    peak = np.interp(view.echoes.time, view.time, view.level) + view.echoes.amplitude.astype(np.float64)
     axes.plot(view.echoes.time, peak, "D", color=ECHO, markersize=3, markerfacecolor="none", markeredgewidth=0.7)
-    shown = view.samples[(view.time >= low) & (view.time <= high)]
+    shown = view.samples[(view.time >= low) & (view.time <= high) & np.isfinite(view.samples)]
     bottom, top = min(shown.min(initial=view.baseline), view.baseline), max(shown.max(initial=0), peak.max(initial=0))
     span = max(top - bottom, 6 * view.std)
     axes.set_ylim(bottom - 0.06 * span, bottom + 1.1 * span)

@@ -17,6 +17,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.kernels.signal.runs import find_stretches
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -108,9 +109,11 @@ def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
     axes.tick_params(labelbottom=False)
     axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0)
     axes.axhline(view.baseline, color=GREY, linewidth=0.8, zorder=1)
+    shade_gaps(axes, view)
+    level = view.fine_level
     for curve in view.curves:
-        axes.fill_between(view.fine, view.baseline, view.baseline + curve, color=PULSE, alpha=0.15, linewidth=0)
-        axes.plot(view.fine, view.baseline + curve, color=PULSE, linewidth=0.9)
+        axes.fill_between(view.fine, level, level + curve, color=PULSE, alpha=0.15, linewidth=0)
+        axes.plot(view.fine, level + curve, color=PULSE, linewidth=0.9)
     if view.fit is not None:
         axes.plot(view.fine, view.fit, color=FIT, linewidth=1.5)
     size = (2.4 if small else 3.4) * (1.0 if len(view.time) <= _MANY else 0.6)
@@ -125,11 +128,19 @@ def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
     _draw_echoes(axes, view, small=small)
 
 
+def shade_gaps(axes: Axes, view: WaveformView) -> None:
+    """Hatches the times between two recordings of a packet, at which nothing was recorded."""
+    _, start, end = find_stretches(np.isnan(view.samples)[None])
+    for first, last in zip(start.tolist(), end.tolist(), strict=True):
+        low, high = ((place - 0.5) * view.spacing for place in (first, last))
+        axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0)
+
+
 def _draw_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
     echoes = view.echoes
     if not len(echoes):
         return
-    peak = view.baseline + echoes.amplitude.astype(np.float64)
+    peak = np.interp(echoes.time, view.time, view.level) + echoes.amplitude.astype(np.float64)
     across, up = (np.nan_to_num(error.astype(np.float64)) for error in (echoes.time_err, echoes.amplitude_err))
     axes.errorbar(
         echoes.time, peak, xerr=across, yerr=up, fmt="D", markersize=4, markerfacecolor="none", color=ECHO,
@@ -168,8 +179,8 @@ def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> N
     if view.fit is not None:
         values.append(view.fit[inside(view.fine)])
     shown = np.concatenate(values)
-    span = float(shown.max() - shown.min())
-    axes.set_ylim(shown.min() - 0.05 * span, shown.max() + 0.17 * span)
+    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+    axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
 
 
 def _list_echoes(view: WaveformView) -> str:
@@ -213,6 +224,8 @@ def _place_legend(figure: Figure, views: Sequence[WaveformView]) -> None:
     handles.append(Line2D([], [], marker="D", color=ECHO, markerfacecolor="none", markersize=4, label="echoes"))
     if any(len(view.returns) for view in views):
         handles.append(Line2D([], [], color=VENDOR, linestyle=_DASHED, label="returns of the file"))
+    if any(np.isnan(view.samples).any() for view in views):
+        handles.append(Patch(facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, label="not recorded"))
     if any(view.clipped.any() for view in views):
         look = {"marker": "^", "color": CLIPPED, "markeredgecolor": INK, "linestyle": ""}
         handles.append(Line2D([], [], **look, label="saturated samples"))

@@ -40,19 +40,21 @@ class WaveformView:
     time: np.ndarray
     """Times of the samples after the first one [ns], f8 (s,)."""
     samples: np.ndarray
-    """Samples [DN], f8 (s,)."""
+    """Samples [DN], f8 (s,); NaN where nothing was recorded."""
     clipped: np.ndarray
     """Samples at the digitizer's limit, bool (s,)."""
     baseline: float
     std: float
     """Noise of a sample without signal [DN]."""
+    level: np.ndarray
+    """Baseline at each sample [DN], f8 (s,): recordings of one packet may differ."""
     fine: np.ndarray
     """Times of the curves [ns], f8 (q,)."""
     curves: np.ndarray
     """Pulse of each echo above the baseline [DN], f8 (k, q); (0, q) if the chain fits no pulses."""
     residual: np.ndarray | None
     """Samples less baseline and fit, in standard deviations of the noise at each sample, f8 (s,); NaN for clipped
-    samples below the fit, which agree with it. None without a fit."""
+    samples below the fit, which agree with it, and where nothing was recorded. None without a fit."""
     echoes: EchoTable
     """The k echoes of this waveform."""
     returns: np.ndarray
@@ -65,8 +67,14 @@ class WaveformView:
 
     @property
     def fit(self) -> np.ndarray | None:
-        """Sum of baseline and curves [DN], f8 (q,); None without a fit."""
-        return None if self.residual is None else self.baseline + self.curves.sum(axis=0)
+        """Sum of baseline and curves [DN], f8 (q,); None without a fit. NaN in gaps between two recordings."""
+        return None if self.residual is None else self.fine_level + self.curves.sum(axis=0)
+
+    @property
+    def fine_level(self) -> np.ndarray:
+        """Level without signal at the times of the curves [DN], f8 (q,); NaN where nothing was recorded."""
+        nearest = np.clip(np.rint(self.fine / self.spacing).astype(np.int64), 0, len(self.time) - 1)
+        return np.where(np.isnan(self.samples), np.nan, self.level)[nearest]
 
 
 def read_views(
@@ -95,6 +103,8 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
     for row, number in enumerate(packets):
         table = echoes.take(np.flatnonzero(echoes.waveform == row))
         samples = block.samples[row].astype(np.float64)
+        if block.missing is not None:
+            samples[block.missing[row]] = np.nan
         clipped = samples >= level
         baseline, std = float(noise.baseline[row]), float(noise.std[row])
         time = np.arange(len(samples)) * block.spacing
@@ -103,12 +113,12 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
         if shape is not None:
             pulses = _place_pulses(shape, table, system, block.spacing)
             curves = pulses(fine)
-            residual = _residual(samples - baseline, pulses(time).sum(axis=0), clipped, std, system.noise_gain)
+            residual = _residual(samples - noise.level[row], pulses(time).sum(axis=0), clipped, std, system.noise_gain)
         returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
         views.append(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
-                fine, curves, residual, table, returns,
+                np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table, returns,
             )  # fmt: skip
         )
     return views

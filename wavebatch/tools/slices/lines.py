@@ -124,9 +124,12 @@ def _read_pulses(reader: StripReader, unit: Unit) -> _Pulses:
 
 def _shape(block: WaveformBlock) -> _Pulses:
     n, s = block.samples.shape
+    # Fill holds the lower quartile of what was recorded (docs/algorithms.md H8), so it does not move the level.
     values = block.samples.astype(np.float32)
     at = int(_FLOOR * (s - 1))
     values -= np.partition(values, at, axis=1)[:, at : at + 1]
+    if block.missing is not None:
+        values[block.missing] = 0
     place = (block.point, block.gps_time, block.origin, block.direction)
     return _Pulses(*place, np.full(n, block.spacing), np.arange(n) * s, np.full(n, s), values.reshape(-1))
 

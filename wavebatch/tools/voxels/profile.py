@@ -124,6 +124,8 @@ def deconvolve_block(block: WaveformBlock, system: SystemPulse, options: Deconvo
         kept, seen[rows] = keep_signal(np.ascontiguousarray(profile.T), near, least * std, floor * std)
         if options.method != "richardson_lucy":  # that iteration keeps the energy, the others do not
             kept = fit_height(kept, part, taps, near)
+        if block.missing is not None:
+            kept = np.where(block.missing[rows[:, None], place.T], 0.0, kept)
         value[rows[:, None], place.T] = kept
     offset, anchored = _find_offsets(block, value)
     clipped = (block.samples >= clip_level(block, system)).any(axis=1)

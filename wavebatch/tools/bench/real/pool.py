@@ -58,7 +58,7 @@ class Solver:
     def expect(self, block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
         """Samples without their noise, f4 (n, s): baseline and fitted echoes; the baseline where nothing is fitted."""
         system, (first, _, decomposer) = self.system.of(block), self.chain.steps
-        baseline = first.stage.function(block, system, **first.parameters).baseline[:, None]
+        baseline = first.stage.function(block, system, **first.parameters).level
         model = rebuild_waveforms(block, system, decomposer, echoes)
         return np.broadcast_to(baseline, block.samples.shape) if model is None else baseline + model
 
