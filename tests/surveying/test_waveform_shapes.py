@@ -86,3 +86,21 @@ def test_samples_before_the_pulse_agree_with_the_baseline(strip, request):
 def test_ordinary_strips_keep_all_quiet_samples():
     signal, *_ = render(bell, 2, second=0.5)
     assert survey_block(digitize(signal, 2)).system.recovery == 0
+
+
+def optech(x):
+    """A steep front and a tail, as Optech's receivers give."""
+    return (bell(x) + 0.15 * bell((x - 1.6) / 1.2) + 0.02 * bell((x - 4.2) / 1.6)) / 1.04
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_clipped_tops_stay_one_echo(seed):
+    """Amplitudes to four times the range of the digitizer, noise that rounding nearly hides, widened echoes too."""
+    plain, rows, time, height = render(optech, seed, n=3000, s=100, width=3.0, amplitude=(8, 980))
+    wide = render(optech, seed, n=3000, s=100, width=3.25, amplitude=(8, 980))[0]
+    widened = np.random.default_rng(seed).random((3000, 1)) < 0.3
+    block = digitize(np.where(widened, wide, plain), seed, noise=0.3, base=10)
+    system, echoes = decompose(block)
+    number, clipped = echoes.count(3000), height > 250
+    assert system.saturation == 255 and len(system.components) > 1
+    assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.98
