@@ -209,7 +209,7 @@ def test_detectors_find_nothing_in_gaps_and_at_their_edges(whole, tmp_path, name
     assert abs(len(first) - len(second)) <= 0.03 * len(first)
 
 
-@pytest.mark.parametrize("name", sorted(name for name in STAGES if name.startswith("decompose.") and name != "decompose.none"))
+@pytest.mark.parametrize("name", sorted({one for one in STAGES if one.startswith("decompose.")} - {"decompose.none"}))
 @pytest.mark.parametrize("shift", [0, 7])
 def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name, shift):
     plain, block, system, _ = two_levels(whole, tmp_path, shift)

@@ -192,7 +192,12 @@ def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Tak
         return Taken(system, None, {})
     if guess:
         # Not below half a sample, as for isolated echoes: spikes are no pulses.
-        system = replace(system, sigma_ref=max(float(np.quantile(lone.sigma, 0.25)), 0.5 * block.spacing))
+        # The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all
+        # echoes: noise makes the strongest of many weak ones both high and narrow.
+        every = find_lone(block, system, len(block))
+        low, middle = np.quantile(every.sigma, (0.25, 0.5))
+        width = min(low + 0.674 * float(np.median(every.sigma_err)), middle)
+        system = replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
         lone = find_lone(block, system)
     return Taken(replace(system, ringing=_find_ringing(block, system, lone)), None, {})
 
