@@ -58,7 +58,7 @@ def test_the_order_of_the_strips_does_not_matter(strips, flight):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("level", "its level is 13.7"),
+        ("level", "its level is 13."),
         ("noise", "its noise is 1."),
         ("wide", "ns wide (Gaussian sigma), those of the flight"),
         ("narrow", "ns wide (Gaussian sigma), those of the flight"),

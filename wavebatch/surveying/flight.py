@@ -54,9 +54,12 @@ SHAPE = 0.008
 """How much worse than in the flight the common pulse may fit the better half of a strip's strong echoes, as a share of
 the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
 
-ALIKE_PULSES, ALIKE_NOISE, ALIKE_LEVEL = 0.03, 1.15, 0.5
-"""Limits within which surveys of single strips agree: difference of the pulses (`compare_pulses`), ratio of the noise,
-difference of the level over the noise. Two halves of one strip stay within 0.02, 1.1 and 0.3."""
+ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
+"""Difference of two pulses (`compare_pulses`) up to which surveys of single strips agree, and what is added to it, over
+the root of the number of isolated echoes: pulses of two simulated strips with 200 of them differ by 0.03."""
+
+ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
+"""The same for the ratio of the noise, and for the difference of the level over the noise."""
 
 Kind = tuple[float, float, float, float]
 """Bits, spacing [ns], gain and offset [V] of a descriptor."""
@@ -417,9 +420,10 @@ def _agree(a: Survey, b: Survey) -> bool:
     if any(a.figures.get(name) != b.figures.get(name) for name in ("spacing_ns", "bits")):
         return False
     noise = min(a.system.noise_std, b.system.noise_std)
+    echoes = min(a.figures["isolated_echoes"], b.figures["isolated_echoes"])
     return (
         max(a.system.noise_std, b.system.noise_std) < ALIKE_NOISE * noise
         and abs(a.system.baseline - b.system.baseline) < ALIKE_LEVEL * noise
         and a.system.digitizers.keys() == b.system.digitizers.keys()
-        and compare_pulses(a.system, b.system) < ALIKE_PULSES
+        and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
     )
