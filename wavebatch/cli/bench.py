@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,6 @@ def _bench_real(
         if not options["as_json"]:
             click.echo(format_report(report) + "\n")
     if options["as_json"]:
-        print_json({"strips": [report.to_json() for report in reports]})
+        print_json({"strips": [asdict(report) for report in reports]})
     if failed:
         sys.exit(1)

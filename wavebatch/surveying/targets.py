@@ -220,14 +220,12 @@ def _collect(
     chain, found = load_profile("balanced"), [_Found() for _ in targets]
     corners = np.concatenate([target.corners for target in targets])
     low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
-        for block, _ in reader.read_blocks(unit, _BLOCK, owned_only=True):
-            xy = block.returns.xyz[:, :2]
-            near = np.unique(block.returns.waveform[((xy >= low) & (xy <= high)).all(axis=1)])
-            if len(near):
-                part = source.fill(block.rows(near))
-                _add_echoes(part, chain.run(part, system), targets, found)
+    for block in reader.all_blocks(scan, _BLOCK):
+        xy = block.returns.xyz[:, :2]
+        near = np.unique(block.returns.waveform[((xy >= low) & (xy <= high)).all(axis=1)])
+        if len(near):
+            part = source.fill(block.rows(near))
+            _add_echoes(part, chain.run(part, system), targets, found)
     return found
 
 

@@ -95,10 +95,7 @@ class Strip:
         """
         if size is not None and size < 1:
             raise ValueError(f"size must be at least 1, got {size}")
-        for number in range(self.reader.unit_count()):
-            unit = self.reader.read_unit(number, self.scan)
-            for block, _ in self.reader.read_blocks(unit, size or BLOCK_SIZE, owned_only=True):
-                yield block
+        yield from self.reader.all_blocks(self.scan, size or BLOCK_SIZE)
 
     def close(self) -> None:
         """Close the files and remove temporary ones. Harmless twice."""

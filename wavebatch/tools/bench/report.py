@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
-from wavebatch.tools.bench.plot import can_plot, plot_scene
+from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
 
 Column = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -208,17 +208,21 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
 
     Without matplotlib there are no plots, and a message says how to get them. Raises InputError where it cannot write.
     """
+    texts = {"bench.json": json.dumps(document, indent=1, sort_keys=True), "bench.txt": text}
+    written = write_texts(folder, texts)
+    if not can_plot():
+        return [written, NO_PLOT]
+    for section in document["scenes"]:
+        name = f"bench-{Path(section['scene']).stem}.png"
+        plot_scene(section, folder / name)
+        written += f", {name}"
+    return [written]
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> str:
+    """Writes texts by file name into a folder, replacing old ones; returns a line that names them."""
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "bench.json").write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", "utf-8")
-        (folder / "bench.txt").write_text(text + "\n", "utf-8")
-        written = ["bench.json", "bench.txt"]
-        if can_plot():
-            for section in document["scenes"]:
-                name = f"bench-{Path(section['scene']).stem}.png"
-                plot_scene(section, folder / name)
-                written.append(name)
-    lines = [f"{folder}: {', '.join(written)}"]
-    if not can_plot():
-        lines.append("no plot without matplotlib: pip install 'wavebatch[plot]'")
-    return lines
+        for name, text in texts.items():
+            (folder / name).write_text(text + "\n", "utf-8")
+    return f"{folder}: {', '.join(texts)}"

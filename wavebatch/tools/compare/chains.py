@@ -16,7 +16,7 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
 from wavebatch.surveying import Survey
@@ -111,7 +111,7 @@ def match_sides(
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         chosen = choose_chain(survey)
         runs = {key: ChainRun(side.chain or chosen, survey.system, tolerance_ns) for key, side in chains.items()}
-        blocks = _read_blocks(reader, scan, limit)
+        blocks = reader.sample_blocks(scan, limit, _BLOCK) if limit is not None else reader.all_blocks(scan, _BLOCK)
         if clouds:
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
         else:
@@ -120,15 +120,6 @@ def match_sides(
     vendor = {key: run.vendor.finish(chains[key].name, str(strip), "waveform") for key, run in runs.items()}
     fit = {key: runs[key].fit.result() if key in runs else {} for key in ("a", "b")[: 1 if b is None else 2]}
     return Matchup(str(strip), some.pulses, some.echoes[1], between, vendor, fit)
-
-
-def _read_blocks(reader: StripReader, scan: StripScan, limit: int | None) -> Iterator[WaveformBlock]:
-    if limit is not None:
-        yield from reader.sample_blocks(scan, limit, _BLOCK)
-        return
-    for number in range(reader.unit_count()):
-        for block, _ in reader.read_blocks(reader.read_unit(number, scan), _BLOCK, owned_only=True):
-            yield block
 
 
 def match_chains(

@@ -117,8 +117,7 @@ def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
 def _read_units(reader: StripReader, scan: StripScan) -> Iterator[tuple[Unit, int]]:
     """The units of the strip, each with the number of packets in the units before it."""
     base = 0
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
+    for unit in reader.read_units(scan):
         yield unit, base
         base += int(np.count_nonzero(unit.packets.owned))
 

@@ -81,7 +81,7 @@ def simulate_blocks(
         for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
             low = number * SEED_BLOCK
             parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, SEED_BLOCK)))
-        yield (parts[0].block, parts[0].truth) if len(parts) == 1 else _join(parts, start)
+        yield _join(parts, start)
 
 
 def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
@@ -143,12 +143,6 @@ def _prepare(scene: Scene | str, recording: Recording | None) -> Scene:
 
 
 def _join(parts: list[Simulated], first: int) -> tuple[WaveformBlock, EchoTable]:
-    blocks = [part.block for part in parts]
-    shifts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    truth = EchoTable.concatenate((part.truth, int(shift)) for part, shift in zip(parts, shifts, strict=True))
-    columns = {
-        name: np.concatenate([getattr(block, name) for block in blocks])
-        for name in ("samples", "point", "gps_time", "origin", "direction")
-    }
-    columns["samples"].flags.writeable = False
-    return replace(blocks[0], first=first, **columns), truth
+    shifts = np.cumsum([0, *(len(part.block) for part in parts[:-1])]).tolist()
+    truth = EchoTable.concatenate((part.truth, shift) for part, shift in zip(parts, shifts, strict=True))
+    return replace(WaveformBlock.concatenate([part.block for part in parts]), first=first), truth

@@ -86,15 +86,15 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
     number = lost = total = 0
     axis = None
     rest: _Pulses | None = None
-    for unit_number in range(reader.unit_count()):
-        pulses = _read_pulses(reader, reader.read_unit(unit_number, scan))
+    for unit in reader.read_units(scan):
+        pulses = _read_pulses(reader, unit)
         if rest is not None:
             pulses = _join([rest, pulses])
         if not len(pulses):
             continue
         axis = _find_axis(pulses.direction) if axis is None else axis
         edges = _cut_long(np.append(find_sweeps(_measure_angle(pulses, axis), pulses.gps_time), len(pulses)))
-        last = unit_number == reader.unit_count() - 1
+        last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if b == len(pulses) and not last:
                 break

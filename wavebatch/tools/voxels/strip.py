@@ -228,8 +228,7 @@ def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, s
 
 def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iterator[WaveformBlock]:
     """Every packet of the strip once."""
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
+    for unit in reader.read_units(scan):
         longest = int(unit.packets.n_samples.max(initial=1))
         for block, _ in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
             yield block

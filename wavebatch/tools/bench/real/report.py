@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.disk.publish import reporting
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.bench.plot import can_plot
+from wavebatch.tools.bench.plot import NO_PLOT, can_plot
 from wavebatch.tools.bench.real.agreement import Agreement
-from wavebatch.tools.bench.real.measure import RealReport
-from wavebatch.tools.bench.real.recall import APART, NEAR_SIGMAS, Calibration, Class
-from wavebatch.tools.bench.report import align
+from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
+from wavebatch.tools.bench.report import align, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,34 +65,24 @@ def _span(low: float, high: float) -> str:
     return f"{low:g}.." if math.isinf(high) else f"{low:g}-{high:g}"
 
 
-def _share(row: Class) -> str:
-    return f"{100 * row.recall:.1f}" if row.injected else "-"
-
-
 def _recall_table(title: str, rows: Sequence[Class]) -> list[str]:
     return align([
         [title, *(_span(row.low, row.high) for row in rows)],
         ["injected", *(str(row.injected) for row in rows)],
-        ["found %", *map(_share, rows)],
+        ["found %", *(f"{100 * row.recall:.1f}" for row in rows)],
     ])  # fmt: skip
 
 
 def _separation_table(rows: Sequence[Class]) -> list[str]:
     """A line per separation, before and after the strongest echo."""
     cells = {(row.low, row.apart): row for row in rows}
-    spans = [_span(low, high) for low, high in zip(NEAR_SIGMAS, (*NEAR_SIGMAS[1:], math.inf), strict=True)]
+    spans = [_span(low, high) for low, high in between(NEAR_SIGMAS)]
     heads = [f"{side} {span}" for side in ("before", "after") for span in spans]
     lines = [["found % near the strongest echo, FWHM", *heads]]
-    for near, far in zip(APART[:-1], APART[1:], strict=True):
-        row = [_span(near, far)]
-        for side in (-1.0, 1.0):
-            row += [_share_of(cells.get((low, (side * near, side * far)))) for low in NEAR_SIGMAS]
-        lines.append(row)
+    for near, far in pairwise(APART):
+        row = [cells[low, (side * near, side * far)] for side in (-1.0, 1.0) for low in NEAR_SIGMAS]
+        lines.append([_span(near, far), *(f"{100 * c.recall:.0f}" if c.injected >= LEAST_SHOWN else "-" for c in row)])
     return align(lines)
-
-
-def _share_of(row: Class | None) -> str:
-    return "-" if row is None or row.injected < LEAST_SHOWN else f"{100 * row.recall:.0f}"
 
 
 def _describe_splits(report: RealReport) -> list[str]:
@@ -166,20 +156,12 @@ def write_report(report: RealReport, folder: Path) -> str:
     Raises InputError where it cannot write.
     """
     stem = f"real-{Path(report.strip).stem}"
-    with reporting(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{stem}.json").write_text(to_text(report.to_json()) + "\n", "utf-8")
-        (folder / f"{stem}.txt").write_text(format_report(report) + "\n", "utf-8")
-    names = [f"{stem}.json", f"{stem}.txt"]
+    document = json.dumps(without_nan(asdict(report)), indent=1, sort_keys=True, allow_nan=False)
+    written = write_texts(folder, {f"{stem}.json": document, f"{stem}.txt": format_report(report)})
     if not can_plot():
-        return f"{folder}: {', '.join(names)}; no plot without matplotlib: pip install 'wavebatch[plot]'"
+        return f"{written}; {NO_PLOT}"
     draw_report(report, folder / f"{stem}.png")
-    return f"{folder}: {', '.join([*names, f'{stem}.png'])}"
-
-
-def to_text(document: Mapping[str, Any]) -> str:
-    """JSON with sorted keys; null for what is no number."""
-    return json.dumps(without_nan(document), indent=1, sort_keys=True, allow_nan=False)
+    return f"{written}, {stem}.png"
 
 
 def draw_report(report: RealReport, target: Path) -> None:
@@ -208,7 +190,7 @@ def _name_classes(axes: Axes, rows: Sequence[Class | Calibration]) -> None:
 
 
 def _draw_separations(axes: Axes, rows: Sequence[Class]) -> None:
-    for low, high in zip(NEAR_SIGMAS, (*NEAR_SIGMAS[1:], math.inf), strict=True):
+    for low, high in between(NEAR_SIGMAS):
         part = [row for row in rows if row.low == low and row.injected >= LEAST_SHOWN]
         points = sorted((0.5 * sum(row.apart), 100 * row.recall) for row in part)
         axes.plot([x for x, _ in points], [y for _, y in points], "o-", markersize=3, label=_span(low, high))

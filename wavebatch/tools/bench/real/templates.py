@@ -17,7 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, find_strongest
 
 BEFORE, AFTER = 4.5, 12.5
 """What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""
@@ -235,19 +235,14 @@ def _fit_alone(
     samples = np.rint(system.baseline + signal + rng.normal(0.0, noise, signal.shape))
     top = min(clip_level(block, system) - 1, np.iinfo(block.samples.dtype).max)
     found = solver.run(bare_block(block, np.clip(samples, 0, top).astype(block.samples.dtype)))
-    best = np.full(ALONE, -1)
-    order = np.lexsort((found.amplitude, found.waveform))
-    best[found.waveform[order]] = order
+    best = find_strongest(found, ALONE)
     hit = best >= 0
-    delay = found.time[best[hit]] - time[hit]
     if not hit.any():
         return replace(template, sigma=template.fwhm / FWHM_PER_SIGMA)
-    return replace(
-        template,
-        gain=float(np.median(found.amplitude[best[hit]])) / template.amplitude,
-        delay=float(np.median(delay)),
-        sigma=float(np.median(found.sigma[best[hit]])),
-    )
+    best = found.take(best[hit])
+    values = (best.amplitude, best.time - time[hit], best.sigma)
+    amplitude, delay, sigma = (float(np.median(each)) for each in values)
+    return replace(template, gain=amplitude / template.amplitude, delay=delay, sigma=sigma)
 
 
 def summarize(templates: Sequence[Template]) -> TemplateSummary:
