@@ -15,9 +15,10 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.tools.bench.real import measure_real, pool
+from wavebatch.tools.bench.real import pool
 from wavebatch.tools.bench.real.agreement import compare_solvers
 from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
+from wavebatch.tools.bench.real.measure import measure_real
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
 from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, read_pool
 from wavebatch.tools.bench.real.report import format_report

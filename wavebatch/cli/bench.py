@@ -93,7 +93,7 @@ def _bench_real(
     strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
 ) -> None:
     """Measures strip after strip; one that cannot be measured is named, and the others go on."""
-    from wavebatch.tools.bench.real import measure_real
+    from wavebatch.tools.bench.real.measure import measure_real
     from wavebatch.tools.bench.real.report import format_report, write_report
 
     reports, failed = [], False

@@ -46,8 +46,8 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
-        if target is not None and not overwrite:
-            refuse_existing(target)
+        if target is not None:
+            refuse_existing(target, overwrite)
     saved, facts = _survey(strip, options)
     if output is not None:
         write_survey(output, saved, overwrite=overwrite)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
@@ -20,7 +21,7 @@ BLOCK_SIZE = 16_384
 """Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
 
 
-class Strip:
+class Strip(Closing):
     """An open full-waveform strip. A context manager; make one with `open_strip`.
 
     `len(strip)` is the number of waveforms, each counted once however many points share it. The first use of `len`,
@@ -35,14 +36,6 @@ class Strip:
     def __init__(self, reader: StripReader) -> None:
         self.reader = reader
         self._scan: StripScan | None = None
-
-    def __enter__(self) -> Strip:
-        """Return the strip."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Close the strip."""
-        self.close()
 
     def __len__(self) -> int:
         """Return the number of waveforms."""

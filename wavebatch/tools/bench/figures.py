@@ -7,7 +7,7 @@ runs with other seeds, because that is what a reader compares.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ class Figure:
 
     def to_json(self) -> dict[str, Any]:
         """Value and error; None where there were no data."""
-        return without_nan({"value": self.value, "error": self.error})
+        return without_nan(asdict(self))
 
     def scale(self, factor: float) -> Figure:
         """The figure in another unit."""
@@ -91,14 +91,8 @@ def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
 
 def median_range(values: list[float]) -> dict[str, Any]:
     """Median, least, most and number of repeated measurements; None without any."""
-    if not values:
-        return {"median": None, "min": None, "max": None, "repeats": 0}
-    return {
-        "median": float(np.median(values)),
-        "min": float(min(values)),
-        "max": float(max(values)),
-        "repeats": len(values),
-    }
+    found = [float(measure(values)) if values else None for measure in (np.median, min, max)]
+    return {**dict(zip(("median", "min", "max"), found, strict=True)), "repeats": len(values)}
 
 
 def find_front(costs: Sequence[Sequence[float | None]]) -> np.ndarray:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
+from wavebatch.stages.score import QUANTITIES
 from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
 
 Column = tuple[str, str, float, int]
@@ -30,11 +31,10 @@ LENGTHS: tuple[Column, ...] = (
     ("isolated cm", "rmse_isolated_cm", 1, 2),
     ("overlapped cm", "rmse_overlapped_cm", 1, 2),
 )
-QUANTITIES = (("time", "time"), ("amplitude", "amplitude"), ("sigma", "sigma"))
 
 
 def _ratios(kind: str) -> tuple[Column, ...]:
-    columns = tuple((head, f"{name}_ratio_{kind}", 1.0, 3) for head, name in QUANTITIES)
+    columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
     return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
 
 
@@ -93,8 +93,7 @@ def rate_text(times: Mapping[str, Any]) -> str:
 
 
 def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    head = ["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]
-    lines = [head]
+    lines = [["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]]
     for row in rows:
         name = row["name"]
         if row.get("same_as"):
@@ -102,17 +101,9 @@ def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if row.get("crashed_or_hung"):
             name += f" ({row['crashed_or_hung']} crashed or hung)"
         once, memory = row["survey_seconds"]["median"], row["peak_bytes"]
-        lines.append(
-            [
-                name,
-                rate_text(row["kernels"]),
-                rate_text(row["file"]),
-                rate_text(row["file_with_survey"]),
-                "-" if once is None else f"{once:.2f}",
-                "-" if memory is None else f"{memory / 1e6:.0f}",
-                "*" if row["pareto"] else "",
-            ]
-        )
+        rates = (rate_text(row[kind]) for kind in ("kernels", "file", "file_with_survey"))
+        cells = ("-" if once is None else f"{once:.2f}", "-" if memory is None else f"{memory / 1e6:.0f}")
+        lines.append([name, *rates, *cells, "*" if row["pareto"] else ""])
     return align(lines)
 
 
@@ -135,13 +126,8 @@ def figure_text(row: Mapping[str, Any], column: Column) -> str:
 def align(lines: Sequence[Sequence[str]]) -> list[str]:
     """Lines of cells as columns: the first aligned to the left, the others to the right."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if place == 0 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    ]
+    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def _format_stability(document: Mapping[str, Any]) -> str:
@@ -185,15 +171,11 @@ def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list
     for row in rows:
         known = {name for name, figure in row["figures"].items() if figure["value"] is not None}
         kind = "isolated" if "found_isolated" in known else "overlapped"
-        columns: list[Column] = [
-            ("", "completeness", 100, 1),
-            ("", "exact_count", 100, 1),
-            ("", "false_splits" if "false_splits" in known else "false_alarms", 100, 1),
-            *(("", f"{name}_ratio_{kind}", 1.0, 2) for _, name in QUANTITIES),
-            ("", f"gross_{kind}", 100, 1),
-        ]
+        names = ["completeness", "exact_count", "false_splits" if "false_splits" in known else "false_alarms"]
+        figures = [figure_text(row, ("", name, 100, 1)) for name in names]
+        figures += [figure_text(row, ("", f"{name}_ratio_{kind}", 1, 2)) for name in QUANTITIES]
+        figures.append(figure_text(row, ("", f"gross_{kind}", 100, 1)))
         cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
-        figures = [figure_text(row, column) for column in columns]
         lines.append([*cells, *figures, _list_failures([row]), _list_flags(row)])
     return lines
 

@@ -16,6 +16,7 @@ from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.files.disk.closing import Closing
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.tools.return_stats.returns import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
@@ -89,7 +90,7 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
     return rows
 
 
-class CloudTask:
+class CloudTask(Closing):
     """One comparison: `add` puts rows of both sides into buckets, `finish` compares bucket by bucket.
 
     A context manager, because temporary files hold the rows.
@@ -102,10 +103,8 @@ class CloudTask:
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)
 
-    def __enter__(self) -> CloudTask:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Removes the temporary files."""
         for bucket in self.buckets:
             bucket.close()
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.las.header import is_projection, read_header
@@ -22,6 +22,7 @@ from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+from wavebatch.tools.simulate.returns import fill_packets
 
 INTENSITIES = ("peak", "reflectance")
 """Meanings of the intensities of a cloud, see SynthesisOptions."""
@@ -315,13 +316,9 @@ def _fill_points(
     for name in set(dtype.names) & set(records.dtype.names) - set(_PACKET_FIELDS):
         points[name] = records[name]
     kind = pulses.kind[pulses.pulse]
-    has = kind < len(_LENGTHS)
-    points["wavepacket_index"] = np.where(has, kind + 1, 0)
-    points["wavepacket_offset"] = np.where(has, offset[pulses.pulse], 0)
-    points["wavepacket_size"] = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
-    points["return_point_wave_location"] = np.where(has, pulses.time * PS_PER_NS, 0)
-    for axis, name in enumerate(("x_t", "y_t", "z_t")):
-        points[name] = np.where(has, -pulses.ray[pulses.pulse, axis] * HALF_C / PS_PER_NS, 0)
+    index = np.where(kind < len(_LENGTHS), kind + 1, 0)
+    size = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
+    fill_packets(points, index, offset[pulses.pulse], size, pulses.time, pulses.ray[pulses.pulse] * HALF_C)
     return points
 
 

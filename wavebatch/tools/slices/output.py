@@ -37,8 +37,7 @@ class SegmentWriter:
         suffix = self.target.suffix.lower()
         if suffix not in SEGMENT_SUFFIXES:
             raise ConfigError(f"{target}: segments are written as .csv or .geojson")
-        if not overwrite:
-            refuse_existing(self.target)
+        refuse_existing(self.target, overwrite)
         self._geojson, self._count = suffix == ".geojson", 0
         self._draft = Draft(self.target, overwrite=overwrite)
         if self._geojson:

@@ -128,8 +128,7 @@ def voxelize_strip(
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
-    if not overwrite:
-        refuse_existing(target)
+    refuse_existing(target, overwrite)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         pulse = _find_pulse(reader, scan, system, calibration)
         source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)

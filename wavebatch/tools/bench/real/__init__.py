@@ -4,7 +4,3 @@
 them to other waveforms. `false_echoes` counts echoes that a chain should not have found, `agreement` compares surveys
 of parts of the strip. `measure` does all of it and counts what was found, `report` writes it down.
 """
-
-from wavebatch.tools.bench.real.measure import RealReport, measure_real
-
-__all__ = ["RealReport", "measure_real"]
