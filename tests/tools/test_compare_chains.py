@@ -65,7 +65,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     sides = find_contender("fast"), find_contender("accurate")
     result = match_sides(mixed / "s.las", *sides)
     with StripReader(mixed / "s.las") as reader, reader.scan() as scan:
-        system = chains.survey_sample(chains.read_sample(reader, scan)).system
+        system = chains.survey_blocks(chains.read_sample(reader, scan)).system
         ((block, _),) = list(reader.read_blocks(reader.read_unit(0, scan), 5000, owned_only=True))
     a, b = (side.chain.run(block, system) for side in sides)
     differences, exact, counts = [], 0, ({}, {})

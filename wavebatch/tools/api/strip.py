@@ -12,10 +12,10 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
-from wavebatch.surveying import Survey
+from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.angle_limits import survey_angles
 from wavebatch.surveying.auto_chain import decide
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 
 BLOCK_SIZE = 16_384
 """Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
@@ -153,7 +153,7 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     if not sample:
         path = strip.facts.path
         raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-    found = survey_sample(sample)
+    found = survey_blocks(sample)
     if divergence is not None:
         found = survey_angles(strip.reader, strip.scan, found, divergence)
     chosen = decide(found)

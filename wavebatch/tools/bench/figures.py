@@ -113,10 +113,10 @@ def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | N
 
     rows: as in the document of the benchmark.
     """
-    good = []
-    for row in rows:
-        rmse = row["figures"]["rmse_isolated_cm"]
-        seconds = row["kernels"]["median"]
-        if rmse["value"] is not None and seconds is not None and rmse["value"] + (rmse["error"] or 0) <= tolerance_cm:
-            good.append((seconds, row["name"], row))
-    return min(good, key=lambda entry: entry[:2])[2] if good else None
+
+    def is_good(row: Mapping) -> bool:
+        error = row["figures"]["rmse_isolated_cm"]
+        return error["value"] is not None and error["value"] + (error["error"] or 0) <= tolerance_cm
+
+    good = [row for row in rows if row["kernels"]["median"] is not None and is_good(row)]
+    return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)

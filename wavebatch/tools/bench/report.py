@@ -52,24 +52,20 @@ def format_document(document: Mapping[str, Any]) -> str:
 
 def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str:
     rows, survey = section["rows"], section["survey"]
-    lines = [
+    head = [
         f"== {section['scene']}: {section['meaning']}",
         f"survey of {survey['groups']} x {survey['waveforms_of_a_group']} waveforms: "
         f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, "
         f"kappa {_span(survey['kappa'])}, "
         f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}",
-        "",
-        *_speed_table(rows),
-        "",
-        *_figure_table("echoes found", rows, SHARES),
-        "",
-        *_figure_table("rms error of the range", rows, LENGTHS),
     ]
+    parts = [head, _speed_table(rows), _figure_table("echoes found", rows, SHARES)]
+    parts.append(_figure_table("rms error of the range", rows, LENGTHS))
     for kind in ("isolated", "overlapped"):
-        lines += ["", *_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind))]
+        parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
     if tolerance_cm is not None:
-        lines += ["", _format_cheapest(section, tolerance_cm)]
-    return "\n".join(lines)
+        parts.append([_format_cheapest(section, tolerance_cm)])
+    return "\n\n".join(map("\n".join, parts))
 
 
 def _format_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:

@@ -19,9 +19,9 @@ from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-from wavebatch.surveying import Survey
+from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
@@ -107,7 +107,7 @@ def match_sides(
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
-        survey = survey or survey_sample(read_sample(reader, scan))
+        survey = survey or survey_blocks(read_sample(reader, scan))
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         chosen = choose_chain(survey)
         runs = {key: ChainRun(side.chain or chosen, survey.system, tolerance_ns) for key, side in chains.items()}

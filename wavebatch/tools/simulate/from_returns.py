@@ -109,15 +109,8 @@ class SynthesisOptions:
 
     def recording(self, n_samples: int) -> Recording:
         """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
-        return Recording(
-            n_samples=n_samples,
-            spacing=self.spacing,
-            bits=self.bits,
-            baseline=self.baseline,
-            baseline_spread=0.0,
-            noise_std=self.noise,
-            pulse=PulseModel(self.sigma),
-        )
+        pulse = PulseModel(self.sigma)
+        return Recording(n_samples, self.spacing, self.bits, self.baseline, 0.0, self.noise, pulse=pulse)
 
 
 @dataclass(slots=True)
@@ -211,14 +204,13 @@ def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]
 
 def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
     point_format = _FORMATS[reader.point_format]
+    lengths = enumerate(_LENGTHS, 1)
     return FullwaveWriter(
         target,
         version="1.3" if point_format < 6 else "1.4",
         point_format=point_format,
         internal=options.internal,
-        digitizers=[
-            Digitizer(number, options.bits, length, options.spacing) for number, length in enumerate(_LENGTHS, 1)
-        ],
+        digitizers=[Digitizer(number, options.bits, length, options.spacing) for number, length in lengths],
         scales=reader.scales,
         offsets=reader.offsets,
         records=[vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)],

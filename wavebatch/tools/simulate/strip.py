@@ -186,15 +186,11 @@ def _simulate_parts(
     """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
     if pulses < 1:
         raise ConfigError(f"a strip needs at least one pulse, not {pulses}")
-
-    def parts() -> Iterator[Simulated]:
-        for first in range(0, pulses, SEED_BLOCK):
-            n = min(SEED_BLOCK, pulses - first)
-            yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
-            if progress:
-                progress(n)
-
-    return parts()
+    for first in range(0, pulses, SEED_BLOCK):
+        n = min(SEED_BLOCK, pulses - first)
+        yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
+        if progress:
+            progress(n)
 
 
 def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: bool) -> FullwaveWriter:

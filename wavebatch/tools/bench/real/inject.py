@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
@@ -284,8 +285,7 @@ def _list_truth(table: EchoTable, places: Places, true: np.ndarray) -> tuple[Ech
     count = np.bincount(table.waveform, minlength=int(places.row.max(initial=0)) + 1)
     first = np.cumsum(count) - count
     number = count[places.row]
-    copy = np.repeat(np.arange(k), number)
-    old = np.repeat(first[places.row] - (np.cumsum(number) - number), number) + np.arange(len(copy))
+    copy, old = np.repeat(np.arange(k), number), expand(first[places.row], number)
     is_new = np.repeat((False, True), (len(copy), k))
     is_host = np.r_[places.strongest[copy] == old, np.zeros(k, bool)]
     before = np.stack([table.time, table.amplitude, table.sigma], axis=1)[old]

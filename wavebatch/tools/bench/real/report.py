@@ -37,28 +37,25 @@ def format_report(report: RealReport) -> str:
     """All tables of a strip; `!` marks figures that miss their goal."""
     survey, noise, templates = report.survey, report.noise, report.templates
     correlation = " ".join(f"{value:.2f}" for value in noise.correlation) or "unknown"
-    lines = [
+    head = [
         f"== {report.strip}: {report.waveforms} waveforms, {report.echoes} echoes, seed {report.seed}; ! misses a goal",
         f"survey: FWHM {survey.fwhm:.3f} ns, noise {survey.noise:.2f} DN, {survey.model}, acceptance "
         f"{survey.acceptance:g}, digitizers that record otherwise: {survey.digitizers}",
         f"quiet samples: noise {noise.std:.2f} DN ({noise.samples} samples), correlation {correlation}",
         f"templates: {templates.templates} of {templates.echoes} clear echoes, FWHM {templates.fwhm:.3f} ns; the chain "
         f"finds {templates.gain:.4f} of their amplitude and {templates.widened:.4f} of their width",
-        "",
-        *_recall_table("in quiet stretches, noise std", report.quiet_by_sigma),
-        "",
-        *_recall_table("in quiet stretches, DN", report.quiet_by_count),
-        "",
-        *_separation_table(report.near_by_separation),
-        "",
-        *_describe_splits(report),
-        *_describe_false(report),
-        "",
-        *_calibration_table(report.calibration),
+    ]
+    parts = [
+        head,
+        _recall_table("in quiet stretches, noise std", report.quiet_by_sigma),
+        _recall_table("in quiet stretches, DN", report.quiet_by_count),
+        _separation_table(report.near_by_separation),
+        [*_describe_splits(report), *_describe_false(report)],
+        _calibration_table(report.calibration),
     ]
     if report.agreement:
-        lines += ["", *_agreement_table(report.agreement)]
-    return "\n".join(lines)
+        parts.append(_agreement_table(report.agreement))
+    return "\n\n".join(map("\n".join, parts))
 
 
 def _span(low: float, high: float) -> str:
