@@ -179,8 +179,7 @@ class _Found:
         echoes = self.echoes
         rows = np.zeros(len(echoes), CLOUD_DTYPE)
         rows["gps_time"] = echoes.waveform
-        for axis, name in enumerate("xyz"):
-            rows["xyz"][:, axis] = echoes.attributes[name]
+        rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
         rows["ray"] = block.direction[echoes.waveform]
         rows["number"], rows["total"] = _rank(echoes.waveform, echoes.time, len(block))
         rows["echo_time"] = echoes.time

@@ -81,8 +81,7 @@ def _share_times(first: CloudReader, second: CloudReader) -> bool:
 
 def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
     rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
-    for axis, name in enumerate("xyz"):
-        rows["xyz"][:, axis] = piece[name]
+    rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
     for name in ("gps_time", "amplitude", "flags", "isolated"):
         rows[name] = piece[name]
     rows["echo_time"] = piece["time"]

@@ -83,10 +83,7 @@ class ReturnStats:
 
 
 def count_returns(
-    clouds: Sequence[Path],
-    skip: Callable[[InputError], None] | None = None,
-    *,
-    divisions: Sequence[Division] = (),
+    clouds: Sequence[Path], skip: Callable[[InputError], None] | None = None, *, divisions: Sequence[Division] = ()
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 

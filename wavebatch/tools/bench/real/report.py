@@ -106,20 +106,16 @@ def _describe_false(report: RealReport) -> list[str]:
             rate = part.echoes / part.length
             lines.append(
                 f"signal-free stretches {name} all signal: {part.echoes} echoes in {part.length:.0f} ns, {rate:.1e} "
-                f"per ns{_mark(rate >= MOST_FALSE)}; with mirrored residuals {part.mirrored}"
+                f"per ns{'!' * (rate >= MOST_FALSE)}; with mirrored residuals {part.mirrored}"
             )
     return lines
-
-
-def _mark(missed: bool) -> str:
-    return "!" if missed else ""
 
 
 def _calibration_table(rows: Sequence[Calibration]) -> list[str]:
     heads = ["time", "amplitude", "width", "bias ns", "DN", "ns", "scatter ns", "DN", "ns", "gross %"]
     lines = [["error / reported error, noise std", "echoes", *heads]]
     for row in rows:
-        ratio = [f"{value:.3f}{_mark(not RATIOS[0] <= value <= RATIOS[1])}" for value in row.ratio]
+        ratio = [f"{value:.3f}{'!' * (not RATIOS[0] <= value <= RATIOS[1])}" for value in row.ratio]
         bias = [f"{value:+.3f}" for value in row.bias]
         scatter = [f"{value:.3f}" for value in row.scatter]
         name = f"{row.where} {_span(row.low, row.high)}"
@@ -138,10 +134,10 @@ def _agreement_table(rows: Sequence[Agreement]) -> list[str]:
             f"{one.fwhm:.3f}/{other.fwhm:.3f}",
             f"{one.noise:.2f}/{other.noise:.2f}",
             one.model if one.model == other.model else f"{one.model}/{other.model}",
-            f"{100 * row.differ:.2f}{_mark(row.differ >= MOST_DIFFER)}",
-            f"{row.offset:+.4f}{_mark(abs(row.offset) >= MOST_OFFSET)}",
-            f"{row.apart:.4f}{_mark(row.apart >= MOST_OFFSET)}",
-            f"{row.amplitude_ratio:.4f}{_mark(abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
+            f"{100 * row.differ:.2f}{'!' * (row.differ >= MOST_DIFFER)}",
+            f"{row.offset:+.4f}{'!' * (abs(row.offset) >= MOST_OFFSET)}",
+            f"{row.apart:.4f}{'!' * (row.apart >= MOST_OFFSET)}",
+            f"{row.amplitude_ratio:.4f}{'!' * (abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
             f"{row.width_ratio:.4f}",
         ])  # fmt: skip
     return align(lines)
