@@ -24,7 +24,8 @@ from wavebatch.stages.decompose.models import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.tools.slices import ScanLine, SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices.lines import ScanLine
+from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
 DETECTORS = {

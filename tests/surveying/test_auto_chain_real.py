@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 
 AFTER_PULSE = (9.0, 12.0)
 """Where the RIEGL's after-pulse lies behind an echo [ns]; it has 4 % of its amplitude."""
@@ -31,7 +32,7 @@ class Found(NamedTuple):
 def _run(path) -> Found:
     parts = []
     with StripReader(path) as reader, reader.scan() as scan:
-        survey = survey_sample(read_sample(reader, scan))
+        survey = survey_blocks(read_sample(reader, scan))
         assert survey.system.components, "a learned pulse is what real strips need"
         chain = choose_chain(survey)
         for number in range(reader.unit_count()):
@@ -94,5 +95,5 @@ def test_the_chain_of_a_real_strip_is_the_same_every_time(strip, request):
     chosen = []
     for _ in range(2):
         with StripReader(path) as reader, reader.scan() as scan:
-            chosen.append(survey_sample(read_sample(reader, scan)))
+            chosen.append(survey_blocks(read_sample(reader, scan)))
     assert chosen[0] == chosen[1]

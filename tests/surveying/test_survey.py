@@ -10,7 +10,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.measure import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
@@ -92,7 +92,7 @@ def test_any_waveforms_can_be_surveyed(rng):
 
 def _survey_file(path):
     with StripReader(path) as reader, reader.scan() as scan:
-        return survey_sample(read_sample(reader, scan))
+        return survey_blocks(read_sample(reader, scan))
 
 
 def test_riegl_is_what_is_known_of_it(riegl):

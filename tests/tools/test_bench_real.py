@@ -1,7 +1,7 @@
 """`wavebatch bench --real` on simulated strips, where what it should report is known, and on the real ones."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -13,10 +13,12 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.surveying import Survey
-from wavebatch.tools.bench.real import measure_real
+from wavebatch.surveying import Survey, survey_blocks
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.tools.bench.real import pool
 from wavebatch.tools.bench.real.agreement import compare_solvers
 from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
+from wavebatch.tools.bench.real.measure import measure_real
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
 from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, read_pool
 from wavebatch.tools.bench.real.report import format_report
@@ -48,7 +50,8 @@ def make_pool(samples, path="made.las"):
 
 
 def level_solver(**system):
-    return Solver.of_blocks([], lambda blocks: Survey(SystemPulse(**system), 0, {}, ()))
+    survey = Survey(SystemPulse(**system), 0, {}, ())
+    return Solver(survey, choose_chain(survey))
 
 
 def test_strong_echoes_are_found_and_weak_ones_are_not(report):
@@ -92,16 +95,17 @@ def test_seed_decides_all_and_json_holds_it(strip):
     few = {"injections": 300, "stability": False, "waveforms": 1200}
     one, same, other = (replace(measure_real(strip, seed=seed, **few), seconds={}) for seed in (1, 1, 2))
     assert one == same and one.quiet_by_sigma != other.quiet_by_sigma
-    assert json.loads(json.dumps(one.to_json()))["seed"] == 1 and one.agreement == []
+    assert json.loads(json.dumps(asdict(one)))["seed"] == 1 and one.agreement == []
     assert "misses a goal" in format_report(one)
 
 
-def test_another_survey_can_be_measured(strip, report):
+def test_a_wrong_survey_is_seen(strip, report, monkeypatch):
     def deaf(blocks):
-        survey = Solver.of_blocks(blocks).survey
+        survey = survey_blocks(blocks)
         return replace(survey, system=replace(survey.system, noise_std=4 * survey.system.noise_std))
 
-    found = measure_real(strip, injections=2000, stability=False, survey_of=deaf)
+    monkeypatch.setattr(pool, "survey_blocks", deaf)
+    found = measure_real(strip, injections=2000, stability=False)
     rows = [{row.low: row.recall for row in each.quiet_by_sigma} for each in (report, found)]
     assert rows[0][6.0] > 0.99 and rows[1][6.0] < 0.5
     assert found.noise.std == pytest.approx(report.noise.std, rel=0.06)
@@ -121,8 +125,8 @@ def test_values_before_rounding_keep_variance_and_correlation():
 
 def test_noise_of_short_quiet_stretches_is_not_too_small():
     samples = np.rint(20 + correlated(3000, 8)).astype(np.uint8)
-    pool = make_pool(samples)
-    found = measure_noise(pool, level_solver(sigma_ref=2.0, baseline=20.0), [EchoTable.empty()])
+    made = make_pool(samples)
+    found = measure_noise(made, level_solver(sigma_ref=2.0, baseline=20.0), [EchoTable.empty()])
     assert found.std == pytest.approx(np.hypot(0.9, 12**-0.5), rel=0.12)
     assert found.correlation[0] == pytest.approx(0.6 * 0.81 / (0.81 + 1 / 12), abs=0.1)
 
@@ -148,19 +152,19 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     assert not find_fill(np.zeros((3, 50), np.uint8)).any()
     assert not find_fill((samples > 30).astype(np.uint8) + 5).any()
 
-    pool = read_pool(strip)
-    solver = Solver.of_blocks(pool.surveyed)
-    echoes = [solver.run(block) for block in pool.blocks]
-    noise = measure_noise(pool, solver, echoes)
-    templates = learn_templates(pool, solver, echoes, noise.std, np.random.default_rng(1))
-    counts = pool.blocks[0].samples[:200].copy()
+    whole = read_pool(strip)
+    solver = Solver.of_blocks(whole.surveyed)
+    echoes = [solver.run(block) for block in whole.blocks]
+    noise = measure_noise(whole, solver, echoes)
+    templates = learn_templates(whole, solver, echoes, noise.std, np.random.default_rng(1))
+    counts = whole.blocks[0].samples[:200].copy()
     counts[:, :] = np.rint(12 + correlated(200, counts.shape[1]))
     counts[:, 25:] = 0
     gapped = WaveformBlock.from_samples(counts)
-    gapped = replace(gapped, digitizer=pool.blocks[0].digitizer)
+    gapped = replace(gapped, digitizer=whole.blocks[0].digitizer)
     none = EchoTable.empty()
     made = inject_echoes(
-        replace(pool, blocks=(gapped,)), solver, [none], templates, noise, 300, np.random.default_rng(3)
+        replace(whole, blocks=(gapped,)), solver, [none], templates, noise, 300, np.random.default_rng(3)
     )
     assert 0 < len(made) <= 150 and not made.near.any()
 
@@ -175,12 +179,12 @@ def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp
 
 
 def test_agreement_sees_a_survey_that_is_off(strip):
-    pool = read_pool(strip, 500)
-    one = Solver.of_blocks(pool.blocks)
+    whole = read_pool(strip, 500)
+    one = Solver.of_blocks(whole.blocks)
     wide = replace(one.survey, system=replace(one.system, noise_std=8.0, acceptance=120.0))
-    row = compare_solvers("made", one, Solver(wide, one.chain), pool.blocks)
+    row = compare_solvers("made", one, Solver(wide, one.chain), whole.blocks)
     assert row.differ > 0.01 and row.surveys[1].noise == 8.0
-    assert compare_solvers("same", one, one, pool.blocks).differ == 0
+    assert compare_solvers("same", one, one, whole.blocks).differ == 0
 
 
 def test_a_strip_of_five_packets_gives_one_line(tmp_path):

@@ -65,7 +65,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     sides = find_contender("fast"), find_contender("accurate")
     result = match_sides(mixed / "s.las", *sides)
     with StripReader(mixed / "s.las") as reader, reader.scan() as scan:
-        system = chains.survey_sample(chains.read_sample(reader, scan)).system
+        system = chains.survey_blocks(chains.read_sample(reader, scan)).system
         ((block, _),) = list(reader.read_blocks(reader.read_unit(0, scan), 5000, owned_only=True))
     a, b = (side.chain.run(block, system) for side in sides)
     differences, exact, counts = [], 0, ({}, {})
@@ -206,7 +206,7 @@ def test_what_the_readme_says_of_the_real_strip(riegl):
     assert one.between.counts_a[2] > 0.6 * 2375 and one.between.counts_b[1] > 0.9 * 2375
     for result in (one, two):
         number, of = result.between.extra_by["flag"]["RINGING_SUSPECT"]
-        assert number > 0.97 * of and number > 0.9 * result.between.extra
+        assert number > 0.97 * of and number > 0.75 * result.between.extra
         assert result.between.completeness > 0.9 and result.between.differences["time"].nmad < 0.02
     assert two.vendor["b"].missed < one.vendor["a"].missed < one.vendor["b"].missed
     assert two.fit["b"]["all"].median < two.fit["a"]["all"].median < 0.5 * one.fit["b"]["all"].median

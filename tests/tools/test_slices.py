@@ -12,7 +12,9 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
-from wavebatch.tools.slices import ScanLine, SliceOptions, cut_slice, find_segments, lines, read_scan_lines
+from wavebatch.tools.slices import lines
+from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
+from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
 FLIGHT = Flight(pulse_rate=50_000, half_angle=12.0, look_ahead=0.0)
 PULSES = 4000

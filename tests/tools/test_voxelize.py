@@ -28,9 +28,9 @@ from wavebatch.tools.simulate.geometry import Flight
 from wavebatch.tools.simulate.pulses import find_pulse
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.strip import WKT, StripOptions
-from wavebatch.tools.voxels import Deconvolution, VoxelOptions, voxelize_strip
 from wavebatch.tools.voxels.ceiling import Ceiling
-from wavebatch.tools.voxels.profile import _pulse_taps, deconvolve_block
+from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
+from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.05)
 SAVED = SavedSurvey(Survey(SYSTEM, 1000, {}, ()))
@@ -572,7 +572,7 @@ def test_memory_does_not_grow_with_the_strip(tmp_path):
         script = f"""
             import resource
             from pathlib import Path
-            from wavebatch.tools.voxels import VoxelOptions, voxelize_strip
+            from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
             voxelize_strip(Path({str(strip)!r}), Path({str(strip)!r}).with_suffix(".npz"), VoxelOptions(0.25))
             print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
         """

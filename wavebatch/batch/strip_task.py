@@ -96,9 +96,8 @@ class StripTask:
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
         if options.resume:
             return report_file.read_current(job, options.folder, self._described)
-        if not options.overwrite:
-            refuse_existing(report_file.cloud_path(job, options.folder))
-            refuse_existing(report_file.report_path(job, options.folder))
+        refuse_existing(report_file.cloud_path(job, options.folder), options.overwrite)
+        refuse_existing(report_file.report_path(job, options.folder), options.overwrite)
         return None
 
     @property

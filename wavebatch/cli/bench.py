@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +93,7 @@ def _bench_real(
     strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
 ) -> None:
     """Measures strip after strip; one that cannot be measured is named, and the others go on."""
-    from wavebatch.tools.bench.real import measure_real
+    from wavebatch.tools.bench.real.measure import measure_real
     from wavebatch.tools.bench.real.report import format_report, write_report
 
     reports, failed = [], False
@@ -109,6 +110,6 @@ def _bench_real(
         if not options["as_json"]:
             click.echo(format_report(report) + "\n")
     if options["as_json"]:
-        print_json({"strips": [report.to_json() for report in reports]})
+        print_json({"strips": [asdict(report) for report in reports]})
     if failed:
         sys.exit(1)

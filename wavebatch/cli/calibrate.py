@@ -48,8 +48,7 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
     from wavebatch.surveying.targets import calibrate_strip, load_targets
 
     sensor = shared.read_sensor(options)
-    if not overwrite:
-        refuse_existing(output)
+    refuse_existing(output, overwrite)
     loaded, saved = load_targets(targets), shared.read_system(options)
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}

@@ -70,7 +70,7 @@ def compare(
     """  # fmt: skip
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
-        print_result(as_json, agreement.to_json(), _list_angles(agreement))
+        print_result(as_json, agreement, _list_angles(agreement))
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result

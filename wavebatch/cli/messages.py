@@ -14,7 +14,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -92,9 +92,10 @@ def printable(text: str) -> str:
 
 
 def print_json(value: Any) -> None:
-    """Prints `value` as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
+    """Prints `value` (plain, or a dataclass) as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
     from wavebatch.core.no_data import without_nan
 
+    value = asdict(value) if is_dataclass(value) else value
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
     click.echo(text.encode(errors="backslashreplace").decode())
 
@@ -110,7 +111,7 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
 def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
     """The summary (a dataclass or dictionary) as JSON if --json is given, and the lines on stderr unless --quiet."""
     if options["as_json"]:
-        print_json(summary if isinstance(summary, dict) else asdict(summary))
+        print_json(summary)
     if not options["quiet"]:
         for line in lines:
             talk(line)

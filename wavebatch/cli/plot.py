@@ -15,6 +15,8 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.figure_file import check_picture
+from wavebatch.files.inputs import find_files
 
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
 _flags = shared.together(
@@ -77,7 +79,6 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.files.figure_file import check_picture
     from wavebatch.tools.plots.packets import Wanted
     from wavebatch.tools.plots.values import read_flags
 
@@ -135,8 +136,6 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.files.figure_file import check_picture
-    from wavebatch.files.inputs import find_files
     from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
 
     check_picture(output, overwrite=options["overwrite"])
@@ -192,8 +191,6 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.files.figure_file import check_picture
-    from wavebatch.files.inputs import find_files
     from wavebatch.tools.plots.raster import grid_values
 
     check_picture(output, overwrite=options["overwrite"])

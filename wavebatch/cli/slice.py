@@ -18,7 +18,9 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
-from wavebatch.tools.slices import SegmentWriter, SliceOptions, cut_slice, draw_slice, find_segments, read_scan_lines
+from wavebatch.tools.slices.lines import read_scan_lines
+from wavebatch.tools.slices.output import SegmentWriter, draw_slice
+from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
 _SURVEYED = 2000
 """Waveforms from which the width of the pulse is measured: enough for 1 % of it."""
@@ -51,8 +53,8 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
     """  # fmt: skip
     if output is None and png is None:
         raise click.UsageError("give -o for the segments, --png for a picture, or both")
-    if png and not options["overwrite"]:
-        refuse_existing(png)
+    if png:
+        refuse_existing(png, options["overwrite"])
     with StripReader(strip, direction=options["direction"]) as reader:
         scan = reader.scan()
         sigma = options["sigma"]

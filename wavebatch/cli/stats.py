@@ -53,8 +53,8 @@ def stats(
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
-    if output is not None and not overwrite:
-        refuse_existing(output)
+    if output is not None:
+        refuse_existing(output, overwrite)
     divisions = [] if size is None else [Grid(size)]
     divisions += [] if polygons is None else [PolygonSet(load_polygons(polygons))]
     failed: list[InputError] = []

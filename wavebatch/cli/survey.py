@@ -60,8 +60,8 @@ def survey(
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
-        if target is not None and not overwrite:
-            refuse_existing(target)
+        if target is not None:
+            refuse_existing(target, overwrite)
     paths = find_files(strips)
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:

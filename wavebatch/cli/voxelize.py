@@ -15,7 +15,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, counting, print_summary
 
 if TYPE_CHECKING:
-    from wavebatch.tools.voxels import VoxelSummary
+    from wavebatch.tools.voxels.strip import VoxelSummary
 
 _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 
@@ -64,7 +64,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the strip cannot be read or the output cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.voxels import Deconvolution, VoxelOptions, voxelize_strip
+    from wavebatch.tools.voxels.profile import Deconvolution
+    from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
     _check_options(options)
     sensor = shared.read_sensor(options)
@@ -90,10 +91,6 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
 
 def _check_options(options: dict[str, Any]) -> None:
     """Refuses options that would have no effect."""
-    if options["snr"] is not None and options["method"] != "wiener":
-        raise click.UsageError("--snr needs --method wiener")
-    if options["iterations"] is not None and options["method"] == "wiener":
-        raise click.UsageError("--method wiener has no --iterations")
     for name in _SENSOR:
         if options[name] is not None and options["calibration_file"] is None:
             raise click.UsageError(f"--{name.replace('_', '-')} is of no use without --calibration")

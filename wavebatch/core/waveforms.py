@@ -6,7 +6,7 @@ never write into them. The meaning, dtype and unit of a field stand below it, an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -148,6 +148,16 @@ class WaveformBlock:
             direction=np.tile([0.0, 0.0, -HALF_C], (n, 1)),
         )
 
+    @classmethod
+    def concatenate(cls, blocks: Sequence[WaveformBlock]) -> WaveformBlock:
+        """Join blocks of one digitizer and one length; the result has no sensor and no scanner channels."""
+        if len(blocks) == 1:
+            return blocks[0]
+        names = ("samples", "point", "gps_time", "origin", "direction")
+        arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
+        arrays["samples"].flags.writeable = False
+        return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None)
+
     def rows(self, rows: np.ndarray | slice) -> WaveformBlock:
         """The block restricted to the waveforms at `rows` (indices, mask or slice), with the returns of these."""
         index = np.arange(len(self))[rows]
@@ -166,6 +176,15 @@ class WaveformBlock:
         parts = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first
         return replace(self, samples=samples, first=first, returns=returns, **parts)
+
+
+def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
+    if any(block.returns is None for block in blocks):
+        return None
+    starts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
+    waveform = [block.returns.waveform + start for block, start in zip(blocks, starts, strict=True)]
+    others = [np.concatenate([getattr(b.returns, name) for b in blocks]) for name in ("time", "point", "xyz")]
+    return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

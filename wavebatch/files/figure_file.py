@@ -60,8 +60,7 @@ def check_picture(target: Path, *, overwrite: bool) -> None:
         raise ConfigError(f"{target}: unknown kind of picture; use {', '.join(_METADATA)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError(f"{target}: pictures need matplotlib: pip install 'wavebatch[plot]'")
-    if not overwrite:
-        refuse_existing(target)
+    refuse_existing(target, overwrite)
 
 
 @contextlib.contextmanager

@@ -94,11 +94,6 @@ def sample_size(reader: StripReader, scan: StripScan) -> int:
     return int(np.clip(SAMPLE_SAMPLES // max(longest, 1), LEAST_WAVEFORMS, SAMPLE))
 
 
-def survey_sample(sample: list[WaveformBlock]) -> Survey:
-    """Survey the sample of a strip; the survey of an empty sample has no figures."""
-    return survey_blocks(sample)
-
-
 def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Request) -> Choice:
     """Choose the pulse and the chain of a strip.
 
@@ -120,7 +115,7 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
         Where no shipped chain meets the tolerance.
     """
     sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
-    found = survey_sample(sample) if request.system is None else request.system.survey
+    found = survey_blocks(sample) if request.system is None else request.system.survey
     block = sample[0] if sample else None
     if request.tolerance is not None:
         return _choose_by_tolerance(block, found, request.tolerance, str(reader.facts.path))

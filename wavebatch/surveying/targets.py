@@ -26,8 +26,9 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 LEAST_ECHOES = 10
@@ -187,7 +188,7 @@ def calibrate_strip(
         source = find_sensor(reader, scan, sensor or SensorRequest())
         if source.kind == "none":
             raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
-        pulse = system or survey_sample(read_sample(reader, scan)).system
+        pulse = system or survey_blocks(read_sample(reader, scan)).system
         found = _collect(reader, scan, targets, source, pulse)
         fingerprint = take_fingerprint(path, reader.facts.packet_file)
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
@@ -220,14 +221,12 @@ def _collect(
     chain, found = load_profile("balanced"), [_Found() for _ in targets]
     corners = np.concatenate([target.corners for target in targets])
     low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
-        for block, _ in reader.read_blocks(unit, _BLOCK, owned_only=True):
-            xy = block.returns.xyz[:, :2]
-            near = np.unique(block.returns.waveform[((xy >= low) & (xy <= high)).all(axis=1)])
-            if len(near):
-                part = source.fill(block.rows(near))
-                _add_echoes(part, chain.run(part, system), targets, found)
+    for block in reader.all_blocks(scan, _BLOCK):
+        xy = block.returns.xyz[:, :2]
+        near = np.unique(block.returns.waveform[((xy >= low) & (xy <= high)).all(axis=1)])
+        if len(near):
+            part = source.fill(block.rows(near))
+            _add_echoes(part, chain.run(part, system), targets, found)
     return found
 
 

@@ -30,8 +30,7 @@ class NpzWriter:
 
     def __init__(self, target: Path, columns: Mapping[str, np.dtype | str], *, overwrite: bool = False) -> None:
         self.target = Path(target)
-        if not overwrite:
-            refuse_existing(self.target)
+        refuse_existing(self.target, overwrite)
         self._dtypes = {name: np.dtype(dtype) for name, dtype in columns.items()}
         self._lengths = dict.fromkeys(self._dtypes, 0)
         with contextlib.ExitStack() as stack, reporting(self.target):

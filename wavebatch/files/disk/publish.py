@@ -122,9 +122,9 @@ def open_stream(target: Path) -> BinaryIO:
     return os.fdopen(descriptor, "wb")
 
 
-def refuse_existing(target: Path) -> None:
-    """Raise InputError if something of that name exists; publishing checks again."""
-    if os.path.lexists(target):
+def refuse_existing(target: Path, overwrite: bool = False) -> None:
+    """Raise InputError if something of that name exists, without `overwrite`; publishing checks again."""
+    if not overwrite and os.path.lexists(target):
         raise InputError(_exists(target))
 
 

@@ -44,8 +44,7 @@ class PointFile:
         header.vlrs = [vlr for vlr in header.vlrs if not has_record([vlr], "laszip encoded", 22204)]
         self._place_extra_bytes()
         self._statistics = Statistics(dtype, self._records)
-        if not overwrite:
-            refuse_existing(self.target)
+        refuse_existing(self.target, overwrite)
         self.draft = Draft(self.target, overwrite=overwrite)
         self.drafts = [self.draft]
         """All files that are published together, the point file last."""

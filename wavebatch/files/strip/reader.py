@@ -196,6 +196,16 @@ class StripReader(Closing):
         rows = np.flatnonzero(unit.packets.owned) if owned_only else np.arange(len(unit.packets))
         yield from self.read_rows(unit, rows, size)
 
+    def read_units(self, scan: StripScan) -> Iterator[Unit]:
+        """Yield all units of the strip."""
+        return (self.read_unit(number, scan) for number in range(self.unit_count()))
+
+    def all_blocks(self, scan: StripScan, size: int) -> Iterator[WaveformBlock]:
+        """Yield every packet of the strip once, in blocks as those of `read_blocks`."""
+        for unit in self.read_units(scan):
+            for block, _ in self.read_blocks(unit, size, owned_only=True):
+                yield block
+
     def sample_blocks(self, scan: StripScan, n_waveforms: int, size: int = 4096) -> Iterator[WaveformBlock]:
         """Yield about `n_waveforms` waveforms spread evenly over the strip, the same ones every time.
 

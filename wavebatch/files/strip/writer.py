@@ -87,8 +87,7 @@ class FullwaveWriter(PointFile):
         super().__init__(target, header, build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
         packet_file = target.with_suffix(".wdp")
         try:
-            if not (internal or overwrite):
-                refuse_existing(packet_file)
+            refuse_existing(packet_file, internal or overwrite)
             self._packets = Draft(packet_file, overwrite=overwrite)
         except InputError:
             self.abort()

@@ -8,19 +8,20 @@ from pathlib import Path
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import Digitizer, WaveformBlock
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
-from wavebatch.surveying import Survey
+from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.angle_limits import survey_angles
 from wavebatch.surveying.auto_chain import decide
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 
 BLOCK_SIZE = 16_384
 """Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
 
 
-class Strip:
+class Strip(Closing):
     """An open full-waveform strip. A context manager; make one with `open_strip`.
 
     `len(strip)` is the number of waveforms, each counted once however many points share it. The first use of `len`,
@@ -35,14 +36,6 @@ class Strip:
     def __init__(self, reader: StripReader) -> None:
         self.reader = reader
         self._scan: StripScan | None = None
-
-    def __enter__(self) -> Strip:
-        """Return the strip."""
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Close the strip."""
-        self.close()
 
     def __len__(self) -> int:
         """Return the number of waveforms."""
@@ -95,10 +88,7 @@ class Strip:
         """
         if size is not None and size < 1:
             raise ValueError(f"size must be at least 1, got {size}")
-        for number in range(self.reader.unit_count()):
-            unit = self.reader.read_unit(number, self.scan)
-            for block, _ in self.reader.read_blocks(unit, size or BLOCK_SIZE, owned_only=True):
-                yield block
+        yield from self.reader.all_blocks(self.scan, size or BLOCK_SIZE)
 
     def close(self) -> None:
         """Close the files and remove temporary ones. Harmless twice."""
@@ -163,7 +153,7 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     if not sample:
         path = strip.facts.path
         raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-    found = survey_sample(sample)
+    found = survey_blocks(sample)
     if divergence is not None:
         found = survey_angles(strip.reader, strip.scan, found, divergence)
     chosen = decide(found)

@@ -99,11 +99,7 @@ def describe_found(found: EchoTable) -> EchoTable:
     if "echo_width" not in found.attributes:
         return found
     factor = np.float32(1 / FWHM_PER_SIGMA)
-    return replace(
-        found,
-        sigma=found.attributes["echo_width"] * factor,
-        sigma_err=found.attributes["echo_width_err"] * factor,
-    )
+    return replace(found, **{f"sigma{end}": found.attributes[f"echo_width{end}"] * factor for end in ("", "_err")})
 
 
 @dataclass(slots=True)

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -77,62 +77,45 @@ def draw_clipped(rng: np.random.Generator, n: int, recording: Recording, *, leve
     return draw_echoes(rng, n, recording, heights=((recording.clip - recording.baseline) / level,))
 
 
-def _list_cases() -> tuple[Case, ...]:
+def _list_cases() -> Iterator[Case]:
     base = Recording(n_samples=96, pulse=PulseModel(SIGMA))
     deep = replace(base, bits=16, baseline=200.0)
     clipping = replace(base, saturation=255)
     one = partial(partial, draw_echoes)
-    cases = [
-        Case("H1", f"pair {gap:g} s apart, SNR 50", one(heights=(52.0, 52.0), gap=gap), base)
-        for gap in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5)
-    ]
-    cases += [Case("H1", "pair 1.75 s apart, 52 and 10 DN", one(heights=(52.0, 10.4), gap=1.75), base)]
-    cases += [
-        Case("H2", f"pair {gap:g} s apart, 20000 DN", one(heights=(2e4, 2e4), gap=gap), deep) for gap in (0.25, 1)
-    ]
-    cases += [Case("H3", f"weak: SNR {snr}", one(heights=(1.041 * snr,)), base) for snr in (3, 4, 5)]
-    cases += [
-        Case("H4", f"skew {kappa:g}, SNR 100", one(heights=(104.0,)), replace(base, pulse=PulseModel(SIGMA, kappa)))
-        for kappa in (0.06, 0.10, 0.15)
-    ]
-    cases += [Case("H5", "50 to 50000 DN in 16 bit", partial(draw_between, low=50.0, high=5e4), deep)]
-    cases += [
-        Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), clipping)
-        for level in (0.95, 0.8, 0.64, 0.5, 0.3)
-    ]
-    cases += [Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)]
-    cases += [Case("H6", "5 to 500 times the range", draw_huge, clipping)]
-    cases += [
-        Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), replace(base, pulse=base.pulse.with_ringing(ring)))
-        for ring in (0.01, 0.02, 0.03)
-    ]
-    cases += [
-        Case("H8", f"centre {inside:g} s inside", partial(draw_at_edge, inside=inside), base)
-        for inside in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5)
-    ]
+    for gap in (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5):
+        yield Case("H1", f"pair {gap:g} s apart, SNR 50", one(heights=(52.0, 52.0), gap=gap), base)
+    yield Case("H1", "pair 1.75 s apart, 52 and 10 DN", one(heights=(52.0, 10.4), gap=1.75), base)
+    for gap in (0.25, 1):
+        yield Case("H2", f"pair {gap:g} s apart, 20000 DN", one(heights=(2e4, 2e4), gap=gap), deep)
+    for snr in (3, 4, 5):
+        yield Case("H3", f"weak: SNR {snr}", one(heights=(1.041 * snr,)), base)
+    for kappa in (0.06, 0.10, 0.15):
+        skewed = replace(base, pulse=PulseModel(SIGMA, kappa))
+        yield Case("H4", f"skew {kappa:g}, SNR 100", one(heights=(104.0,)), skewed)
+    yield Case("H5", "50 to 50000 DN in 16 bit", partial(draw_between, low=50.0, high=5e4), deep)
+    for level in (0.95, 0.8, 0.64, 0.5, 0.3):
+        yield Case("H6", f"clipped at {level:.0%} of its height", partial(draw_clipped, level=level), clipping)
+    yield Case("H6", "clipped at 50%, none in the survey", partial(draw_clipped, level=0.5), base)
+    yield Case("H6", "5 to 500 times the range", draw_huge, clipping)
+    for ring in (0.01, 0.02, 0.03):
+        ringing = replace(base, pulse=base.pulse.with_ringing(ring))
+        yield Case("H7", f"ringing {ring:.0%}", one(heights=(200.0,)), ringing)
+    for inside in (2.0, 1.5, 1.0, 0.5, 0.0, -0.5):
+        yield Case("H8", f"centre {inside:g} s inside", partial(draw_at_edge, inside=inside), base)
     quiet = replace(base, noise_std=0.5, baseline_spread=0.1)
-    cases += [Case("H9", "2 to 6 DN, noise 0.5", partial(draw_between, low=2.0, high=6.0), quiet)]
-    cases += [
-        Case("H10", "constant 0, 12 or 255", draw_constant, base),
-        Case("H10", "noise only", one(heights=()), base),
-    ]
-    cases += [
-        Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho))
-        for rho in (0.5, 0.667, 0.8)
-    ]
-    cases += [
-        Case("H12", f"variance +{gain:g} per DN", one(heights=(150.0,)), replace(base, noise_gain=gain))
-        for gain in (0.05, 0.1)
-    ]
-    cases += [
-        Case("H16", "2.5 to 4 times as wide", draw_broad, base),
-        Case("H16", "weak beside strong", draw_contrast, base),
-        Case("H16", "eight echoes", draw_crowd, base),
-    ]
-    return tuple(cases)
+    yield Case("H9", "2 to 6 DN, noise 0.5", partial(draw_between, low=2.0, high=6.0), quiet)
+    yield Case("H10", "constant 0, 12 or 255", draw_constant, base)
+    yield Case("H10", "noise only", one(heights=()), base)
+    for rho in (0.5, 0.667, 0.8):
+        yield Case("H11", f"noise of rho {rho:.2g}", one(heights=(60.0,)), replace(base, rho=rho))
+    for gain in (0.05, 0.1):
+        yield Case("H12", f"variance +{gain:g} per DN", one(heights=(150.0,)), replace(base, noise_gain=gain))
+    yield Case("H16", "2.5 to 4 times as wide", draw_broad, base)
+    yield Case("H16", "weak beside strong", draw_contrast, base)
+    yield Case("H16", "eight echoes", draw_crowd, base)
 
 
-CASES: tuple[Case, ...] = _list_cases()
+CASES: tuple[Case, ...] = tuple(_list_cases())
 """Every case, in the order of the hazards. H13 to H15 concern range and angle, not waveforms."""
 
 

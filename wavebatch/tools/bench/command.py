@@ -186,12 +186,9 @@ def _mark_front(rows: list[dict[str, Any]]) -> None:
 
     Peers get other and fewer waveforms: they are never on the front.
     """
-    costs = [
-        (row["kernels"]["median"], row["figures"]["rmse_all_cm"]["value"], row["figures"]["wrong"]["value"])
-        if row["kind"] == "chain"
-        else (None, None, None)
-        for row in rows
-    ]
+    names = ("rmse_all_cm", "wrong")
+    costs = [(row["kernels"]["median"], *(row["figures"][name]["value"] for name in names)) for row in rows]
+    costs = [cost if row["kind"] == "chain" else (None,) * 3 for row, cost in zip(rows, costs, strict=True)]
     for row, best in zip(rows, find_front(costs).tolist(), strict=True):
         row["pareto"] = best
 

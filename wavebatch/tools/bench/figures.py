@@ -7,7 +7,7 @@ runs with other seeds, because that is what a reader compares.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,7 @@ class Figure:
 
     def to_json(self) -> dict[str, Any]:
         """Value and error; None where there were no data."""
-        return without_nan({"value": self.value, "error": self.error})
+        return without_nan(asdict(self))
 
     def scale(self, factor: float) -> Figure:
         """The figure in another unit."""
@@ -91,14 +91,8 @@ def _standard_error(influence: np.ndarray, group: np.ndarray) -> float:
 
 def median_range(values: list[float]) -> dict[str, Any]:
     """Median, least, most and number of repeated measurements; None without any."""
-    if not values:
-        return {"median": None, "min": None, "max": None, "repeats": 0}
-    return {
-        "median": float(np.median(values)),
-        "min": float(min(values)),
-        "max": float(max(values)),
-        "repeats": len(values),
-    }
+    found = [float(measure(values)) if values else None for measure in (np.median, min, max)]
+    return {**dict(zip(("median", "min", "max"), found, strict=True)), "repeats": len(values)}
 
 
 def find_front(costs: Sequence[Sequence[float | None]]) -> np.ndarray:
@@ -119,10 +113,10 @@ def choose_cheapest(rows: Sequence[Mapping], tolerance_cm: float) -> Mapping | N
 
     rows: as in the document of the benchmark.
     """
-    good = []
-    for row in rows:
-        rmse = row["figures"]["rmse_isolated_cm"]
-        seconds = row["kernels"]["median"]
-        if rmse["value"] is not None and seconds is not None and rmse["value"] + (rmse["error"] or 0) <= tolerance_cm:
-            good.append((seconds, row["name"], row))
-    return min(good, key=lambda entry: entry[:2])[2] if good else None
+
+    def is_good(row: Mapping) -> bool:
+        error = row["figures"]["rmse_isolated_cm"]
+        return error["value"] is not None and error["value"] + (error["error"] or 0) <= tolerance_cm
+
+    good = [row for row in rows if row["kernels"]["median"] is not None and is_good(row)]
+    return min(good, key=lambda row: (row["kernels"]["median"], row["name"]), default=None)

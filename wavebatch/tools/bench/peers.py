@@ -77,9 +77,8 @@ def fit_leastsq(block: WaveformBlock, noise: Noise, system: SystemPulse) -> Peer
             solved.append(_solve(leastsq, starts[first:last].ravel(), x, signal[row]))
             rows.append(np.full(last - first, row))
     seconds = time.perf_counter() - begin
-    if not solved:
-        return PeerResult(EchoTable.empty(), seconds, len(block), 0)
-    return PeerResult(_table(np.concatenate(rows), np.concatenate(solved), x[-1]), seconds, len(block), 0)
+    found = _table(np.concatenate(rows), np.concatenate(solved), x[-1]) if solved else EchoTable.empty()
+    return PeerResult(found, seconds, len(block), 0)
 
 
 def _solve(leastsq, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -16,6 +16,8 @@ import numpy as np
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.bench.figures import find_front
 
+NO_PLOT = "no plot without matplotlib: pip install 'wavebatch[plot]'"
+
 PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),
     ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),

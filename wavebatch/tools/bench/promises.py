@@ -77,16 +77,16 @@ def judge(document: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _scene_promises(section: Mapping[str, Any]) -> Iterator[Promise]:
     rows = {row["name"]: row for row in section["rows"]}
     scene, main = section["scene"], rows.get("auto") or rows["accurate"]
+    rows[MAIN] = main
     for place, role, kind, limit in SPEEDS:
         if place == scene:
-            row = main if role == MAIN else rows[role]
             timed = "file to file" if kind == "file" else kind
-            yield Promise(f"{scene}: {row['name']}, {timed}", _rate(row, kind), limit, unit="waveforms/s")
+            what = f"{scene}: {rows[role]['name']}, {timed}"
+            yield Promise(what, _rate(rows[role], kind), limit, unit="waveforms/s")
     if scene == "mixed":
         for role, shares in SHARES.items():
-            row = main if role == MAIN else rows[role]
             for name, limit in shares.items():
-                yield Promise(f"mixed: {row['name']}, {name}", _percent(row, name), limit, unit="%")
+                yield Promise(f"mixed: {rows[role]['name']}, {name}", _percent(rows[role], name), limit, unit="%")
         if "gdecomp" in rows:
             yield from _peer_promises(main, rows["gdecomp"])
     ratio = main["figures"]["time_ratio_isolated"]["value"]

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
-from wavebatch.tools.bench.plot import can_plot, plot_scene
+from wavebatch.stages.score import QUANTITIES
+from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
 
 Column = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -30,11 +31,10 @@ LENGTHS: tuple[Column, ...] = (
     ("isolated cm", "rmse_isolated_cm", 1, 2),
     ("overlapped cm", "rmse_overlapped_cm", 1, 2),
 )
-QUANTITIES = (("time", "time"), ("amplitude", "amplitude"), ("sigma", "sigma"))
 
 
 def _ratios(kind: str) -> tuple[Column, ...]:
-    columns = tuple((head, f"{name}_ratio_{kind}", 1.0, 3) for head, name in QUANTITIES)
+    columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
     return (*columns, ("gross %", f"gross_{kind}", 100, 2), ("err column", f"time_calibration_{kind}", 1.0, 3))
 
 
@@ -52,24 +52,20 @@ def format_document(document: Mapping[str, Any]) -> str:
 
 def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str:
     rows, survey = section["rows"], section["survey"]
-    lines = [
+    head = [
         f"== {section['scene']}: {section['meaning']}",
         f"survey of {survey['groups']} x {survey['waveforms_of_a_group']} waveforms: "
         f"sigma {_span(survey['sigma_ref'])} ns, noise {_span(survey['noise_std'])} DN, "
         f"kappa {_span(survey['kappa'])}, "
         f"acceptance {_span(survey['acceptance'])}, Gaussians {', '.join(map(str, survey['components']))}",
-        "",
-        *_speed_table(rows),
-        "",
-        *_figure_table("echoes found", rows, SHARES),
-        "",
-        *_figure_table("rms error of the range", rows, LENGTHS),
     ]
+    parts = [head, _speed_table(rows), _figure_table("echoes found", rows, SHARES)]
+    parts.append(_figure_table("rms error of the range", rows, LENGTHS))
     for kind in ("isolated", "overlapped"):
-        lines += ["", *_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind))]
+        parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
     if tolerance_cm is not None:
-        lines += ["", _format_cheapest(section, tolerance_cm)]
-    return "\n".join(lines)
+        parts.append([_format_cheapest(section, tolerance_cm)])
+    return "\n\n".join(map("\n".join, parts))
 
 
 def _format_cheapest(section: Mapping[str, Any], tolerance_cm: float) -> str:
@@ -93,8 +89,7 @@ def rate_text(times: Mapping[str, Any]) -> str:
 
 
 def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    head = ["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]
-    lines = [head]
+    lines = [["median (least..most) waveforms/s", "kernels", "file to file", "with survey", "survey s", "MB", "front"]]
     for row in rows:
         name = row["name"]
         if row.get("same_as"):
@@ -102,17 +97,9 @@ def _speed_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if row.get("crashed_or_hung"):
             name += f" ({row['crashed_or_hung']} crashed or hung)"
         once, memory = row["survey_seconds"]["median"], row["peak_bytes"]
-        lines.append(
-            [
-                name,
-                rate_text(row["kernels"]),
-                rate_text(row["file"]),
-                rate_text(row["file_with_survey"]),
-                "-" if once is None else f"{once:.2f}",
-                "-" if memory is None else f"{memory / 1e6:.0f}",
-                "*" if row["pareto"] else "",
-            ]
-        )
+        rates = (rate_text(row[kind]) for kind in ("kernels", "file", "file_with_survey"))
+        cells = ("-" if once is None else f"{once:.2f}", "-" if memory is None else f"{memory / 1e6:.0f}")
+        lines.append([name, *rates, *cells, "*" if row["pareto"] else ""])
     return align(lines)
 
 
@@ -135,13 +122,8 @@ def figure_text(row: Mapping[str, Any], column: Column) -> str:
 def align(lines: Sequence[Sequence[str]]) -> list[str]:
     """Lines of cells as columns: the first aligned to the left, the others to the right."""
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    return [
-        "  ".join(
-            cell.ljust(width) if place == 0 else cell.rjust(width)
-            for place, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    ]
+    form = "  ".join(["{:<%d}", *["{:>%d}"] * (len(widths) - 1)]) % tuple(widths)
+    return [form.format(*line).rstrip() for line in lines]
 
 
 def _format_stability(document: Mapping[str, Any]) -> str:
@@ -185,15 +167,11 @@ def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list
     for row in rows:
         known = {name for name, figure in row["figures"].items() if figure["value"] is not None}
         kind = "isolated" if "found_isolated" in known else "overlapped"
-        columns: list[Column] = [
-            ("", "completeness", 100, 1),
-            ("", "exact_count", 100, 1),
-            ("", "false_splits" if "false_splits" in known else "false_alarms", 100, 1),
-            *(("", f"{name}_ratio_{kind}", 1.0, 2) for _, name in QUANTITIES),
-            ("", f"gross_{kind}", 100, 1),
-        ]
+        names = ["completeness", "exact_count", "false_splits" if "false_splits" in known else "false_alarms"]
+        figures = [figure_text(row, ("", name, 100, 1)) for name in names]
+        figures += [figure_text(row, ("", f"{name}_ratio_{kind}", 1, 2)) for name in QUANTITIES]
+        figures.append(figure_text(row, ("", f"gross_{kind}", 100, 1)))
         cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
-        figures = [figure_text(row, column) for column in columns]
         lines.append([*cells, *figures, _list_failures([row]), _list_flags(row)])
     return lines
 
@@ -208,17 +186,21 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
 
     Without matplotlib there are no plots, and a message says how to get them. Raises InputError where it cannot write.
     """
+    texts = {"bench.json": json.dumps(document, indent=1, sort_keys=True), "bench.txt": text}
+    written = write_texts(folder, texts)
+    if not can_plot():
+        return [written, NO_PLOT]
+    for section in document["scenes"]:
+        name = f"bench-{Path(section['scene']).stem}.png"
+        plot_scene(section, folder / name)
+        written += f", {name}"
+    return [written]
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> str:
+    """Writes texts by file name into a folder, replacing old ones; returns a line that names them."""
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "bench.json").write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", "utf-8")
-        (folder / "bench.txt").write_text(text + "\n", "utf-8")
-        written = ["bench.json", "bench.txt"]
-        if can_plot():
-            for section in document["scenes"]:
-                name = f"bench-{Path(section['scene']).stem}.png"
-                plot_scene(section, folder / name)
-                written.append(name)
-    lines = [f"{folder}: {', '.join(written)}"]
-    if not can_plot():
-        lines.append("no plot without matplotlib: pip install 'wavebatch[plot]'")
-    return lines
+        for name, text in texts.items():
+            (folder / name).write_text(text + "\n", "utf-8")
+    return f"{folder}: {', '.join(texts)}"

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import StageError
+from wavebatch.files.disk.closing import Closing
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _START = "from wavebatch.tools.bench.worker import serve; serve()"
@@ -26,7 +27,7 @@ class WorkerDied(Exception):
     """The process ended before it answered."""
 
 
-class Worker:
+class Worker(Closing):
     """Runs functions in another Python process, one after another; a context manager."""
 
     def __init__(self) -> None:
@@ -39,12 +40,6 @@ class Worker:
         self._replies: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def submit(self, function: Callable, *arguments: Any) -> None:
         """Starts `function(*arguments)`; `take` returns the answer."""

@@ -6,7 +6,7 @@ as in Fig. 6 of Rhomberg-Kauert et al. 2024. Sums are kept per piece, so that me
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -53,10 +53,6 @@ class AngleAgreement:
     histogram_normals: tuple[int, ...]
     difference_edges: tuple[float, ...]
     histogram_difference: tuple[int, ...]
-
-    def to_json(self) -> dict:
-        """Plain numbers and lists for JSON."""
-        return asdict(self)
 
 
 def compare_angles(a: Path, b: Path | None = None, *, tolerance_ns: float = 1.0) -> AngleAgreement:

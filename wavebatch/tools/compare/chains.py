@@ -16,12 +16,12 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-from wavebatch.surveying import Survey
+from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
@@ -107,11 +107,11 @@ def match_sides(
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
-        survey = survey or survey_sample(read_sample(reader, scan))
+        survey = survey or survey_blocks(read_sample(reader, scan))
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         chosen = choose_chain(survey)
         runs = {key: ChainRun(side.chain or chosen, survey.system, tolerance_ns) for key, side in chains.items()}
-        blocks = _read_blocks(reader, scan, limit)
+        blocks = reader.sample_blocks(scan, limit, _BLOCK) if limit is not None else reader.all_blocks(scan, _BLOCK)
         if clouds:
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)
         else:
@@ -120,15 +120,6 @@ def match_sides(
     vendor = {key: run.vendor.finish(chains[key].name, str(strip), "waveform") for key, run in runs.items()}
     fit = {key: runs[key].fit.result() if key in runs else {} for key in ("a", "b")[: 1 if b is None else 2]}
     return Matchup(str(strip), some.pulses, some.echoes[1], between, vendor, fit)
-
-
-def _read_blocks(reader: StripReader, scan: StripScan, limit: int | None) -> Iterator[WaveformBlock]:
-    if limit is not None:
-        yield from reader.sample_blocks(scan, limit, _BLOCK)
-        return
-    for number in range(reader.unit_count()):
-        for block, _ in reader.read_blocks(reader.read_unit(number, scan), _BLOCK, owned_only=True):
-            yield block
 
 
 def match_chains(
@@ -188,8 +179,7 @@ class _Found:
         echoes = self.echoes
         rows = np.zeros(len(echoes), CLOUD_DTYPE)
         rows["gps_time"] = echoes.waveform
-        for axis, name in enumerate("xyz"):
-            rows["xyz"][:, axis] = echoes.attributes[name]
+        rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
         rows["ray"] = block.direction[echoes.waveform]
         rows["number"], rows["total"] = _rank(echoes.waveform, echoes.time, len(block))
         rows["echo_time"] = echoes.time

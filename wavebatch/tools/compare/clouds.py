@@ -16,6 +16,7 @@ from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
+from wavebatch.files.disk.closing import Closing
 from wavebatch.tools.compare.pairing import Comparison, Pairing, check_tolerance
 from wavebatch.tools.return_stats.returns import pulses_told_apart
 from wavebatch.tools.simulate.truth import TruthReader
@@ -80,8 +81,7 @@ def _share_times(first: CloudReader, second: CloudReader) -> bool:
 
 def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
     rows = np.zeros(len(piece["gps_time"]), _TRUTH_DTYPE)
-    for axis, name in enumerate("xyz"):
-        rows["xyz"][:, axis] = piece[name]
+    rows["xyz"] = np.stack([piece[name] for name in "xyz"], axis=1)
     for name in ("gps_time", "amplitude", "flags", "isolated"):
         rows[name] = piece[name]
     rows["echo_time"] = piece["time"]
@@ -89,7 +89,7 @@ def _shape_truth(piece: dict[str, np.ndarray]) -> np.ndarray:
     return rows
 
 
-class CloudTask:
+class CloudTask(Closing):
     """One comparison: `add` puts rows of both sides into buckets, `finish` compares bucket by bucket.
 
     A context manager, because temporary files hold the rows.
@@ -102,10 +102,8 @@ class CloudTask:
         self.buckets = [Buckets(dtype, self.number) for dtype in dtypes]
         self.borders = np.empty(0)
 
-    def __enter__(self) -> CloudTask:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Removes the temporary files."""
         for bucket in self.buckets:
             bucket.close()
 

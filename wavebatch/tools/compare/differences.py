@@ -64,9 +64,8 @@ class Differences:
             values = values[~np.isnan(values)]
             median = np.median(values)
             nmad = MAD_TO_STD * np.median(np.abs(values - median))
-            result[name] = Spread(
-                int(number), float(median), float(total / number), float(np.sqrt(squares / number)), float(nmad)
-            )
+            figures = (median, total / number, np.sqrt(squares / number), nmad)
+            result[name] = Spread(int(number), *map(float, figures))
         return result
 
     def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:

@@ -75,14 +75,9 @@ class FitQuality:
         classes = _classes(whole)
         found = {}
         for name, (number, misfit, floor) in self._sums.items():
-            inside = classes[name]
-            found[name] = Goodness(
-                waveforms=int(number),
-                mean=float(misfit / number) if number else float("nan"),
-                median=_median(whole["misfit"][inside]),
-                floor_mean=float(floor / number) if number else float("nan"),
-                floor_median=_median(whole["floor"][inside]),
-            )
+            means = [float(total / number) if number else float("nan") for total in (misfit, floor)]
+            medians = [_median(whole[kind][classes[name]]) for kind in ("misfit", "floor")]
+            found[name] = Goodness(int(number), means[0], medians[0], means[1], medians[1])
         return found
 
 

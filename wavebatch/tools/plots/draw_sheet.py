@@ -73,10 +73,7 @@ def draw_sheet(
 
 
 def _draw_cell(
-    figure: Figure,
-    view: WaveformView,
-    times: tuple[float, float] | None,
-    place: tuple[float, float, float, float],
+    figure: Figure, view: WaveformView, times: tuple[float, float] | None, place: tuple[float, float, float, float]
 ) -> None:
     left, bottom, width, height = place
     upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))

@@ -80,20 +80,38 @@ def find_places(
         raise InputError(f"{path}: holds no waveform to draw; `wavebatch check` shows what it holds")
     if wanted.flags:
         return _find_flagged(reader, scan, wanted, run)
-    searches = [_Number(number) for number in _list_numbers(scan, wanted, str(path))]
-    searches += [_Point(point) for point in wanted.points]
-    searches += [_Time(time) for time in wanted.times]
-    if len(searches) > wanted.limit:
-        raise ConfigError(f"{path}: {len(searches)} waveforms are too many for a picture; {wanted.limit} fit")
+    numbers = _list_numbers(scan, wanted, str(path))
+    number = len(numbers) + len(wanted.points) + len(wanted.times)
+    if number > wanted.limit:
+        raise ConfigError(f"{path}: {number} waveforms are too many for a picture; {wanted.limit} fit")
     for point in wanted.points:
         if not 0 <= point < scan.points:
             raise ConfigError(f"{path}: there is no point {point}; points are 0 to {scan.points - 1}")
+    found: dict[tuple[str, float], Place] = {}
+    away = dict.fromkeys(wanted.times, np.inf)
     for unit, base in _read_units(reader, scan):
-        for search in searches:
-            search.look(unit, base)
-        if all(search.is_done for search in searches):
+        owned = np.flatnonzero(unit.packets.owned)
+        rows = {number: owned[number - base] for number in numbers if base <= number < base + len(owned)}
+        found |= {("packet", number): Place(unit.number, int(row), number) for number, row in rows.items()}
+        for point in wanted.points:
+            if 0 <= point - unit.start < len(unit.points):
+                found["point", point] = _find_point(unit, base, point, str(path))
+        for time in wanted.times:
+            row, apart = _find_nearest(unit, time)
+            if apart < away[time]:
+                away[time], found["time", time] = apart, _place(unit, base, row)
+        # Times need not be in order: all units are read for them.
+        if not wanted.times and len(found) == len({*numbers}) + len({*wanted.points}):
             break
-    places = [search.finish(str(path)) for search in searches]
+    for time, apart in away.items():
+        if apart > FARTHEST:
+            why = f"the nearest is {apart:g} s away" if np.isfinite(apart) else "no pulse has a time"
+            raise ConfigError(f"{path}: no pulse lies within {FARTHEST:g} s of GPS time {time!r}: {why}")
+    for number in numbers:
+        if ("packet", number) not in found:
+            raise InputError(f"{path}: packet {number} was not found; the file changed while it was read")
+    wants = [("packet", numbers), ("point", wanted.points), ("time", wanted.times)]
+    places = [found[kind, one] for kind, each in wants for one in each]
     return list({(place.unit, place.row): place for place in places}.values())
 
 
@@ -117,8 +135,7 @@ def _list_numbers(scan: StripScan, wanted: Wanted, path: str) -> list[int]:
 def _read_units(reader: StripReader, scan: StripScan) -> Iterator[tuple[Unit, int]]:
     """The units of the strip, each with the number of packets in the units before it."""
     base = 0
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
+    for unit in reader.read_units(scan):
         yield unit, base
         base += int(np.count_nonzero(unit.packets.owned))
 
@@ -128,71 +145,23 @@ def _place(unit: Unit, base: int, row: int) -> Place:
     return Place(unit.number, row, base + int(np.count_nonzero(owned[:row])) if owned[row] else -1)
 
 
-class _Search:
-    """Search for one waveform: `look` at unit after unit until `is_done`, then `finish`."""
-
-    is_done = False
-
-    def __init__(self, wanted: float) -> None:
-        self.wanted = wanted
-        self.place: Place | None = None
-
-
-class _Number(_Search):
-    """Search for a packet by its number."""
-
-    def look(self, unit: Unit, base: int) -> None:
-        owned = np.flatnonzero(unit.packets.owned)
-        if base <= self.wanted < base + len(owned):
-            self.place = Place(unit.number, int(owned[self.wanted - base]), self.wanted)
-            self.is_done = True
-
-    def finish(self, path: str) -> Place:
-        if self.place is None:
-            raise InputError(f"{path}: packet {self.wanted} was not found; the file changed while it was read")
-        return self.place
+def _find_point(unit: Unit, base: int, point: int, path: str) -> Place:
+    row = int(unit.packet_of_point[point - unit.start])
+    if row < 0:
+        broken = unit.point_flags[point - unit.start] & EchoFlag.BROKEN_PACKET
+        why = "a packet that cannot be used" if broken else "no waveform"
+        raise ConfigError(f"{path}: point {point} has {why}; name another")
+    return _place(unit, base, row)
 
 
-class _Point(_Search):
-    """Search for the packet of a point."""
-
-    flags = 0
-
-    def look(self, unit: Unit, base: int) -> None:
-        index = self.wanted - unit.start
-        if 0 <= index < len(unit.points):
-            self.is_done = True
-            row = int(unit.packet_of_point[index])
-            self.flags = int(unit.point_flags[index])
-            self.place = _place(unit, base, row) if row >= 0 else None
-
-    def finish(self, path: str) -> Place:
-        if self.place is None:
-            why = "a packet that cannot be used" if self.flags & EchoFlag.BROKEN_PACKET else "no waveform"
-            raise ConfigError(f"{path}: point {self.wanted} has {why}; name another")
-        return self.place
-
-
-class _Time(_Search):
-    """Search for the pulse nearest to a GPS time; it looks at all units, because times need not be in order."""
-
-    away = np.inf
-
-    def look(self, unit: Unit, base: int) -> None:
-        points = np.flatnonzero(unit.packet_of_point >= 0)
-        with np.errstate(invalid="ignore"):
-            away = np.abs(unit.points["gps_time"][points] - self.wanted)
-        away[np.isnan(away)] = np.inf
-        if len(away) and away.min() < self.away:
-            nearest = int(np.argmin(away))
-            self.away = float(away[nearest])
-            self.place = _place(unit, base, int(unit.packet_of_point[points[nearest]]))
-
-    def finish(self, path: str) -> Place:
-        if self.place is None or self.away > FARTHEST:
-            why = "no pulse has a time" if self.place is None else f"the nearest is {self.away:g} s away"
-            raise ConfigError(f"{path}: no pulse lies within {FARTHEST:g} s of GPS time {self.wanted!r}: {why}")
-        return self.place
+def _find_nearest(unit: Unit, time: float) -> tuple[int, float]:
+    """Packet of the unit that is nearest to a GPS time, and how far away it is [s]; infinity if none has a time."""
+    points = np.flatnonzero(unit.packet_of_point >= 0)
+    with np.errstate(invalid="ignore"):
+        away = np.abs(unit.points["gps_time"][points] - time)
+    away[np.isnan(away)] = np.inf
+    nearest = int(np.argmin(away)) if len(away) else -1
+    return (int(unit.packet_of_point[points[nearest]]), float(away[nearest])) if len(away) else (-1, np.inf)
 
 
 def _find_flagged(

@@ -39,6 +39,9 @@ class Area(NamedTuple):
     """Lower left corner of a cell; NaN for others."""
 
 
+OUTSIDE = Area("outside", "outside")
+
+
 class Division(Protocol):
     """A division of the plane into areas that do not overlap."""
 
@@ -70,7 +73,7 @@ class Grid:
     def describe(self, number: int) -> Area:
         """As Division.describe."""
         if number == _OUTSIDE:
-            return Area("outside", "outside")
+            return OUTSIDE
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
@@ -91,9 +94,7 @@ class PolygonSet:
 
     def describe(self, number: int) -> Area:
         """As Division.describe."""
-        if number == _OUTSIDE:
-            return Area("outside", "outside")
-        return Area("polygon", self.polygons[number].name)
+        return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
 
 
 @dataclass(frozen=True, slots=True)

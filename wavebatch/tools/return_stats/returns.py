@@ -83,10 +83,7 @@ class ReturnStats:
 
 
 def count_returns(
-    clouds: Sequence[Path],
-    skip: Callable[[InputError], None] | None = None,
-    *,
-    divisions: Sequence[Division] = (),
+    clouds: Sequence[Path], skip: Callable[[InputError], None] | None = None, *, divisions: Sequence[Division] = ()
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
@@ -132,7 +129,8 @@ def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
             keys = _Keys(by_time)
             for rows in reader.read_pieces():
                 tally.add_points(rows)
-                buckets.add(_shape(rows, keys.of(rows)), lambda part: _sort_by_key(part, number))
+                shaped = _shape(rows, keys.of(rows))
+                buckets.add(shaped, lambda part: (np.arange(len(part)), spread_keys(part["key"], number)))
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
     return tally
@@ -163,10 +161,6 @@ def _shape(rows: np.ndarray, key: np.ndarray) -> np.ndarray:
         shaped[name] = rows[name]
     shaped["echo"] = (rows["flags"] & np.uint16(PASSED_THROUGH)) == 0
     return shaped
-
-
-def _sort_by_key(rows: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.arange(len(rows)), spread_keys(rows["key"], number)
 
 
 @dataclass(slots=True, eq=False)
@@ -217,10 +211,8 @@ class _Tally:
 
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
-        self.points += other.points
-        self.incomplete += other.incomplete
         self.methods |= other.methods
-        for name in ("by_number", "by_count", "bins", "pairs", "sums"):
+        for name in ("points", "incomplete", "by_number", "by_count", "bins", "pairs", "sums"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.least = np.minimum(self.least, other.least)
         for area, more in zip(self.areas, other.areas, strict=True):
@@ -234,9 +226,7 @@ class _Tally:
         zone = hidden = self._find_dead_zone()
         if not math.isnan(zone):
             hidden = int(self.bins[round(zone / _BIN) : round(2 * zone / _BIN)].sum()) / pulses
-        flags = self.flags
-        if flags is not None:
-            flags = {flag.name: int(number) for flag, number in zip(EchoFlag, flags, strict=True)}
+        names = [flag.name for flag in EchoFlag]
         return ReturnStats(
             cloud=cloud,
             points=self.points,
@@ -248,7 +238,7 @@ class _Tally:
             separations=self._list_separations(),
             dead_zone=zone,
             hidden=hidden,
-            flags=flags,
+            flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
             warnings=tuple(self._warn(zone, hidden, pulses)),
             areas=tuple(stats for area in self.areas for stats in area.finish()),
         )

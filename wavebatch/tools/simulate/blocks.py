@@ -52,27 +52,28 @@ class Simulated:
 
 
 def simulate_block(
-    scene: Scene | str, n: int, rng: np.random.Generator, *, recording: Recording | None = None, first: int = 0
+    scene: Scene | str, n: int, rng: np.random.Generator, *, recording: Recording | None = None
 ) -> tuple[WaveformBlock, EchoTable]:
     """A block of n waveforms of the scene and the truth: an EchoTable of the echoes in it.
 
-    scene: a Scene or the name of one. recording: replaces the scene's receiver. first: number of the first pulse.
+    scene: a Scene or the name of one. recording: replaces the scene's receiver.
     In the truth, time is the peak [ns after sample 0], amplitude the height of the peak above the baseline [count] and
     sigma the standard deviation of the main lobe [ns]; the flags are those of `flag_truth`. The block's origin is the
     true position of sample 0. Raises ConfigError for an unknown scene.
     """
-    simulated = simulate_pulses(_prepare(scene, recording), n, rng, first=first)
+    scene = find_scene(scene)
+    simulated = simulate_pulses(replace(scene, recording=recording) if recording else scene, n, rng)
     return simulated.block, simulated.truth
 
 
 def simulate_blocks(
-    scene: Scene | str, n: int, *, seed: int = 0, recording: Recording | None = None, size: int = SEED_BLOCK
+    scene: Scene | str, n: int, *, seed: int = 0, size: int = SEED_BLOCK
 ) -> Iterator[tuple[WaveformBlock, EchoTable]]:
     """Blocks of at most `size` waveforms, n in all, and their truth.
 
     Waveform k depends on scene and seed only: two calls with other n or size agree in the waveforms that both make.
     """
-    scene = _prepare(scene, recording)
+    scene = find_scene(scene)
     if n < 0 or size < 1:
         raise ConfigError(f"cannot simulate {n} waveforms in blocks of {size}; give numbers above 0")
     for start in range(0, n, size):
@@ -81,7 +82,7 @@ def simulate_blocks(
         for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
             low = number * SEED_BLOCK
             parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, SEED_BLOCK)))
-        yield (parts[0].block, parts[0].truth) if len(parts) == 1 else _join(parts, start)
+        yield _join(parts, start)
 
 
 def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
@@ -137,18 +138,7 @@ def _ground_time(truth: EchoTable, n: int, recording: Recording) -> np.ndarray:
     return time
 
 
-def _prepare(scene: Scene | str, recording: Recording | None) -> Scene:
-    scene = find_scene(scene)
-    return scene if recording is None else replace(scene, recording=recording)
-
-
 def _join(parts: list[Simulated], first: int) -> tuple[WaveformBlock, EchoTable]:
-    blocks = [part.block for part in parts]
-    shifts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    truth = EchoTable.concatenate((part.truth, int(shift)) for part, shift in zip(parts, shifts, strict=True))
-    columns = {
-        name: np.concatenate([getattr(block, name) for block in blocks])
-        for name in ("samples", "point", "gps_time", "origin", "direction")
-    }
-    columns["samples"].flags.writeable = False
-    return replace(blocks[0], first=first, **columns), truth
+    shifts = np.cumsum([0, *(len(part.block) for part in parts[:-1])]).tolist()
+    truth = EchoTable.concatenate((part.truth, shift) for part, shift in zip(parts, shifts, strict=True))
+    return replace(WaveformBlock.concatenate([part.block for part in parts]), first=first), truth

@@ -52,7 +52,7 @@ class LogUniform:
     low: float
     high: float
 
-    def __call__(self, rng: np.random.Generator, m: int) -> np.ndarray:
+    def __call__(self, rng: np.random.Generator, m: int | tuple[int, ...]) -> np.ndarray:
         return np.exp(rng.uniform(np.log(self.low), np.log(self.high), m))
 
 

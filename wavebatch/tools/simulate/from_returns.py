@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.las.header import is_projection, read_header
@@ -22,6 +22,7 @@ from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+from wavebatch.tools.simulate.returns import fill_packets
 
 INTENSITIES = ("peak", "reflectance")
 """Meanings of the intensities of a cloud, see SynthesisOptions."""
@@ -108,15 +109,8 @@ class SynthesisOptions:
 
     def recording(self, n_samples: int) -> Recording:
         """The receiver with waveforms of that length; raises ConfigError for values that none can have."""
-        return Recording(
-            n_samples=n_samples,
-            spacing=self.spacing,
-            bits=self.bits,
-            baseline=self.baseline,
-            baseline_spread=0.0,
-            noise_std=self.noise,
-            pulse=PulseModel(self.sigma),
-        )
+        pulse = PulseModel(self.sigma)
+        return Recording(n_samples, self.spacing, self.bits, self.baseline, 0.0, self.noise, pulse=pulse)
 
 
 @dataclass(slots=True)
@@ -210,14 +204,13 @@ def _read_pulses(reader: ReturnReader) -> Iterator[tuple[np.ndarray, np.ndarray]
 
 def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, overwrite: bool) -> FullwaveWriter:
     point_format = _FORMATS[reader.point_format]
+    lengths = enumerate(_LENGTHS, 1)
     return FullwaveWriter(
         target,
         version="1.3" if point_format < 6 else "1.4",
         point_format=point_format,
         internal=options.internal,
-        digitizers=[
-            Digitizer(number, options.bits, length, options.spacing) for number, length in enumerate(_LENGTHS, 1)
-        ],
+        digitizers=[Digitizer(number, options.bits, length, options.spacing) for number, length in lengths],
         scales=reader.scales,
         offsets=reader.offsets,
         records=[vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)],
@@ -315,13 +308,9 @@ def _fill_points(
     for name in set(dtype.names) & set(records.dtype.names) - set(_PACKET_FIELDS):
         points[name] = records[name]
     kind = pulses.kind[pulses.pulse]
-    has = kind < len(_LENGTHS)
-    points["wavepacket_index"] = np.where(has, kind + 1, 0)
-    points["wavepacket_offset"] = np.where(has, offset[pulses.pulse], 0)
-    points["wavepacket_size"] = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
-    points["return_point_wave_location"] = np.where(has, pulses.time * PS_PER_NS, 0)
-    for axis, name in enumerate(("x_t", "y_t", "z_t")):
-        points[name] = np.where(has, -pulses.ray[pulses.pulse, axis] * HALF_C / PS_PER_NS, 0)
+    index = np.where(kind < len(_LENGTHS), kind + 1, 0)
+    size = np.append(_LENGTHS, 0)[kind] * (options.bits // 8)
+    fill_packets(points, index, offset[pulses.pulse], size, pulses.time, pulses.ray[pulses.pulse] * HALF_C)
     return points
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from wavebatch.tools.simulate.draws import Drawn, tabulate_echoes
+from wavebatch.tools.simulate.draws import Drawn, LogUniform, tabulate_echoes
 from wavebatch.tools.simulate.render import Recording
 
 Draw = Callable[[np.random.Generator, int, Recording], Drawn]
@@ -21,16 +21,12 @@ def _middle(rng: np.random.Generator, n: int, recording: Recording, room: float 
     return rng.uniform(keep, recording.duration - keep, (n, 1))
 
 
-def _log(rng: np.random.Generator, low: float, high: float, shape) -> np.ndarray:
-    return np.exp(rng.uniform(np.log(low), np.log(high), shape))
-
-
 def draw_near(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """Two echoes of the system's width 0.5 to 2 sigma apart, amplitude 30 to 150, the second 0.2 to 1 of the first."""
     s = recording.pulse.sigma
     gap = s * rng.uniform(0.5, 2.0, (n, 1))
     start = _middle(rng, n, recording)
-    first = _log(rng, 30, 150, (n, 1))
+    first = LogUniform(30, 150)(rng, (n, 1))
     amplitude = np.hstack([first, first * rng.uniform(0.2, 1.0, (n, 1))])
     return tabulate_echoes(np.hstack([start - gap / 2, start + gap / 2]), amplitude, s)
 
@@ -41,12 +37,12 @@ def draw_saturated(rng: np.random.Generator, n: int, recording: Recording) -> Dr
     strong = (recording.clip - recording.baseline) / rng.uniform(0.3, 0.95, (n, 1))
     time = _middle(rng, n, recording)
     before = np.where(rng.random((n, 1)) < 1 / 3, time - rng.uniform(6, 9, (n, 1)) * s, np.nan)
-    return tabulate_echoes(np.hstack([before, time]), np.hstack([_log(rng, 15, 60, (n, 1)), strong]), s)
+    return tabulate_echoes(np.hstack([before, time]), np.hstack([LogUniform(15, 60)(rng, (n, 1)), strong]), s)
 
 
 def draw_huge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 5 to 500 times as high as the receiver can record: a flat top hides its amplitude."""
-    strong = (recording.clip - recording.baseline) * _log(rng, 5, 500, (n, 1))
+    strong = (recording.clip - recording.baseline) * LogUniform(5, 500)(rng, (n, 1))
     return tabulate_echoes(_middle(rng, n, recording), strong, recording.pulse.sigma)
 
 
@@ -66,12 +62,12 @@ def draw_edge(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     s = recording.pulse.sigma
     inside = s * rng.uniform(-0.5, 2.0, (n, 1))
     time = np.where(rng.random((n, 1)) < 0.5, inside, recording.duration - inside)
-    return tabulate_echoes(time, _log(rng, 20, 200, (n, 1)), s)
+    return tabulate_echoes(time, LogUniform(20, 200)(rng, (n, 1)), s)
 
 
 def draw_tiny(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo of 2 to 6 counts."""
-    return tabulate_echoes(_middle(rng, n, recording), _log(rng, 2, 6, (n, 1)), recording.pulse.sigma)
+    return tabulate_echoes(_middle(rng, n, recording), LogUniform(2, 6)(rng, (n, 1)), recording.pulse.sigma)
 
 
 def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
@@ -79,21 +75,21 @@ def draw_contrast(rng: np.random.Generator, n: int, recording: Recording) -> Dra
     s = recording.pulse.sigma
     time = _middle(rng, n, recording)
     gap = s * rng.uniform(3.5, 8, (n, 1)) * rng.choice([-1, 1], (n, 1))
-    heights = np.hstack([rng.uniform(150, 220, (n, 1)), _log(rng, 6, 12, (n, 1))])
+    heights = np.hstack([rng.uniform(150, 220, (n, 1)), LogUniform(6, 12)(rng, (n, 1))])
     return tabulate_echoes(np.hstack([time, time + gap]), heights, s)
 
 
 def draw_broad(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """One echo 2.5 to 4 times as wide as the system pulse: steep ground, dense crown."""
     wide = recording.pulse.sigma * rng.uniform(2.5, 4.0, (n, 1))
-    return tabulate_echoes(_middle(rng, n, recording, 12), _log(rng, 20, 120, (n, 1)), wide)
+    return tabulate_echoes(_middle(rng, n, recording, 12), LogUniform(20, 120)(rng, (n, 1)), wide)
 
 
 def draw_crowd(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:
     """Eight echoes evenly over the window: more than most decomposers fit."""
     s = recording.pulse.sigma
     at = np.linspace(4 * s, recording.duration - 4 * s, 8) + 0.3 * s * rng.standard_normal((n, 8))
-    return tabulate_echoes(at, _log(rng, 15, 150, (n, 8)), s)
+    return tabulate_echoes(at, LogUniform(15, 150)(rng, (n, 8)), s)
 
 
 def draw_constant(rng: np.random.Generator, n: int, recording: Recording) -> Drawn:

@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, PS_PER_NS
 from wavebatch.tools.simulate.render import Recording
 
 WEAKEST = 3.0
@@ -131,6 +131,23 @@ def list_returns(truth: EchoTable, n: int, recording: Recording, most: int, *, k
         amplitude = np.append(amplitude, np.zeros(len(empty), np.float32))[order]
     total = np.bincount(pulse, minlength=n)[pulse]
     return Returns(pulse, time, amplitude, _count_within(pulse) + 1, total)
+
+
+def fill_packets(
+    points: np.ndarray, index: np.ndarray, offset: np.ndarray, size: np.ndarray, time: np.ndarray, step: np.ndarray
+) -> None:
+    """Writes where the packets of points (k,) are, and how the points lie in them.
+
+    index: of the descriptor, 0 without packet; offset, size [bytes]; time: after sample 0 [ns]; step: away from the
+    sensor (k, 3) [m/ns].
+    """
+    has = index > 0
+    points["wavepacket_index"] = index
+    points["wavepacket_offset"] = np.where(has, offset, 0)
+    points["wavepacket_size"] = np.where(has, size, 0)
+    points["return_point_wave_location"] = np.where(has, time * PS_PER_NS, 0)
+    for axis, name in enumerate(("x_t", "y_t", "z_t")):
+        points[name] = np.where(has, -step[:, axis] / PS_PER_NS, 0)
 
 
 def _pick_strongest(echoes: EchoTable) -> np.ndarray:

@@ -15,7 +15,6 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
-from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.cloud.return_io import ReturnWriter
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
@@ -23,7 +22,7 @@ from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
 from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
 from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight
-from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, list_returns
+from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 from wavebatch.tools.simulate.truth import TruthWriter
 
@@ -187,15 +186,11 @@ def _simulate_parts(
     """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
     if pulses < 1:
         raise ConfigError(f"a strip needs at least one pulse, not {pulses}")
-
-    def parts() -> Iterator[Simulated]:
-        for first in range(0, pulses, SEED_BLOCK):
-            n = min(SEED_BLOCK, pulses - first)
-            yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
-            if progress:
-                progress(n)
-
-    return parts()
+    for first in range(0, pulses, SEED_BLOCK):
+        n = min(SEED_BLOCK, pulses - first)
+        yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
+        if progress:
+            progress(n)
 
 
 def _open_writer(target: Path, scene: Scene, options: StripOptions, overwrite: bool) -> FullwaveWriter:
@@ -233,7 +228,9 @@ def _write_part(
     offset = np.zeros(n, np.uint64)
     offset[rows] = writer.write_packets(block.samples[rows], 1)
     points = _fill_points(writer.dtype, simulated, returns, options.scale)
-    _fill_packets(points, block, returns, jitter, stored, offset)
+    pulse = returns.pulse
+    size = block.samples.shape[1] * block.samples.itemsize
+    fill_packets(points, stored[pulse], offset[pulse], size, returns.time + jitter[pulse], block.direction[pulse])
     writer.write_points(points)
     kept = simulated.truth.take(np.flatnonzero(stored[simulated.truth.waveform]))
     if truth_writer:
@@ -274,25 +271,6 @@ def _fill_points(dtype: np.dtype, simulated: Simulated, returns: Returns, scale:
         points["raw_classification"] = ground_or_plants
         points["scan_angle_rank"] = np.rint(scan_angle)
     return points
-
-
-def _fill_packets(
-    points: np.ndarray,
-    block: WaveformBlock,
-    returns: Returns,
-    jitter: np.ndarray,
-    stored: np.ndarray,
-    offset: np.ndarray,
-) -> None:
-    """Where the packets of the points are, and how the points lie in them."""
-    pulse = returns.pulse
-    has = stored[pulse]
-    points["wavepacket_index"] = has
-    points["wavepacket_offset"] = np.where(has, offset[pulse], 0)
-    points["wavepacket_size"] = np.where(has, block.samples.shape[1] * block.samples.itemsize, 0)
-    points["return_point_wave_location"] = np.where(has, (returns.time + jitter[pulse]) * PS_PER_NS, 0)
-    for axis, name in enumerate(("x_t", "y_t", "z_t")):
-        points[name] = np.where(has, -block.direction[pulse, axis] / PS_PER_NS, 0)
 
 
 def _locate(block: WaveformBlock, pulse: np.ndarray, time: np.ndarray) -> np.ndarray:

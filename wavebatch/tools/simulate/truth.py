@@ -15,6 +15,7 @@ from typing import IO, Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
 
 ECHO_COLUMNS: dict[str, str] = {
@@ -59,7 +60,7 @@ class TruthWriter(NpzWriter):
         super().publish({_META: json.dumps(meta, sort_keys=True)})
 
 
-class TruthReader:
+class TruthReader(Closing):
     """Reads a truth file; raises InputError when `path` is none."""
 
     def __init__(self, path: Path) -> None:
@@ -79,10 +80,8 @@ class TruthReader:
                 raise
             raise InputError(f"{self.path}: cannot be read: {error.strerror or error}; check the name") from error
 
-    def __enter__(self) -> TruthReader:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Closes the file."""
         self._archive.close()
 
     def read_pieces(self, *names: str, size: int = _PIECE) -> Iterator[dict[str, np.ndarray]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.strip.shared_packets import expand
 from wavebatch.kernels.geometry.scan_lines import find_sweeps
 
@@ -28,27 +28,28 @@ _FLOOR = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pulses:
-    """n pulses in file order; the samples of pulse i are values[first[i] : first[i] + count[i]]."""
+    """n pulses in file order, with count[i] samples of pulse i in `values`, one pulse after the other."""
 
     point: np.ndarray
     gps_time: np.ndarray
     origin: np.ndarray
     direction: np.ndarray
     spacing: np.ndarray
-    first: np.ndarray
     count: np.ndarray
     values: np.ndarray
 
     def __len__(self) -> int:
         return len(self.point)
 
+    @property
+    def first(self) -> np.ndarray:
+        """Where the samples of each pulse begin in `values`."""
+        return np.cumsum(self.count) - self.count
+
     def take(self, rows: np.ndarray) -> _Pulses:
         """Some pulses, with only their samples."""
-        count = self.count[rows]
-        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:5]}
-        return _Pulses(
-            **kept, first=np.cumsum(count) - count, count=count, values=self.values[expand(self.first[rows], count)]
-        )
+        kept = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-1]}
+        return _Pulses(**kept, values=self.values[expand(self.first[rows], kept["count"])])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,16 +86,16 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
     """
     number = lost = total = 0
     axis = None
-    rest: _Pulses | None = None
-    for unit_number in range(reader.unit_count()):
-        pulses = _read_pulses(reader, reader.read_unit(unit_number, scan))
-        if rest is not None:
-            pulses = _join([rest, pulses])
-        if not len(pulses):
+    rest: list[_Pulses] = []
+    for unit in reader.read_units(scan):
+        parts = rest + [_shape(block) for block, _ in reader.read_blocks(unit, _BLOCK, True)]
+        if not parts:
             continue
+        pulses = _join(parts)
+        pulses = pulses.take(np.argsort(pulses.point, kind="stable"))
         axis = _find_axis(pulses.direction) if axis is None else axis
         edges = _cut_long(np.append(find_sweeps(_measure_angle(pulses, axis), pulses.gps_time), len(pulses)))
-        last = unit_number == reader.unit_count() - 1
+        last = unit.number == reader.unit_count() - 1
         for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             if b == len(pulses) and not last:
                 break
@@ -104,22 +105,12 @@ def read_scan_lines(reader: StripReader, scan: StripScan) -> Iterator[ScanLine]:
                 continue
             yield _build_line(number, pulses.take(np.arange(a, b)))
             number += 1
-        rest = pulses.take(np.arange(edges[-2], len(pulses)))
+        rest = [pulses.take(np.arange(edges[-2], len(pulses)))]
     if lost > total / 2:
         raise InputError(
             f"{reader.facts.path}: {lost} of {total} pulses lie in scan lines of fewer than {LEAST_PULSES} pulses; "
             "slices need pulses in the order of time: sort the strip by GPS time"
         )
-
-
-def _read_pulses(reader: StripReader, unit: Unit) -> _Pulses:
-    parts = [_shape(block) for block, _ in reader.read_blocks(unit, _BLOCK, True)]
-    if not parts:
-        empty, three = np.empty(0), np.empty((0, 3))
-        none = np.empty(0, np.int64)
-        return _Pulses(none, empty, three, three, empty, none, none, np.empty(0, np.float32))
-    pulses = _join(parts)
-    return pulses.take(np.argsort(pulses.point, kind="stable"))
 
 
 def _shape(block: WaveformBlock) -> _Pulses:
@@ -131,14 +122,12 @@ def _shape(block: WaveformBlock) -> _Pulses:
     if block.missing is not None:
         values[block.missing] = 0
     place = (block.point, block.gps_time, block.origin, block.direction)
-    return _Pulses(*place, np.full(n, block.spacing), np.arange(n) * s, np.full(n, s), values.reshape(-1))
+    return _Pulses(*place, np.full(n, block.spacing), np.full(n, s), values.reshape(-1))
 
 
 def _join(parts: list[_Pulses]) -> _Pulses:
-    shifts = np.cumsum([0, *(len(part.values) for part in parts[:-1])])
-    joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(_Pulses)}
-    joined["first"] = np.concatenate([part.first + shift for part, shift in zip(parts, shifts, strict=True)])
-    return _Pulses(**joined)
+    names = [field.name for field in fields(_Pulses)]
+    return _Pulses(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _find_axis(direction: np.ndarray) -> np.ndarray:

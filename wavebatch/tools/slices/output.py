@@ -37,8 +37,7 @@ class SegmentWriter:
         suffix = self.target.suffix.lower()
         if suffix not in SEGMENT_SUFFIXES:
             raise ConfigError(f"{target}: segments are written as .csv or .geojson")
-        if not overwrite:
-            refuse_existing(self.target)
+        refuse_existing(self.target, overwrite)
         self._geojson, self._count = suffix == ".geojson", 0
         self._draft = Draft(self.target, overwrite=overwrite)
         if self._geojson:
@@ -65,9 +64,10 @@ class SegmentWriter:
         self._draft.publish()
 
     def _feature(self, segment: Segment) -> str:
+        ends = [[round(value, 4) for value in end] for end in (segment.start, segment.end)]
         feature = {
             "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": [_round(segment.start), _round(segment.end)]},
+            "geometry": {"type": "LineString", "coordinates": ends},
             "properties": {name: getattr(segment, name) for name in ("line", "segment", *_FIGURES)},
         }
         return (",\n" if self._count else "\n") + json.dumps(feature)
@@ -82,10 +82,6 @@ def _row(segment: Segment) -> str:
     values = [getattr(segment, name) for name in _FIGURES]
     texts = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
     return ",".join([str(segment.line), str(segment.segment), *ends, *texts]) + "\n"
-
-
-def _round(place: Sequence[float]) -> list[float]:
-    return [round(value, 4) for value in place]
 
 
 def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overwrite: bool = False) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.key_sums import HELD, KeyedSums
 from wavebatch.kernels.geometry.voxels import (
     Crossings,
@@ -65,7 +66,7 @@ def energy_unit(bits: int) -> float:
     return 2.0**-20 if bits <= 16 else 2.0**-8
 
 
-class VoxelGrid:
+class VoxelGrid(Closing):
     """Sums of the rays of a strip per voxel; a context manager, since large sums lie partly on disk.
 
     size: of the voxels [m]; faces lie at multiples of it. anchor: index of a voxel in the middle of the strip, counted
@@ -90,10 +91,8 @@ class VoxelGrid:
         self.unknown = 0
         """Rays with signal of unknown cross section."""
 
-    def __enter__(self) -> VoxelGrid:
-        return self
-
-    def __exit__(self, *error: object) -> None:
+    def close(self) -> None:
+        """Removes what lies on disk."""
         self._sums.close()
 
     @property

@@ -99,15 +99,9 @@ def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwri
     The centres are exact: coordinates count half voxels from the lower corner of the grid.
     """
     header = _build_header(space)
-    records = [
-        ExtraRecord.build(
-            column.name,
-            column.dtype,
-            column.meaning if column.unit == "-" else f"{column.meaning} [{column.unit}]",
-            no_data=column.no_data,
-        )
-        for column in space.columns
-    ]
+    texts = [one.meaning if one.unit == "-" else f"{one.meaning} [{one.unit}]" for one in space.columns]
+    columns = zip(space.columns, texts, strict=True)
+    records = [ExtraRecord.build(one.name, one.dtype, text, no_data=one.no_data) for one, text in columns]
     dtype = build_dtype(header.point_format, records)
     file = PointFile(target, header, dtype, records, overwrite=overwrite)
     number = 0

@@ -69,9 +69,9 @@ class Deconvolution:
         if self.method not in METHODS:
             raise ConfigError(f"method {self.method!r} is unknown; choose {', '.join(METHODS)}")
         if self.iterations is not None and (self.method not in ITERATIONS or not 1 <= self.iterations <= 10_000):
-            raise ConfigError("iterations are for methods richardson_lucy and gold, 1 to 10000")
+            raise ConfigError(f"--iterations {self.iterations}: give 1 to 10000; --method wiener has no --iterations")
         if self.snr is not None and (self.method != "wiener" or not 0 < self.snr < 1e9):
-            raise ConfigError("the signal-to-noise ratio is for method wiener, above 0")
+            raise ConfigError(f"--snr needs --method wiener and a number above 0, not {self.snr:g}")
         if not 0 <= self.threshold < 1e9:
             raise ConfigError("the threshold must not be below 0")
 

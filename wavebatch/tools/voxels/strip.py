@@ -6,6 +6,7 @@ output must not depend on block size, so nothing here may mix waveforms of a blo
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,8 +22,9 @@ from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
+from wavebatch.surveying import survey_blocks
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
@@ -94,16 +96,6 @@ class VoxelSummary:
     """Waveforms with signal of unknown cross section."""
 
 
-@dataclass(slots=True)
-class _Counts:
-    """Counts of waveforms, see VoxelSummary."""
-
-    waveforms: int = 0
-    with_signal: int = 0
-    anchored: int = 0
-    clipped: int = 0
-
-
 def voxelize_strip(
     strip: Path,
     target: Path,
@@ -128,15 +120,14 @@ def voxelize_strip(
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
-    if not overwrite:
-        refuse_existing(target)
+    refuse_existing(target, overwrite)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         pulse = _find_pulse(reader, scan, system, calibration)
         source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
         middle = _find_middle(reader, scan, options)
         ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
         with _open_grid(reader, middle, options, calibration is not None, held) as grid:
-            counts = _Counts()
+            counts: Counter[str] = Counter()
             for block in _read_blocks(reader, scan, block_size):
                 _add_block(grid, counts, source.fill(block), pulse, options, ceiling)
                 if progress is not None:
@@ -144,7 +135,7 @@ def voxelize_strip(
             meta = _describe(strip, options, pulse, calibration)
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             return VoxelSummary(
-                **asdict(counts),
+                **counts,
                 strip=str(strip),
                 output=str(target),
                 voxels=write_voxels(target, space, grid.pieces(), overwrite=overwrite),
@@ -168,7 +159,7 @@ def _find_pulse(
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
-    system = survey_sample(read_sample(reader, scan)).system if saved is None else saved.survey.system
+    system = survey_blocks(read_sample(reader, scan)).system if saved is None else saved.survey.system
     if calibration is None:
         return system
     system = calibration.apply(system)
@@ -228,8 +219,7 @@ def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, s
 
 def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iterator[WaveformBlock]:
     """Every packet of the strip once."""
-    for number in range(reader.unit_count()):
-        unit = reader.read_unit(number, scan)
+    for unit in reader.read_units(scan):
         longest = int(unit.packets.n_samples.max(initial=1))
         for block, _ in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
             yield block
@@ -237,7 +227,7 @@ def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iter
 
 def _add_block(
     grid: VoxelGrid,
-    counts: _Counts,
+    counts: Counter[str],
     block: WaveformBlock,
     pulse: SystemPulse,
     options: VoxelOptions,
@@ -251,10 +241,9 @@ def _add_block(
         system=pulse if pulse.calibration is not None else None,
     )
     grid.add(rays, block.spacing)
-    counts.waveforms += len(block)
-    counts.with_signal += int(profiles.seen.sum())
-    counts.anchored += int((profiles.seen & profiles.anchored).sum())
-    counts.clipped += int(profiles.clipped.sum())
+    anchored = int((profiles.seen & profiles.anchored).sum())
+    counts.update(with_signal=int(profiles.seen.sum()), anchored=anchored, clipped=int(profiles.clipped.sum()))
+    counts["waveforms"] += len(block)
 
 
 def _describe(

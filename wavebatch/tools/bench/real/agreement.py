@@ -9,7 +9,7 @@ import numpy as np
 
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.score import match_echoes
-from wavebatch.tools.bench.real.pool import Pool, Solver, SurveyOf
+from wavebatch.tools.bench.real.pool import Pool, Solver
 
 COMPARED = 4000
 """Packets that are decomposed with either survey."""
@@ -65,7 +65,7 @@ class Agreement:
     """The same of the widths."""
 
 
-def compare_parts(pool: Pool, whole: Solver, survey_of: SurveyOf, rng: np.random.Generator) -> list[Agreement]:
+def compare_parts(pool: Pool, whole: Solver, rng: np.random.Generator) -> list[Agreement]:
     """Agreement of the surveys of halves, tiles and shuffled waveforms; parts that are too small are left out.
 
     whole: of the whole strip, in its order, which the shuffled one is compared with.
@@ -74,9 +74,9 @@ def compare_parts(pool: Pool, whole: Solver, survey_of: SurveyOf, rng: np.random
     rows = []
     for name, *parts in _split(pool):
         if min(sum(map(len, part)) for part in parts) >= LEAST:
-            one, other = (Solver.of_blocks(part, survey_of) for part in parts)
+            one, other = (Solver.of_blocks(part) for part in parts)
             rows.append(compare_solvers(name, one, other, packets))
-    shuffled = Solver.of_blocks(_shuffle(pool, rng), survey_of)
+    shuffled = Solver.of_blocks(_shuffle(pool, rng))
     return [*rows, compare_solvers("in order/shuffled", whole, shuffled, packets)]
 
 
@@ -119,14 +119,6 @@ def compare_solvers(name: str, one: Solver, other: Solver, packets: Sequence[Wav
         left, right = second.take(match.found), first.take(match.truth)
         columns.append((left.time - right.time, left.amplitude / right.amplitude, left.sigma / right.sigma))
     step, amplitude, width = (np.concatenate(column).astype(np.float64) for column in zip(*columns, strict=True))
-    found = len(step) > 0
-    return Agreement(
-        name,
-        (Pulse.of(one), Pulse.of(other)),
-        total,
-        differ / max(total, 1),
-        float(np.median(step)) if found else float("nan"),
-        float(np.median(np.abs(step))) if found else float("nan"),
-        float(np.median(amplitude)) if found else float("nan"),
-        float(np.median(width)) if found else float("nan"),
-    )
+    every = (step, np.abs(step), amplitude, width)
+    medians = [float(np.median(values)) if len(values) else float("nan") for values in every]
+    return Agreement(name, (Pulse.of(one), Pulse.of(other)), total, differ / max(total, 1), *medians)

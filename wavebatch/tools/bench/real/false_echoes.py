@@ -13,7 +13,7 @@ from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.inject import TOLERANCE
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_fill
 from wavebatch.tools.bench.real.templates import bare_block
 
 STRONG = 8.0
@@ -73,7 +73,9 @@ def count_false(
     for block, table in zip(pool.blocks, echoes, strict=True):
         new = _mirror(block, table, solver, noise, rng)
         first, last = _signal_span(block, table, noise.std)
-        alone = _apart(new, table, len(block)) > NEAR * solver.fwhm
+        alone = np.ones(len(new), bool)
+        for have, echo in each_echo(table, new.waveform):
+            alone[have] &= np.abs(new.time[have] - table.time[echo]) > NEAR * solver.fwhm
         length += block.samples.size * block.spacing
         found += len(table)
         near, far = near + int((~alone).sum()), far + int(alone.sum())
@@ -116,17 +118,6 @@ def _signal_span(block: WaveformBlock, table: EchoTable, noise: float) -> tuple[
     np.minimum.at(first, waveform, time)
     np.maximum.at(last, waveform, time)
     return first, last
-
-
-def _apart(new: EchoTable, table: EchoTable, n: int) -> np.ndarray:
-    """Distance of each new echo from the nearest echo of its waveform [ns]."""
-    apart = np.full(len(new), np.inf)
-    count = table.count(n)
-    first = np.cumsum(count) - count
-    for order in range(int(count.max(initial=0))):
-        have = np.flatnonzero(count[new.waveform] > order)
-        apart[have] = np.minimum(apart[have], np.abs(new.time[have] - table.time[first[new.waveform[have]] + order]))
-    return apart
 
 
 def _count_stretches(

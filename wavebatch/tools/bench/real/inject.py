@@ -1,4 +1,7 @@
-"""Echoes of known time, amplitude and width, added to the waveforms of a strip."""
+"""Echoes of known time, amplitude and width, added to the waveforms of a strip.
+
+They lie at random places: in quiet stretches, or near the strongest echo of a waveform.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,11 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.strip.shared_packets import expand
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.score import match_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, unround
-from wavebatch.tools.bench.real.places import Places, find_places
-from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import ROWS, Pool, Solver, each_echo, find_fill, find_strongest
 from wavebatch.tools.bench.real.templates import Template, bare_block, digitizer_kind
 
 LEAST = 2.5
@@ -27,6 +30,33 @@ CLIPPED_INJECTED, MOST_CLIPPED = 0.1, 1.5
 
 TOLERANCE = 0.6
 """A found echo this near is the injected one [FWHM]."""
+
+QUIET = 4.0
+"""An injected echo this far from every echo of its waveform lies in a quiet stretch [FWHM of the system pulse]."""
+
+NEAREST, FARTHEST = 0.5, 4.0
+"""Separations from the strongest echo that are tried, before and after it [FWHM]."""
+
+EDGE = 1.5
+"""Least distance of an injected echo from the ends of its waveform [FWHM]."""
+
+TRIES = 24
+"""Places that are tried for an echo in a waveform before another waveform is taken."""
+
+HOST = 10.0
+"""Least amplitude of the strongest echo of a waveform near which one is injected [noise standard deviations]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Where echoes are injected into a block."""
+
+    row: np.ndarray
+    """Of the block, i8 (k,)."""
+    time: np.ndarray
+    """[ns], f8 (k,)."""
+    strongest: np.ndarray
+    """Row in the table of echoes of the strongest echo of the waveform; -1 for quiet stretches."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,10 +84,6 @@ class Injected:
 
     def __len__(self) -> int:
         return len(self.near)
-
-    def take(self, rows: np.ndarray) -> Injected:
-        """The echoes at `rows`."""
-        return Injected(*(getattr(self, name)[rows] for name in self.__slots__))
 
     @classmethod
     def join(cls, parts: Sequence[Injected]) -> Injected:
@@ -88,7 +114,7 @@ def inject_echoes(
         for near in (False, True):
             for begin in range(0, max(share // 2, 1), ROWS):
                 wanted = min(ROWS, max(share // 2, 1) - begin)
-                places = find_places(block, table, solver, noise.std, wanted, near, rng)
+                places = _find_places(block, table, solver, noise.std, wanted, near, rng)
                 if len(places.row):
                     parts.append(_inject(block, table, solver, usable, noise, places, rng))
     return Injected.join(parts) if parts else _nothing()
@@ -97,6 +123,65 @@ def inject_echoes(
 def _nothing() -> Injected:
     none = np.empty(0)
     return Injected(none > 0, none, none, none, none > 0, none > 0, none, np.empty((0, 3)), np.empty((0, 3)))
+
+
+def _find_places(
+    block: WaveformBlock,
+    table: EchoTable,
+    solver: Solver,
+    noise: float,
+    wanted: int,
+    near: bool,
+    rng: np.random.Generator,
+) -> Places:
+    """Random places that meet the rules; fewer than wanted where the strip has no room."""
+    fwhm, end = solver.fwhm, (block.samples.shape[1] - 1) * block.spacing
+    strongest = find_strongest(table, len(block))
+    hosts = np.arange(len(block))
+    if near:
+        strong = np.where(strongest >= 0, table.amplitude[strongest] if len(table) else 0.0, 0.0)
+        hosts = np.flatnonzero(strong > HOST * noise)
+    if not len(hosts) or end <= 2 * EDGE * fwhm:
+        return Places(*(np.empty(0, np.int64),) * 3)
+    row = np.repeat(rng.choice(hosts, wanted), TRIES)
+    if near:
+        # As many at each ratio of separations: the narrow ones matter most.
+        apart = np.exp(rng.uniform(np.log(NEAREST), np.log(FARTHEST), len(row))) * rng.choice((-1, 1), len(row))
+        time = table.time[strongest[row]] + apart * fwhm
+    else:
+        time = rng.uniform(EDGE * fwhm, end - EDGE * fwhm, len(row))
+    good = (time >= EDGE * fwhm) & (time <= end - EDGE * fwhm)
+    good &= _is_clear(table, row, time, fwhm, strongest if near else None)
+    good &= ~_touches_fill(block, row, time, fwhm)
+    tries = good.reshape(wanted, TRIES)
+    done = np.flatnonzero(tries.any(axis=1))
+    chosen = done * TRIES + tries[done].argmax(axis=1)
+    owner = strongest[row[chosen]] if near else np.full(len(chosen), -1)
+    return Places(row[chosen], time[chosen], owner)
+
+
+def _is_clear(
+    table: EchoTable, row: np.ndarray, time: np.ndarray, fwhm: float, strongest: np.ndarray | None
+) -> np.ndarray:
+    """Whether no echo of the waveform is near; the strongest may be, and others of it further off then."""
+    clear = np.ones(len(row), bool)
+    for have, echo in each_echo(table, row):
+        apart = np.abs(time[have] - table.time[echo]) / fwhm
+        limit = QUIET if strongest is None else np.where(strongest[row[have]] == echo, 0.0, 0.5 * QUIET)
+        clear[have] &= apart >= limit
+    return clear
+
+
+def _touches_fill(block: WaveformBlock, row: np.ndarray, time: np.ndarray, fwhm: float) -> np.ndarray:
+    """Whether a gap between two recordings lies under the echo or next to it."""
+    fill = find_fill(block.samples)
+    if not fill.any():
+        return np.zeros(len(row), bool)
+    before = np.concatenate([np.zeros((len(fill), 1), np.int64), np.cumsum(fill, axis=1)], axis=1)
+    s = fill.shape[1]
+    low = np.clip(np.floor((time - EDGE * fwhm) / block.spacing), 0, s).astype(int)
+    high = np.clip(np.ceil((time + EDGE * fwhm) / block.spacing) + 1, 0, s).astype(int)
+    return before[row, high] > before[row, low]
 
 
 def _inject(
@@ -200,8 +285,7 @@ def _list_truth(table: EchoTable, places: Places, true: np.ndarray) -> tuple[Ech
     count = np.bincount(table.waveform, minlength=int(places.row.max(initial=0)) + 1)
     first = np.cumsum(count) - count
     number = count[places.row]
-    copy = np.repeat(np.arange(k), number)
-    old = np.repeat(first[places.row] - (np.cumsum(number) - number), number) + np.arange(len(copy))
+    copy, old = np.repeat(np.arange(k), number), expand(first[places.row], number)
     is_new = np.repeat((False, True), (len(copy), k))
     is_host = np.r_[places.strongest[copy] == old, np.zeros(k, bool)]
     before = np.stack([table.time, table.amplitude, table.sigma], axis=1)[old]

@@ -1,38 +1,91 @@
-"""`measure_real`: everything that `wavebatch bench --real` reports about one strip."""
+"""`measure_real`: everything that `wavebatch bench --real` reports about one strip.
+
+The tables of injected echoes are made here: the share that is found, and how right the reported errors are.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import InputError
-from wavebatch.surveying import survey_blocks
 from wavebatch.tools.bench.real.agreement import Agreement, Pulse, compare_parts
 from wavebatch.tools.bench.real.false_echoes import FalseEchoes, count_false
 from wavebatch.tools.bench.real.inject import Injected, inject_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise
-from wavebatch.tools.bench.real.pool import Pool, Solver, SurveyOf, read_pool
-from wavebatch.tools.bench.real.recall import (
-    COUNTS,
-    SIGMAS,
-    Calibration,
-    Class,
-    calibrate,
-    count_classes,
-    count_separations,
-)
-from wavebatch.tools.bench.real.templates import Template, TemplateSummary, learn_templates, summarize
+from wavebatch.tools.bench.real.pool import Solver, read_pool
+from wavebatch.tools.bench.real.templates import TemplateSummary, learn_templates, summarize
 
 INJECTIONS = 8000
 
+SIGMAS = (3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 20.0, 40.0, 80.0)
+"""Borders of amplitude classes [noise standard deviations]."""
+
+COUNTS = (2.0, 3.0, 4.0, 6.0, 9.0, 15.0, 30.0, 60.0, 120.0, 240.0)
+"""Borders of amplitude classes [DN]."""
+
+APART = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 3.0, 4.0)
+"""Borders of the classes of separation [FWHM]."""
+
+NEAR_SIGMAS = (5.0, 10.0, 20.0, 40.0)
+"""Borders of amplitude classes near other echoes [noise standard deviations]."""
+
+CALIBRATED = (8.0, 15.0, 30.0, 60.0)
+"""Borders of amplitude classes of the reported errors: weaker echoes are found or not by their error."""
+
+RESOLVED = 1.5
+"""Separation from which errors near other echoes are looked at [FWHM]."""
+
+GROSS = 5.0
+"""Errors of more reported standard deviations are counted, and left out of the root mean square."""
+
 SPLIT = 20.0
 """Injected echoes from here on [noise standard deviations] that are found as several count as split."""
+
+
+@dataclass(frozen=True, slots=True)
+class Class:
+    """Injected echoes of one class of amplitude, and one of separation where it is set."""
+
+    low: float
+    high: float
+    injected: int
+    found: int
+    extra: int
+    """Echoes found in their waveforms that neither were there before nor were injected."""
+    apart: tuple[float, float] | None = None
+    """Separation from the strongest echo [FWHM]."""
+
+    @property
+    def recall(self) -> float:
+        """Share that is found; NaN without any."""
+        return self.found / self.injected if self.injected else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Errors of found echoes against what the chain reports; per quantity time, amplitude, sigma."""
+
+    where: str
+    low: float
+    high: float
+    """Amplitudes [noise standard deviations]."""
+    echoes: int
+    ratio: tuple[float, float, float]
+    """Root mean square of error / reported error, without gross ones."""
+    bias: tuple[float, float, float]
+    """Median error [ns, DN, ns]."""
+    scatter: tuple[float, float, float]
+    """Half the width of the central 68 % of the errors [ns, DN, ns]."""
+    gross: float
+    """Share with an error of more than 5 reported ones in any quantity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +111,6 @@ class RealReport:
     agreement: list[Agreement]
     seconds: dict[str, float]
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain numbers, lists and dictionaries."""
-        return asdict(self)
-
 
 def measure_real(
     path: Path | str,
@@ -70,8 +119,6 @@ def measure_real(
     injections: int = INJECTIONS,
     waveforms: int | None = None,
     stability: bool = True,
-    survey_of: SurveyOf = survey_blocks,
-    solver: Solver | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> RealReport:
     """Injects echoes into a strip's waveforms, counts false ones, and compares surveys of its parts.
@@ -83,8 +130,6 @@ def measure_real(
     injections : number of echoes to inject, about; half in quiet stretches, half near strong echoes.
     waveforms : how many to read, spread over the strip; None: twice as many as a survey looks at.
     stability : also survey halves, tiles and shuffled waveforms, which takes seven more surveys.
-    survey_of : makes a survey from a list of blocks: another one than the program's, for experiments.
-    solver : survey and chain to use in place of those that the strip gives.
     say : gets a line for each step.
 
     Raises
@@ -93,52 +138,31 @@ def measure_real(
         Where the strip cannot be read or has too few clear echoes.
     """
     seconds: dict[str, float] = {}
-    clock = _Clock(seconds, say)
+    begin = time.process_time()
+
+    def note(step: str, text: str) -> None:
+        seconds[step] = time.process_time() - begin - sum(seconds.values())
+        say(f"{pool.path.name}: {text}")
+
     pool = read_pool(path, waveforms)
     if not len(pool):
         raise InputError(f"{path}: holds no waveform to measure; `wavebatch check` says what it holds")
-    clock.note("read", f"{pool.path.name}: {len(pool)} waveforms read")
-    solver = solver or Solver.of_blocks(pool.surveyed, survey_of)
-    clock.note("survey", f"{pool.path.name}: surveyed")
+    note("read", f"{len(pool)} waveforms read")
+    solver = Solver.of_blocks(pool.surveyed)
+    note("survey", "surveyed")
     echoes = [solver.run(block) for block in pool.blocks]
     noise = measure_noise(pool, solver, echoes)
-    templates = learn_templates(pool, solver, echoes, noise.std, np.random.default_rng((seed, 0)))
-    injected = inject_echoes(pool, solver, echoes, templates, noise, injections, np.random.default_rng((seed, 1)))
-    clock.note("inject", f"{pool.path.name}: {len(injected)} echoes injected")
-    false = count_false(pool, solver, echoes, noise, np.random.default_rng((seed, 2)))
-    clock.note("false", f"{pool.path.name}: residuals mirrored")
-    agreement = compare_parts(pool, solver, survey_of, np.random.default_rng((seed, 3))) if stability else []
-    clock.note("stability", f"{pool.path.name}: parts surveyed")
-    return _collect(pool, seed, solver, echoes, noise, templates, injected, false, agreement, seconds)
-
-
-class _Clock:
-    """Notes how long each step took."""
-
-    def __init__(self, seconds: dict[str, float], say: Callable[[str], None]) -> None:
-        self._seconds, self._say, self._last = seconds, say, time.process_time()
-
-    def note(self, step: str, text: str) -> None:
-        now = time.process_time()
-        self._seconds[step], self._last = now - self._last, now
-        self._say(text)
-
-
-def _collect(
-    pool: Pool,
-    seed: int,
-    solver: Solver,
-    echoes: Sequence[EchoTable],
-    noise: QuietNoise,
-    templates: Sequence[Template],
-    injected: Injected,
-    false: FalseEchoes,
-    agreement: list[Agreement],
-    seconds: dict[str, float],
-) -> RealReport:
+    draw = [np.random.default_rng((seed, number)) for number in range(4)]
+    templates = learn_templates(pool, solver, echoes, noise.std, draw[0])
+    injected = inject_echoes(pool, solver, echoes, templates, noise, injections, draw[1])
+    note("inject", f"{len(injected)} echoes injected")
+    false = count_false(pool, solver, echoes, noise, draw[2])
+    note("false", "residuals mirrored")
+    agreement = compare_parts(pool, solver, draw[3]) if stability else []
+    note("stability", "parts surveyed")
     quiet = ~injected.near & ~injected.clipped
-    strong = count_classes(injected, noise.std, (SPLIT,), quiet)
-    clipped = count_classes(injected, noise.std, (SPLIT,), ~injected.near & injected.clipped)
+    strong = _count_classes(injected, noise.std, (SPLIT,), quiet)
+    clipped = _count_classes(injected, noise.std, (SPLIT,), ~injected.near & injected.clipped)
     return RealReport(
         strip=pool.path.name,
         seed=seed,
@@ -147,13 +171,68 @@ def _collect(
         survey=Pulse.of(solver),
         noise=noise,
         templates=summarize(templates),
-        quiet_by_sigma=count_classes(injected, noise.std, SIGMAS, quiet),
-        quiet_by_count=count_classes(injected, 1.0, COUNTS, quiet),
-        near_by_separation=count_separations(injected, noise.std),
+        quiet_by_sigma=_count_classes(injected, noise.std, SIGMAS, quiet),
+        quiet_by_count=_count_classes(injected, 1.0, COUNTS, quiet),
+        near_by_separation=_count_separations(injected, noise.std),
         split=strong[0] if strong else None,
         clipped=clipped[0] if clipped else None,
-        calibration=calibrate(injected, noise.std),
+        calibration=_calibrate(injected, noise.std),
         false_echoes=false,
         agreement=agreement,
         seconds=seconds,
     )
+
+
+def between(borders: Sequence[float]) -> list[tuple[float, float]]:
+    """The classes between borders, and the one above the last."""
+    return list(pairwise((*borders, math.inf)))
+
+
+def _count(injected: Injected, part: np.ndarray, low: float, high: float, **more: Any) -> Class:
+    """The class of the echoes at `part` (mask)."""
+    found, extra = int(injected.found[part].sum()), int(injected.extra[part].sum())
+    return Class(low, high, int(part.sum()), found, extra, **more)
+
+
+def _count_classes(injected: Injected, unit: float, borders: Sequence[float], where: np.ndarray) -> list[Class]:
+    """Classes of amplitude / unit of the echoes at `where` (mask)."""
+    size = injected.amplitude / unit
+    classes = [_count(injected, where & (size >= a) & (size < b), a, b) for a, b in between(borders)]
+    return [row for row in classes if row.injected]
+
+
+def _count_separations(injected: Injected, noise: float) -> list[Class]:
+    """Recall near the strongest echoes by separation, before and after them, and amplitude."""
+    rows = []
+    size = injected.amplitude / noise
+    for side, (near, far) in product((-1.0, 1.0), pairwise(APART)):
+        apart = side * injected.separation
+        inside = injected.near & (apart >= near) & (apart < far)
+        for low, high in between(NEAR_SIGMAS):
+            part = inside & (size >= low) & (size < high)
+            rows.append(_count(injected, part, low, high, apart=(side * near, side * far)))
+    return rows
+
+
+def _calibrate(injected: Injected, noise: float) -> list[Calibration]:
+    """Errors in quiet stretches by amplitude, and near other echoes from a separation that fits can tell apart."""
+    clean = injected.found & ~injected.clipped & (injected.extra <= 0)
+    whole = (CALIBRATED[0], math.inf)
+    classes = [("quiet", *span, clean & ~injected.near) for span in (*between(CALIBRATED), whole)]
+    classes.append(("near", *whole, clean & injected.near & (np.abs(injected.separation) >= RESOLVED)))
+    size = injected.amplitude / noise
+    rows = [_measure_errors(*row[:3], injected, row[3] & (size >= row[1]) & (size < row[2])) for row in classes]
+    return [row for row in rows if row.echoes >= 10]
+
+
+def _measure_errors(where: str, low: float, high: float, injected: Injected, part: np.ndarray) -> Calibration:
+    errors, reported = injected.errors[part], injected.reported[part]
+    known = (np.isfinite(reported) & (reported > 0)).all(axis=1)
+    errors, scaled = errors[known], errors[known] / reported[known]
+    gross = (np.abs(scaled) > GROSS).any(axis=1)
+    if gross.all():
+        return Calibration(where, low, high, 0, *((float("nan"),) * 3,) * 3, 0.0)
+    ratio = np.sqrt(np.mean(scaled[~gross] ** 2, axis=0))
+    lower, middle, upper = np.quantile(errors[~gross], [0.1587, 0.5, 0.8413], axis=0)
+    figures = (tuple(map(float, values)) for values in (ratio, middle, 0.5 * (upper - lower)))
+    return Calibration(where, low, high, len(errors), *figures, float(gross.mean()))

@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, each_echo, find_fill
 
 LAGS = 4
 """Lags at which the covariance is measured [samples]; beyond them it counts as none."""
@@ -100,11 +100,8 @@ def _find_quiet(block: WaveformBlock, table: EchoTable, sigma: float) -> np.ndar
     """Recorded samples far from every echo, bool (n, s)."""
     quiet = ~find_fill(block.samples)
     time = np.arange(block.samples.shape[1]) * block.spacing
-    count = table.count(len(block))
-    first = np.cumsum(count) - count
-    for order in range(int(count.max(initial=0))):
-        rows = np.flatnonzero(count > order)
-        lag = (time - table.time[first[rows] + order][:, None]) / sigma
+    for rows, echo in each_echo(table, np.arange(len(block))):
+        lag = (time - table.time[echo][:, None]) / sigma
         quiet[rows] &= (lag < -QUIET_BEFORE) | (lag > QUIET_AFTER)
     return quiet
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
-from wavebatch.core.waveforms import ReturnTable, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
@@ -22,8 +22,6 @@ from wavebatch.surveying.choose_chain import sample_size
 ROWS = 8192
 """Waveforms that a chain gets at a time."""
 
-SurveyOf = Callable[[Sequence[WaveformBlock]], Survey]
-
 
 @dataclass(frozen=True, slots=True)
 class Solver:
@@ -33,9 +31,9 @@ class Solver:
     chain: Chain
 
     @classmethod
-    def of_blocks(cls, blocks: Sequence[WaveformBlock], survey_of: SurveyOf = survey_blocks) -> Solver:
+    def of_blocks(cls, blocks: Sequence[WaveformBlock]) -> Solver:
         """The survey of `blocks`; its chain stops after the fits, because positions are not needed here."""
-        survey = survey_of(blocks)
+        survey = survey_blocks(blocks)
         chain = choose_chain(survey)
         return cls(survey, Chain(chain.steps[:3], chain.name))
 
@@ -104,6 +102,23 @@ class Pool:
         return self.take([place % step == 0 for place in self.places])
 
 
+def each_echo(table: EchoTable, row: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """First echo, second echo ... of the waveforms `row` (k,): which of `row` have it, and its row in the table."""
+    count = np.bincount(table.waveform, minlength=int(row.max(initial=0)) + 1)
+    first = np.cumsum(count) - count
+    for order in range(int(count.max(initial=0))):
+        have = np.flatnonzero(count[row] > order)
+        yield have, first[row[have]] + order
+
+
+def find_strongest(table: EchoTable, n: int) -> np.ndarray:
+    """Row of the strongest echo of each of n waveforms, -1 without any."""
+    strongest = np.full(n, -1)
+    order = np.lexsort((table.amplitude, table.waveform))
+    strongest[table.waveform[order]] = order
+    return strongest
+
+
 def read_pool(path: Path | str, waveforms: int | None = None) -> Pool:
     """Waveforms of a strip, without their empty part at the end; the same ones every time.
 
@@ -122,26 +137,7 @@ def _join_alike(blocks: Iterable[WaveformBlock]) -> Iterator[WaveformBlock]:
     for block in blocks:
         groups.setdefault((block.digitizer.index, block.samples.shape[1]), []).append(block)
     for _, group in sorted(groups.items()):
-        yield join_blocks(group)
-
-
-def join_blocks(blocks: Sequence[WaveformBlock]) -> WaveformBlock:
-    """Blocks of one digitizer and one length as a single one."""
-    if len(blocks) == 1:
-        return blocks[0]
-    names = ("samples", "point", "gps_time", "origin", "direction")
-    arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
-    arrays["samples"].flags.writeable = False
-    return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None)
-
-
-def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
-    if any(block.returns is None for block in blocks):
-        return None
-    starts = np.cumsum([0, *(len(block) for block in blocks[:-1])])
-    waveform = [block.returns.waveform + start for block, start in zip(blocks, starts, strict=True)]
-    others = [np.concatenate([getattr(b.returns, name) for b in blocks]) for name in ("time", "point", "xyz")]
-    return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
+        yield WaveformBlock.concatenate(group)
 
 
 def find_fill(samples: np.ndarray, shortest: int = 12, gap: int = 3) -> np.ndarray:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.disk.publish import reporting
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.bench.plot import can_plot
+from wavebatch.tools.bench.plot import NO_PLOT, can_plot
 from wavebatch.tools.bench.real.agreement import Agreement
-from wavebatch.tools.bench.real.measure import RealReport
-from wavebatch.tools.bench.real.recall import APART, NEAR_SIGMAS, Calibration, Class
-from wavebatch.tools.bench.report import align
+from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
+from wavebatch.tools.bench.report import align, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,62 +37,49 @@ def format_report(report: RealReport) -> str:
     """All tables of a strip; `!` marks figures that miss their goal."""
     survey, noise, templates = report.survey, report.noise, report.templates
     correlation = " ".join(f"{value:.2f}" for value in noise.correlation) or "unknown"
-    lines = [
+    head = [
         f"== {report.strip}: {report.waveforms} waveforms, {report.echoes} echoes, seed {report.seed}; ! misses a goal",
         f"survey: FWHM {survey.fwhm:.3f} ns, noise {survey.noise:.2f} DN, {survey.model}, acceptance "
         f"{survey.acceptance:g}, digitizers that record otherwise: {survey.digitizers}",
         f"quiet samples: noise {noise.std:.2f} DN ({noise.samples} samples), correlation {correlation}",
         f"templates: {templates.templates} of {templates.echoes} clear echoes, FWHM {templates.fwhm:.3f} ns; the chain "
         f"finds {templates.gain:.4f} of their amplitude and {templates.widened:.4f} of their width",
-        "",
-        *_recall_table("in quiet stretches, noise std", report.quiet_by_sigma),
-        "",
-        *_recall_table("in quiet stretches, DN", report.quiet_by_count),
-        "",
-        *_separation_table(report.near_by_separation),
-        "",
-        *_describe_splits(report),
-        *_describe_false(report),
-        "",
-        *_calibration_table(report.calibration),
+    ]
+    parts = [
+        head,
+        _recall_table("in quiet stretches, noise std", report.quiet_by_sigma),
+        _recall_table("in quiet stretches, DN", report.quiet_by_count),
+        _separation_table(report.near_by_separation),
+        [*_describe_splits(report), *_describe_false(report)],
+        _calibration_table(report.calibration),
     ]
     if report.agreement:
-        lines += ["", *_agreement_table(report.agreement)]
-    return "\n".join(lines)
+        parts.append(_agreement_table(report.agreement))
+    return "\n\n".join(map("\n".join, parts))
 
 
 def _span(low: float, high: float) -> str:
     return f"{low:g}.." if math.isinf(high) else f"{low:g}-{high:g}"
 
 
-def _share(row: Class) -> str:
-    return f"{100 * row.recall:.1f}" if row.injected else "-"
-
-
 def _recall_table(title: str, rows: Sequence[Class]) -> list[str]:
     return align([
         [title, *(_span(row.low, row.high) for row in rows)],
         ["injected", *(str(row.injected) for row in rows)],
-        ["found %", *map(_share, rows)],
+        ["found %", *(f"{100 * row.recall:.1f}" for row in rows)],
     ])  # fmt: skip
 
 
 def _separation_table(rows: Sequence[Class]) -> list[str]:
     """A line per separation, before and after the strongest echo."""
     cells = {(row.low, row.apart): row for row in rows}
-    spans = [_span(low, high) for low, high in zip(NEAR_SIGMAS, (*NEAR_SIGMAS[1:], math.inf), strict=True)]
+    spans = [_span(low, high) for low, high in between(NEAR_SIGMAS)]
     heads = [f"{side} {span}" for side in ("before", "after") for span in spans]
     lines = [["found % near the strongest echo, FWHM", *heads]]
-    for near, far in zip(APART[:-1], APART[1:], strict=True):
-        row = [_span(near, far)]
-        for side in (-1.0, 1.0):
-            row += [_share_of(cells.get((low, (side * near, side * far)))) for low in NEAR_SIGMAS]
-        lines.append(row)
+    for near, far in pairwise(APART):
+        row = [cells[low, (side * near, side * far)] for side in (-1.0, 1.0) for low in NEAR_SIGMAS]
+        lines.append([_span(near, far), *(f"{100 * c.recall:.0f}" if c.injected >= LEAST_SHOWN else "-" for c in row)])
     return align(lines)
-
-
-def _share_of(row: Class | None) -> str:
-    return "-" if row is None or row.injected < LEAST_SHOWN else f"{100 * row.recall:.0f}"
 
 
 def _describe_splits(report: RealReport) -> list[str]:
@@ -119,20 +106,16 @@ def _describe_false(report: RealReport) -> list[str]:
             rate = part.echoes / part.length
             lines.append(
                 f"signal-free stretches {name} all signal: {part.echoes} echoes in {part.length:.0f} ns, {rate:.1e} "
-                f"per ns{_mark(rate >= MOST_FALSE)}; with mirrored residuals {part.mirrored}"
+                f"per ns{'!' * (rate >= MOST_FALSE)}; with mirrored residuals {part.mirrored}"
             )
     return lines
-
-
-def _mark(missed: bool) -> str:
-    return "!" if missed else ""
 
 
 def _calibration_table(rows: Sequence[Calibration]) -> list[str]:
     heads = ["time", "amplitude", "width", "bias ns", "DN", "ns", "scatter ns", "DN", "ns", "gross %"]
     lines = [["error / reported error, noise std", "echoes", *heads]]
     for row in rows:
-        ratio = [f"{value:.3f}{_mark(not RATIOS[0] <= value <= RATIOS[1])}" for value in row.ratio]
+        ratio = [f"{value:.3f}{'!' * (not RATIOS[0] <= value <= RATIOS[1])}" for value in row.ratio]
         bias = [f"{value:+.3f}" for value in row.bias]
         scatter = [f"{value:.3f}" for value in row.scatter]
         name = f"{row.where} {_span(row.low, row.high)}"
@@ -151,10 +134,10 @@ def _agreement_table(rows: Sequence[Agreement]) -> list[str]:
             f"{one.fwhm:.3f}/{other.fwhm:.3f}",
             f"{one.noise:.2f}/{other.noise:.2f}",
             one.model if one.model == other.model else f"{one.model}/{other.model}",
-            f"{100 * row.differ:.2f}{_mark(row.differ >= MOST_DIFFER)}",
-            f"{row.offset:+.4f}{_mark(abs(row.offset) >= MOST_OFFSET)}",
-            f"{row.apart:.4f}{_mark(row.apart >= MOST_OFFSET)}",
-            f"{row.amplitude_ratio:.4f}{_mark(abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
+            f"{100 * row.differ:.2f}{'!' * (row.differ >= MOST_DIFFER)}",
+            f"{row.offset:+.4f}{'!' * (abs(row.offset) >= MOST_OFFSET)}",
+            f"{row.apart:.4f}{'!' * (row.apart >= MOST_OFFSET)}",
+            f"{row.amplitude_ratio:.4f}{'!' * (abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
             f"{row.width_ratio:.4f}",
         ])  # fmt: skip
     return align(lines)
@@ -166,20 +149,12 @@ def write_report(report: RealReport, folder: Path) -> str:
     Raises InputError where it cannot write.
     """
     stem = f"real-{Path(report.strip).stem}"
-    with reporting(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{stem}.json").write_text(to_text(report.to_json()) + "\n", "utf-8")
-        (folder / f"{stem}.txt").write_text(format_report(report) + "\n", "utf-8")
-    names = [f"{stem}.json", f"{stem}.txt"]
+    document = json.dumps(without_nan(asdict(report)), indent=1, sort_keys=True, allow_nan=False)
+    written = write_texts(folder, {f"{stem}.json": document, f"{stem}.txt": format_report(report)})
     if not can_plot():
-        return f"{folder}: {', '.join(names)}; no plot without matplotlib: pip install 'wavebatch[plot]'"
+        return f"{written}; {NO_PLOT}"
     draw_report(report, folder / f"{stem}.png")
-    return f"{folder}: {', '.join([*names, f'{stem}.png'])}"
-
-
-def to_text(document: Mapping[str, Any]) -> str:
-    """JSON with sorted keys; null for what is no number."""
-    return json.dumps(without_nan(document), indent=1, sort_keys=True, allow_nan=False)
+    return f"{written}, {stem}.png"
 
 
 def draw_report(report: RealReport, target: Path) -> None:
@@ -208,7 +183,7 @@ def _name_classes(axes: Axes, rows: Sequence[Class | Calibration]) -> None:
 
 
 def _draw_separations(axes: Axes, rows: Sequence[Class]) -> None:
-    for low, high in zip(NEAR_SIGMAS, (*NEAR_SIGMAS[1:], math.inf), strict=True):
+    for low, high in between(NEAR_SIGMAS):
         part = [row for row in rows if row.low == low and row.injected >= LEAST_SHOWN]
         points = sorted((0.5 * sum(row.apart), 100 * row.recall) for row in part)
         axes.plot([x for x, _ in points], [y for _, y in points], "o-", markersize=3, label=_span(low, high))

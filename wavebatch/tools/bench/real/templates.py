@@ -6,8 +6,9 @@ sub-sample phases can be shifted by any delay without interpolation errors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline, make_lsq_spline
@@ -17,7 +18,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill, find_strongest
 
 BEFORE, AFTER = 4.5, 12.5
 """What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""
@@ -100,14 +101,13 @@ class TemplateSummary:
     """Width that it finds, over that of the curve."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Donors:
-    """Clear echoes of digitizers that record alike; samples one after the other."""
+class _Donor(NamedTuple):
+    """A clear echo: times after it, samples over its amplitude, its width and its amplitude."""
 
-    lag: list[np.ndarray]
-    value: list[np.ndarray]
-    sigma: list[float]
-    amplitude: list[float]
+    lag: np.ndarray
+    value: np.ndarray
+    sigma: float
+    amplitude: float
 
 
 def digitizer_kind(block: WaveformBlock) -> tuple:
@@ -124,15 +124,13 @@ def learn_templates(
     echoes: of the pool's blocks. noise: standard deviation of a quiet sample [DN]. Raises InputError where there are
     too few clear echoes.
     """
-    kinds: dict[tuple, _Donors] = {}
-    number = 0
+    kinds: dict[tuple, list[_Donor]] = {}
     for block, table in zip(pool.blocks, echoes, strict=True):
-        donors = kinds.setdefault(digitizer_kind(block), _Donors([], [], [], []))
-        number += _collect(donors, block, table, solver, noise)
-    most = max(len(donors.sigma) for donors in kinds.values()) if kinds else 0
-    if most < LEAST_ECHOES:
+        kinds.setdefault(digitizer_kind(block), []).extend(_find_donors(block, table, solver, noise))
+    numbers = [len(donors) for donors in kinds.values()]
+    if max(numbers, default=0) < LEAST_ECHOES:
         raise InputError(
-            f"{pool.path}: {number} clear single echoes in {len(pool)} waveforms are too few to inject from; "
+            f"{pool.path}: {sum(numbers)} clear single echoes in {len(pool)} waveforms are too few to inject from; "
             f"at least {LEAST_ECHOES} of one digitizer are needed: name a larger strip"
         )
     templates = []
@@ -143,15 +141,14 @@ def learn_templates(
     return templates
 
 
-def _collect(donors: _Donors, block: WaveformBlock, table: EchoTable, solver: Solver, noise: float) -> int:
-    """Adds the clear echoes of a block; how many there are."""
+def _find_donors(block: WaveformBlock, table: EchoTable, solver: Solver, noise: float) -> Iterator[_Donor]:
+    """The clear echoes of a block."""
     sigma, spacing, s = solver.system.sigma_ref, block.spacing, block.samples.shape[1]
     fill = find_fill(block.samples)
     limit = clip_level(block, solver.system.of(block))
     time = np.arange(s) * spacing
     rows = find_clear(table, solver, noise)
     rows = rows[(table.time[rows] > BEFORE * sigma) & (table.time[rows] < time[-1] - 0.4 * AFTER * sigma)]
-    added = 0
     for row in rows:
         lag = time - table.time[row]
         near = (lag > -BEFORE * sigma) & (lag < AFTER * sigma)
@@ -161,12 +158,8 @@ def _collect(donors: _Donors, block: WaveformBlock, table: EchoTable, solver: So
             continue
         level = samples[quiet]
         kept = level[np.abs(level - np.median(level)) < 3 * noise + 1]
-        donors.lag.append(lag[near])
-        donors.value.append((samples[near] - kept.mean()) / table.amplitude[row])
-        donors.sigma.append(float(table.sigma[row]))
-        donors.amplitude.append(float(table.amplitude[row]))
-        added += 1
-    return added
+        value = (samples[near] - kept.mean()) / table.amplitude[row]
+        yield _Donor(lag[near], value, float(table.sigma[row]), float(table.amplitude[row]))
 
 
 def find_clear(table: EchoTable, solver: Solver, noise: float) -> np.ndarray:
@@ -183,9 +176,9 @@ def find_clear(table: EchoTable, solver: Solver, noise: float) -> np.ndarray:
     return np.flatnonzero(lone & clean & (table.amplitude > LEAST_SNR * noise))
 
 
-def _make_templates(kind: tuple, donors: _Donors, spacing: float, solver: Solver) -> list[Template]:
+def _make_templates(kind: tuple, donors: list[_Donor], spacing: float, solver: Solver) -> list[Template]:
     """Templates of groups of like amplitude and width; the widest tenth, plants and slopes, is left out."""
-    sigma, amplitude = np.array(donors.sigma), np.array(donors.amplitude)
+    sigma, amplitude = np.array([[one.sigma, one.amplitude] for one in donors]).reshape(-1, 2).T
     if len(sigma) < LEAST_ECHOES:
         return []
     order = np.argsort(sigma, kind="stable")
@@ -196,26 +189,27 @@ def _make_templates(kind: tuple, donors: _Donors, spacing: float, solver: Solver
     for tier, part in enumerate(np.array_split(order[np.argsort(amplitude[order], kind="stable")], tiers)):
         part = part[np.argsort(sigma[part], kind="stable")]
         for rows in np.array_split(part, max(number // tiers, 1)):
-            templates.append(_make_template(kind, donors, rows, spacing, tier, solver.system.sigma_ref))
+            group = [donors[row] for row in rows]
+            templates.append(_make_template(kind, group, spacing, tier, solver.system.sigma_ref))
     return templates
 
 
-def _make_template(kind: tuple, donors: _Donors, rows: np.ndarray, spacing: float, tier: int, width: float) -> Template:
+def _make_template(kind: tuple, donors: list[_Donor], spacing: float, tier: int, width: float) -> Template:
     """A cubic spline through the samples of some echoes, scaled to a peak of 1. width: of the system pulse [ns]."""
-    lag = np.concatenate([donors.lag[row] for row in rows])
-    value = np.concatenate([donors.value[row] for row in rows])
-    weight = np.concatenate([np.full(len(donors.lag[row]), donors.amplitude[row]) for row in rows])
+    lag, value = (np.concatenate(part) for part in list(zip(*donors, strict=True))[:2])
+    amplitude = np.array([one.amplitude for one in donors])
+    weight = np.repeat(amplitude, [len(one.lag) for one in donors])
     order = np.argsort(lag, kind="stable")
     lag, value, weight = lag[order], value[order], weight[order]
-    first, last = _covered(lag, spacing, len(rows))
+    first, last = _covered(lag, spacing, len(donors))
     inside = (lag >= first) & (lag <= last)
     curve = _fit_spline(lag[inside], value[inside], weight[inside], max(0.5 * spacing, width / 3))
     fine = np.linspace(first, last, 4096)
     height = float(curve(fine).max())
     above = fine[curve(fine) > 0.5 * height]
-    amplitude = height * float(np.median(np.array(donors.amplitude)[rows]))
     curve = BSpline(curve.t, curve.c / height, 3)
-    return Template(curve, first, last, float(above[-1] - above[0]), amplitude, tier, len(rows), kind)
+    peak = height * float(np.median(amplitude))
+    return Template(curve, first, last, float(above[-1] - above[0]), peak, tier, len(donors), kind)
 
 
 def _fit_alone(
@@ -235,19 +229,14 @@ def _fit_alone(
     samples = np.rint(system.baseline + signal + rng.normal(0.0, noise, signal.shape))
     top = min(clip_level(block, system) - 1, np.iinfo(block.samples.dtype).max)
     found = solver.run(bare_block(block, np.clip(samples, 0, top).astype(block.samples.dtype)))
-    best = np.full(ALONE, -1)
-    order = np.lexsort((found.amplitude, found.waveform))
-    best[found.waveform[order]] = order
+    best = find_strongest(found, ALONE)
     hit = best >= 0
-    delay = found.time[best[hit]] - time[hit]
     if not hit.any():
         return replace(template, sigma=template.fwhm / FWHM_PER_SIGMA)
-    return replace(
-        template,
-        gain=float(np.median(found.amplitude[best[hit]])) / template.amplitude,
-        delay=float(np.median(delay)),
-        sigma=float(np.median(found.sigma[best[hit]])),
-    )
+    best = found.take(best[hit])
+    values = (best.amplitude, best.time - time[hit], best.sigma)
+    amplitude, delay, sigma = (float(np.median(each)) for each in values)
+    return replace(template, gain=amplitude / template.amplitude, delay=delay, sigma=sigma)
 
 
 def summarize(templates: Sequence[Template]) -> TemplateSummary:
