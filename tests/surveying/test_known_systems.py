@@ -11,9 +11,9 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying import survey_block
+from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.measure import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
@@ -25,7 +25,7 @@ KNOWN = {one.name: one for one in known_systems()}
 
 def _survey(path):
     with StripReader(path) as reader, reader.scan() as scan:
-        return survey_sample(read_sample(reader, scan))
+        return survey_blocks(read_sample(reader, scan))
 
 
 def _count_echoes(path, survey) -> int:
