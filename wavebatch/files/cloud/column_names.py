@@ -34,6 +34,11 @@ class Naming:
     """Written as 10 log10 of the value."""
 
 
+def _in_camel_case(*columns: str) -> dict[str, Naming]:
+    """Columns named like EchoWidth."""
+    return {column: Naming(column.title().replace("_", "")) for column in columns}
+
+
 STYLES: dict[str, dict[str, Naming]] = {
     "wavebatch": {},
     # Of the standard extra bytes of ASPRS one is a wavebatch column: pulse width, full width at half maximum in ns.
@@ -45,33 +50,22 @@ STYLES: dict[str, dict[str, Naming]] = {
     },
     # PDAL's Amplitude is in dB and its PulseWidth in samples of the digitizer, so these two names are not used.
     "pdal": {
+        **_in_camel_case(
+            "echo_time", "echo_width", "energy", "cross_section", "backscatter_coefficient", "incidence_angle",
+            "incidence_angle_normals", "echo_width_err", "incidence_angle_err", "incidence_angle_normals_err",
+            "echo_flags",
+        ),
         "amplitude": Naming("PeakAmplitude"),
-        "echo_time": Naming("EchoTime"),
-        "echo_width": Naming("EchoWidth"),
-        "energy": Naming("Energy"),
-        "range": Naming("EchoRange"),
-        "cross_section": Naming("CrossSection"),
-        "backscatter_coefficient": Naming("BackscatterCoefficient"),
-        "reflectance": Naming("Reflectance", unit="dB", decibel=True),
-        "incidence_angle": Naming("IncidenceAngle"),
-        "incidence_angle_normals": Naming("IncidenceAngleNormals"),
-        "range_err": Naming("EchoRangeErr"),
         "amplitude_err": Naming("PeakAmplitudeErr"),
-        "echo_width_err": Naming("EchoWidthErr"),
-        "incidence_angle_err": Naming("IncidenceAngleErr"),
-        "incidence_angle_normals_err": Naming("IncidenceAngleNormalsErr"),
+        "range": Naming("EchoRange"),
+        "range_err": Naming("EchoRangeErr"),
+        "reflectance": Naming("Reflectance", unit="dB", decibel=True),
         "pulse_deviation": Naming("PulseShapeDeviation"),
-        "echo_flags": Naming("EchoFlags"),
     },
-    "opals": {
-        "amplitude": Naming("Amplitude"),
-        "echo_width": Naming("EchoWidth"),
-        "range": Naming("Range"),
-        "cross_section": Naming("CrossSection"),
-        "backscatter_coefficient": Naming("BackscatterCoefficient"),
-        "reflectance": Naming("Reflectance"),
-    },
-}
+    "opals": _in_camel_case(
+        "amplitude", "echo_width", "range", "cross_section", "backscatter_coefficient", "reflectance"
+    ),
+}  # fmt: skip
 """Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 
 _SHORT = {

@@ -25,15 +25,9 @@ CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_
 
 CLOUD_DTYPE = np.dtype(
     [
-        ("gps_time", "<f8"),
-        ("xyz", "<f8", 3),
-        ("ray", "<f4", 3),
-        ("flags", "<u2"),
-        ("number", "u1"),
-        ("total", "u1"),
-        ("intensity", "<u2"),
-        *((name, "<f4") for name in CLOUD_COLUMNS),
-    ]
+        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("ray", "<f4", 3), ("flags", "<u2"), ("number", "u1"), ("total", "u1"),
+        ("intensity", "<u2"), *((name, "<f4") for name in CLOUD_COLUMNS),
+    ]  # fmt: skip
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
 bits, return number and number of returns, intensity, and columns (NaN: no data)."""
