@@ -117,12 +117,12 @@ def build_document(
         **describe_chain(prepared),
         "strip": {
             "las_version": facts.version,
-            "point_format": facts.point_format,
-            "points": facts.point_count,
+            "point_format": facts.header.point_format,
+            "points": facts.header.point_count,
             "packets": {
-                "file": facts.packet_file.name if facts.packet_file else None,
-                "internal": facts.internal,
-                "bytes": facts.packet_end - facts.packet_start,
+                "file": facts.packets.file.name if facts.packets.file else None,
+                "internal": facts.packets.internal,
+                "bytes": facts.packets.end - facts.packets.start,
             },
             **describe_strip(prepared, described),
         },

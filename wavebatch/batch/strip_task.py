@@ -90,7 +90,7 @@ class StripTask:
         options, job = self._options, self.job
         with job.open() as reader:
             self.facts = reader.facts
-        packet_file = self.facts.packet_file
+        packet_file = self.facts.packets.file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))

@@ -172,7 +172,7 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
     """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
     options = job.options
     return plan_output(
-        facts.checked,
+        facts,
         options.columns,
         point_format=options.point_format,
         packets=facts if options.keep_packets else None,

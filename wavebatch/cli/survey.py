@@ -75,7 +75,7 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             "packets": scan.packets,
             "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
         }
-        packet_file = opened.facts.packet_file
+        packet_file = opened.facts.packets.file
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
 
 

@@ -169,12 +169,12 @@ def _describe_file(facts: StripFacts) -> dict[str, Any]:
         "file": str(facts.path),
         "bytes": facts.size,
         "las_version": facts.version,
-        "point_format": facts.point_format,
-        "compressed": facts.compressed,
+        "point_format": facts.header.point_format,
+        "compressed": facts.header.compressed,
         "crs": facts.crs,
-        "scales": list(facts.scales),
-        "offsets": list(facts.offsets),
-        "extra_dimensions": list(facts.extra_dimensions),
+        "scales": list(facts.header.scales),
+        "offsets": list(facts.header.offsets),
+        "extra_dimensions": [record.name for record in facts.records],
     }
 
 
@@ -192,9 +192,9 @@ def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
     used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
     return {
         "count": scan.packets,
-        "where": None if facts.packet_file is None else "internal" if facts.internal else "external",
-        "file": None if facts.packet_file is None else str(facts.packet_file),
-        "bytes": facts.packet_end - facts.packet_start,
+        "where": None if facts.packets.file is None else "internal" if facts.packets.internal else "external",
+        "file": None if facts.packets.file is None else str(facts.packets.file),
+        "bytes": facts.packets.end - facts.packets.start,
         "shorter_than_descriptor": scan.short,
         "farthest_shared": scan.reach,
         "descriptors": [_describe_descriptor(facts, index, count) for index, count in used.items()],

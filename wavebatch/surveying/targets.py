@@ -189,7 +189,7 @@ def calibrate_strip(
             raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
         pulse = system or survey_sample(read_sample(reader, scan)).system
         found = _collect(reader, scan, targets, source, pulse)
-        fingerprint = take_fingerprint(path, reader.facts.packet_file)
+        fingerprint = take_fingerprint(path, reader.facts.packets.file)
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
     whole = _combine([result for result, _ in results], reflectance_error)
     if whole is None:

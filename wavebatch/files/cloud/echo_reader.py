@@ -18,6 +18,7 @@ from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.read_points import open_points
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
@@ -127,13 +128,6 @@ def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
         )
         point_format.dimensions.append(dimension)
     return point_format
-
-
-def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the return numbers and numbers of returns of raw records, u1 (n,) each."""
-    if "classification_flags" in raw.dtype.names:
-        return raw["bit_fields"] & 15, raw["bit_fields"] >> 4
-    return raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:

@@ -14,13 +14,14 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.carried_bytes import Carried, PacketSource, find_packets, plan_carried
+from wavebatch.files.cloud.carried_bytes import Carried, plan_carried
 from wavebatch.files.cloud.column_names import Naming, WrittenColumn, describe, name_columns
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record
 from wavebatch.files.las.point_formats import choose_format, copy_standard
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packets import PacketPlace
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,8 @@ class OutputLayout:
     written: tuple[WrittenColumn, ...]
     whole: bool
     """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
-    packets: PacketSource | None
+    packets: PacketPlace | None
+    """The packets of the input, if the output keeps them."""
     dropped: Mapping[str, str]
     """Extra bytes of the input that are not copied, and why."""
 
@@ -208,6 +210,8 @@ def plan_output(
     _check_crs(path, header, target)
     carried, dropped = plan_carried(checked, points == "returns")
     written = name_columns(columns, names, [entry.record.name for entry in carried])
+    if packets is not None and packets.packets.file is None:
+        raise InputError(f"{path}: has no packets to keep; leave --keep-packets out")
     return OutputLayout(
         source=path,
         version=header.version if target < 6 else max(header.version, (1, 4)),
@@ -219,7 +223,7 @@ def plan_output(
         carried=carried,
         written=tuple(written),
         whole=points == "returns",
-        packets=None if packets is None else find_packets(packets),
+        packets=None if packets is None else packets.packets,
         dropped=dropped,
     )
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.echo_reader import CloudReader, split_numbers
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.las.extra_bytes import build_dtype
 from wavebatch.files.las.header import LasHeader
-from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES
+from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, split_numbers
 from wavebatch.files.las.write_points import PointFile
 
 RETURN_DTYPE = np.dtype(

@@ -72,7 +72,7 @@ class CloudWriter(PointFile):
         if packets is None:
             return
         head = waveform_head(packets.end - packets.start)
-        with reporting(self.target), open(packets.path, "rb") as source:
+        with reporting(self.target), open(packets.file, "rb") as source:
             if packets.internal:
                 self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
@@ -85,7 +85,7 @@ class CloudWriter(PointFile):
 
     def _refuse_input(self, target: Path) -> None:
         packets = self._layout.packets
-        for path in (self._layout.source, *([packets.path] if packets else [])):
+        for path in (self._layout.source, *([packets.file] if packets else [])):
             if target.exists() and os.path.samefile(target, path):
                 raise InputError(f"{target}: is the input itself; choose another output folder")
 

@@ -95,8 +95,7 @@ class Judge:
             if self._good[index]:
                 self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
                 self._odd[index] = digitizer.bits not in WHOLE_BITS
-        self._least = facts.packet_start - facts.packet_base
-        self._end = facts.packet_end - facts.packet_base
+        self._least, self._end = facts.packets.offsets
 
     def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
         """Check the packets of points.

@@ -54,6 +54,16 @@ class PacketPlace:
     end: int
     warnings: tuple[str, ...] = ()
 
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Limits of the byte offsets that points may have."""
+        return self.start - self.base, self.end - self.base
+
+    @property
+    def shift(self) -> int:
+        """What a copy of the packets adds to byte offsets that count from the first byte of a .wdp without header."""
+        return max(0, EVLR_HEADER_SIZE - self.offsets[0])
+
 
 @dataclass(frozen=True, slots=True)
 class Descriptors:

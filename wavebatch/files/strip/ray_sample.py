@@ -12,9 +12,9 @@ import numpy as np
 
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.packet_vectors import read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.files.strip.scanner import locate
 
 MOST_SLICES = 4096
 """Most places of a strip at which rays are read."""
@@ -54,7 +54,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
 
     def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop)
-        xyz, time = locate(points, reader.facts), widen(points["gps_time"])
+        xyz, time = locate(points, reader.facts.header), widen(points["gps_time"])
         pairs.append(_pair_returns(xyz, time))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))

@@ -16,13 +16,14 @@ from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
 from wavebatch.files.strip.packet_vectors import check_option, read_toward
-from wavebatch.files.strip.packets import PacketFile, PacketPlace, block_rows
+from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.scan_result import StripScan, raise_problem
-from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
+from wavebatch.files.strip.scanner import scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
 from wavebatch.kernels.signal.signal import recorded_lengths
 
@@ -114,11 +115,10 @@ class StripReader(Closing):
 
     def _open(self, facts: StripFacts) -> None:
         self.facts = facts
-        self._points = open_points(facts.checked)
+        self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
-            place = (facts.packet_file, facts.internal, facts.packet_base, facts.packet_start, facts.packet_end)
-            self._packets = PacketFile(PacketPlace(*place))
+            self._packets = PacketFile(facts.packets)
         except BaseException:
             self._points.close()
             raise
@@ -140,10 +140,10 @@ class StripReader(Closing):
 
     def unit_count(self) -> int:
         """Return the number of units."""
-        return -(-self.facts.point_count // self._unit_points())
+        return -(-self.facts.header.point_count // self._unit_points())
 
     def _unit_points(self) -> int:
-        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.point_length))
+        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.header.point_length))
 
     def read_points(self, start: int, stop: int) -> np.ndarray:
         """Return records [start, stop) of the file."""
@@ -251,7 +251,7 @@ class _Geometry:
         counts = self._counts[rows]
         place = expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
-        xyz = locate(records, self._facts)
+        xyz = locate(records, self._facts.header)
         location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
         toward = read_toward(records[owner], self._unit.direction, self._unit.vector_form)

@@ -70,17 +70,17 @@ class StripScan(Closing):
 
 def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
     """Return the message about a strip without any usable packet."""
-    if facts.packet_file is None:
+    if facts.packets.file is None:
         name = facts.path.with_suffix(".wdp").name
         return f"points refer to packets that are neither in the file nor next to it: put {name} next to the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
-    remedy = f"{facts.packet_file.name} is cut, damaged or belongs to another strip: get it again"
+    remedy = f"{facts.packets.file.name} is cut, damaged or belongs to another strip: get it again"
     if reason is Reason.PACKED:
         remedy = "write the packets with 8, 16 or 32 bits per sample"
     return (
-        f"no packet can be used: {count} of {facts.point_count} points (first: point {first}) {REASON_TEXTS[reason]}; "
-        f"{remedy}"
+        f"no packet can be used: {count} of {facts.header.point_count} points (first: point {first}) "
+        f"{REASON_TEXTS[reason]}; {remedy}"
     )
 
 
