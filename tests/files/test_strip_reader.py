@@ -125,7 +125,7 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
         spans = [members[-1] - members[0] for _, members in plain.values()]
         assert scan.reach == max(spans)
         assert scan.direction == "toward"
-        spooled = scan.spool
+        spooled = scan.context.path
         assert spooled.exists()
     assert not spooled.exists()
 

@@ -120,7 +120,7 @@ def _check_chain(path: Path) -> Findings:
 
 
 def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
-    if scan.is_hopeless:
+    if scan.broken and not scan.with_waveform:
         return Findings(str(path), scan.problems[:1], ())
     facts = reader.facts
     problems = [*scan.problems, *scan.warnings, *facts.warnings]

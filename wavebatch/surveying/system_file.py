@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.text_file import write_text
-from wavebatch.files.toml_file import TomlTable, check_number, format_toml, parse_toml, read_toml_text, shorten
+from wavebatch.files.text_file import read_text, write_text
+from wavebatch.files.toml_file import TomlTable, check_number, format_toml, parse_toml, shorten
 from wavebatch.surveying import Decision, Survey
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
@@ -116,7 +116,7 @@ def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
 
 def load_survey(path: Path | str) -> SavedSurvey:
     """Read a survey file; raises ConfigError, in one line, where it cannot be read or is wrong."""
-    return parse_survey(read_toml_text(path, "system file"), str(path))
+    return parse_survey(read_text(path, "system file"), str(path))
 
 
 def parse_survey(text: str, name: str) -> SavedSurvey:

@@ -44,11 +44,6 @@ class KeyedSums(Closing):
         if self._file is not None:
             self._file.close()
 
-    @property
-    def spilled(self) -> int:
-        """Number of runs on disk."""
-        return len(self._runs)
-
     def add(self, key: np.ndarray, value: np.ndarray) -> None:
         """Add rows: key u8 (m,), value i8 (m, columns)."""
         if not len(key):

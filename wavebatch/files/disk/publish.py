@@ -48,10 +48,11 @@ def _remedy(error: OSError) -> str:
     return "choose another output folder"
 
 
-class Draft:
+class Draft(contextlib.AbstractContextManager):
     """A file that is being written: `file` is open under a temporary name, also for reading, and locked.
 
     target: its final name. overwrite: whether publishing replaces an existing file.
+    As a context manager it discards the file unless it was published.
     Raises InputError if the folder cannot be written, or the name is that of a device or a pipe.
     """
 
@@ -64,6 +65,9 @@ class Draft:
             self.path, descriptor = _create(self.target.parent)
         self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
         self.published = False
+
+    def __exit__(self, *error: object) -> None:
+        self.discard()
 
     def publish(self, *, same_is_fine: bool = False) -> None:
         """Give the finished file its final name in one step; without overwrite an existing file is never replaced.

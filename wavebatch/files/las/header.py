@@ -222,8 +222,9 @@ def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) 
     )  # fmt: skip
     _read_tail(header, file.read(standard - _FRONT.size))
     header.user_bytes = file.read(size - standard)
-    header.vlrs = list(_read_vlrs(file.read(offset - size), n_vlrs, path))
-    header.padding = _read_padding(file, header)
+    records = file.read(offset - size)
+    header.vlrs = list(_read_vlrs(records, n_vlrs, path))
+    header.padding = records[sum(_VLR.size + len(vlr.payload) for vlr in header.vlrs) :]
     return header
 
 
@@ -249,12 +250,6 @@ def _read_vlrs(data: bytes, count: int, path: Path) -> Iterator[Vlr]:
         if at > len(data):
             raise damaged(path, f"VLR {number} of {count} runs into the points")
         yield Vlr(user_id, record_id, data[at - length : at], description, reserved)
-
-
-def _read_padding(file: BinaryIO, header: LasHeader) -> bytes:
-    used = header.size + sum(_VLR.size + len(vlr.payload) for vlr in header.vlrs)
-    file.seek(used)
-    return file.read(header.offset_to_points - used)
 
 
 def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:

@@ -106,23 +106,19 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & WAVES_INTERNAL:
         return _locate_internal(checked)
-    packet_file = _find_packet_file(path)
-    if header.global_encoding & WAVES_EXTERNAL:
-        if packet_file is None:
-            if _find_packet_file(path, "wdz") is not None:
-                raise refuse_compressed(path, 1)
-            raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
-        return _locate_external(checked, packet_file, headerless)
+    packet_file, external = _find_packet_file(path), header.global_encoding & WAVES_EXTERNAL
     warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
-    if header.waveform_start:
-        place = _locate_internal(checked)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from the record in the file"))
-    if packet_file is not None:
-        place = _locate_external(checked, packet_file, headerless)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {packet_file.name}"))
-    if _find_packet_file(path, "wdz") is not None:
+    if header.waveform_start and not external:
+        place, where = _locate_internal(checked), "the record in the file"
+    elif packet_file is not None:
+        place, where = _locate_external(checked, packet_file, headerless), packet_file.name
+    elif _find_packet_file(path, "wdz") is not None:
         raise refuse_compressed(path, 1)
-    return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
+    elif external:
+        raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
+    else:
+        return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
+    return place if external else replace(place, warnings=(*place.warnings, f"{warning}; they are read from {where}"))
 
 
 def refuse_compressed(path: Path, kind: int) -> InputError:
@@ -134,10 +130,8 @@ def refuse_compressed(path: Path, kind: int) -> InputError:
 
 
 def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
-    for candidate in (path.with_suffix(f".{suffix}"), path.with_suffix(f".{suffix.upper()}")):
-        if candidate.is_file():
-            return candidate
-    return None
+    candidates = (path.with_suffix(f".{name}") for name in (suffix, suffix.upper()))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:

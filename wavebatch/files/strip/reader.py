@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
@@ -20,9 +21,9 @@ from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
-from wavebatch.files.strip.packet_vectors import check_option, read_toward
+from wavebatch.files.strip.packet_vectors import OPTIONS, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
-from wavebatch.files.strip.scan_result import StripScan, raise_problem
+from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.files.strip.scanner import scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
 from wavebatch.kernels.signal.signal import recorded_lengths
@@ -103,7 +104,8 @@ class StripReader(Closing):
     facts: StripFacts
 
     def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
-        check_option(direction)
+        if direction not in OPTIONS:
+            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
         self._open(find_facts(Path(path), direction, headerless))
 
     @classmethod
@@ -134,8 +136,9 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError.
         """
         scan = scan_strip(self.facts, self._points, self._unit_points())
-        if not tolerant:
-            raise_problem(self.facts, scan)
+        if scan.problems and not tolerant:
+            scan.close()
+            raise InputError(f"{self.facts.path}: {scan.problems[0]}")
         return scan
 
     def unit_count(self) -> int:

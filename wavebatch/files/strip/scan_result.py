@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
@@ -53,16 +51,6 @@ class StripScan(Closing):
     problems: tuple[str, ...]
     """Reasons why the strip cannot be processed; empty unless the scan was `tolerant`."""
 
-    @property
-    def is_hopeless(self) -> bool:
-        """Whether points have packets, but none can be used."""
-        return self.broken > 0 and not self.with_waveform
-
-    @property
-    def spool(self) -> Path | None:
-        """Temporary file of shared packets; None if there are few."""
-        return self.context.path
-
     def close(self) -> None:
         """Remove the temporary file."""
         self.context.close()
@@ -90,10 +78,3 @@ def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Ite
         yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged"
     if short:
         yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
-
-
-def raise_problem(facts: StripFacts, scan: StripScan) -> None:
-    """Raise InputError with the first reason why the strip cannot be processed, if there is one."""
-    if scan.problems:
-        scan.close()
-        raise InputError(f"{facts.path}: {scan.problems[0]}")
