@@ -82,8 +82,8 @@ def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_poin
         with reader.scan() as scan:
             assert scan.packets == packets
             assert scan.with_waveform == len(points)
-            assert scan.direction == "toward"
-            assert abs(scan.vector_ratio - 0.9997) < 2e-4
+            assert scan.vectors.direction == "toward"
+            assert abs(scan.vectors.ratio - 0.9997) < 2e-4
     assert_same(read_all(path, size=100), read_plainly(points, data, kinds))
 
 
@@ -124,7 +124,7 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
         assert (scan.packets, scan.with_waveform) == (2375, 2535)
         spans = [members[-1] - members[0] for _, members in plain.values()]
         assert scan.reach == max(spans)
-        assert scan.direction == "toward"
+        assert scan.vectors.direction == "toward"
         spooled = scan.context.path
         assert spooled.exists()
     assert not spooled.exists()

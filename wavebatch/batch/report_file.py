@@ -74,9 +74,9 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
     return {
         "direction": {
-            "sign": scan.direction,
-            "evidence": scan.direction_evidence,
-            "vector_ratio": without_nan(scan.vector_ratio),
+            "sign": scan.vectors.direction,
+            "evidence": scan.vectors.evidence,
+            "vector_ratio": without_nan(scan.vectors.ratio),
         },
         "sensor": prepared.sensor.describe(),
         **describe_survey(prepared.choice, prepared.job.request, fingerprint),

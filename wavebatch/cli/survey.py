@@ -73,7 +73,7 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             "strip": str(opened.facts.path),
             "points": scan.points,
             "packets": scan.packets,
-            "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
+            "direction": {"sign": scan.vectors.direction, "evidence": scan.vectors.evidence},
         }
         packet_file = opened.facts.packets.file
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts

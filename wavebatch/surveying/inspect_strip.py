@@ -73,10 +73,10 @@ def describe_strip(path: Path | str, *, direction: str = "auto", headerless: boo
             "packets": _describe_packets(facts, scan),
             "samples": _describe_samples(reader, scan),
             "vectors": {
-                "direction": scan.direction,
-                "evidence": scan.direction_evidence,
-                "length_over_half_c": without_nan(scan.vector_ratio),
-                "form": scan.vector_form,
+                "direction": scan.vectors.direction,
+                "evidence": scan.vectors.evidence,
+                "length_over_half_c": without_nan(scan.vectors.ratio),
+                "form": scan.vectors.form,
             },
             "warnings": [*facts.warnings, *scan.warnings],
             "problems": list(scan.problems),
@@ -129,7 +129,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     except InputError as error:
         problems.append(_without_name(path, error))
     notes = [*_note_descriptors(facts, scan), *audit_header(reader, scan)]
-    summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
+    summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.vectors.direction} the sensor"
     return Findings(str(path), tuple(problems), tuple(notes), summary)
 
 

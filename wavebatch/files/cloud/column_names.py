@@ -68,6 +68,7 @@ STYLES: dict[str, dict[str, Naming]] = {
 }  # fmt: skip
 """Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 
+_RELATIVE = ("backscatter", "cross_section", "reflectance")
 _SHORT = {
     "amplitude": "peak above the baseline",
     "echo_time": "echo after first sample",
@@ -78,12 +79,8 @@ _SHORT = {
     "incidence_angle_normals": "ray to plane of points",
     "incidence_angle_normals_err": "1 sigma of angle to plane",
     "pulse_deviation": "Gauss-Hermite deviation",
-    "relative_backscatter": "relative to strip only",
-    "relative_cross_section": "relative to strip only",
-    "relative_reflectance": "relative to strip only",
-    "relative_backscatter_err": "1 sigma, relative",
-    "relative_cross_section_err": "1 sigma, relative",
-    "relative_reflectance_err": "1 sigma, relative",
+    **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
+    **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }
 """Short meanings of columns whose declared meaning does not fit into the 32 bytes of a description."""
 

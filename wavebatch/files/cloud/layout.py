@@ -62,11 +62,9 @@ class OutputLayout:
 
     def extended(self, columns: Sequence[str]) -> OutputLayout:
         """Return the layout with temporary columns at the end, which a second pass needs and the cloud does not get."""
-        more = []
-        for name in columns:
-            column = COLUMNS[name]
-            more.append(WrittenColumn(name, ExtraRecord.build(name, column.dtype, describe(column)), Naming(name)))
-        dtype = build_dtype(self.point_format, [*self.extra_records, *(column.record for column in more)])
+        records = [ExtraRecord.build(name, COLUMNS[name].dtype, describe(COLUMNS[name])) for name in columns]
+        more = [WrittenColumn(name, record, Naming(name)) for name, record in zip(columns, records, strict=True)]
+        dtype = build_dtype(self.point_format, [*self.extra_records, *records])
         return replace(self, dtype=dtype, written=(*self.written, *more))
 
     def rows(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -122,17 +123,14 @@ class PointFile(contextlib.AbstractContextManager):
     def _place_extra_bytes(self, records: Sequence[ExtraRecord] | None = None) -> None:
         records = self._records if records is None else records
         vlrs = self._header.vlrs
-        places = [index for index, vlr in enumerate(vlrs) if has_record([vlr], *_EXTRA_BYTES)]
+        old = next((vlr for vlr in vlrs if has_record([vlr], *_EXTRA_BYTES)), None)
+        self._header.vlrs = [vlr for vlr in vlrs if not has_record([vlr], *_EXTRA_BYTES)]
         payload = b"".join(record.data for record in records)
         if len(payload) > 65535:
             raise InputError(f"{self.target}: a LAS file can describe at most 341 extra bytes, not {len(records)}")
-        if places and records:
-            old = vlrs[places[0]]
-            vlrs[places[0]] = Vlr(old.user_id, old.record_id, payload, old.description, old.reserved)
-            places = places[1:]
-        elif records:
-            vlrs.append(Vlr(b"LASF_Spec", EXTRA_BYTES_RECORD_ID, payload, b"Extra bytes"))
-        self._header.vlrs = [vlr for index, vlr in enumerate(vlrs) if index not in places]
+        if records:
+            new = replace(old or Vlr(b"LASF_Spec", EXTRA_BYTES_RECORD_ID, b"", b"Extra bytes"), payload=payload)
+            self._header.vlrs.insert(vlrs.index(old) if old else len(vlrs), new)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:

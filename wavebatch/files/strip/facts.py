@@ -43,13 +43,13 @@ def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:
     """
     checked = read_checked_header(path)
     header = checked.header
-    found = read_descriptors(header)
-    place = locate_packets(checked, found.compression, headerless)
+    digitizers, compression, odd = read_descriptors(header)
+    place = locate_packets(checked, compression, headerless)
     if place.base < 0:
         with contextlib.closing(open_points(checked)) as points:
             place = settle_headerless(place, points.read(0, min(header.point_count, _FIRST_POINTS)))
     crs, units = read_crs(path, header)
     values = {entry.name: getattr(checked, entry.name) for entry in fields(checked)}
-    values["warnings"] = (*checked.warnings, *found.warnings, *place.warnings)
-    return StripFacts(**values, digitizers=found.digitizers, compression=found.compression, packets=place,
+    values["warnings"] = (*checked.warnings, *odd, *place.warnings)
+    return StripFacts(**values, digitizers=digitizers, compression=compression, packets=place,
                       direction_option=direction, crs=crs, units=units)  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.raw_bytes import damaged, read_exactly
+from wavebatch.files.disk.raw_bytes import damaged, read_exactly, reporting_reads
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
@@ -33,7 +33,7 @@ MAX_EVLRS = 4096
 """Most EVLRs that are looked at: a damaged header can claim 4 billion."""
 BLOCK_BYTES = 1 << 25
 """Most bytes of samples in one block, for any number of waveforms."""
-_DESCRIPTOR = struct.Struct("<BBIIdd")
+DESCRIPTOR = struct.Struct("<BBIIdd")
 _FIRST_ID, _LAST_ID = 100, 354
 _SPARSE = 4
 """A span of bytes is read in one piece if it is at most this many times as long as the wanted packets,"""
@@ -65,17 +65,11 @@ class PacketPlace:
         return max(0, EVLR_HEADER_SIZE - self.offsets[0])
 
 
-@dataclass(frozen=True, slots=True)
-class Descriptors:
-    """The wave packet descriptors of a strip, by index."""
+def read_descriptors(header: LasHeader) -> tuple[dict[int, Digitizer], dict[int, int], list[str]]:
+    """Return digitizers and compression types by index, and warnings.
 
-    digitizers: dict[int, Digitizer]
-    compression: dict[int, int]
-    warnings: tuple[str, ...]
-
-
-def read_descriptors(header: LasHeader) -> Descriptors:
-    """Return all descriptors among the VLRs, also unused and empty ones; `packet_check` checks those that are used."""
+    All descriptors among the VLRs count, also unused and empty ones; `packet_check` checks those that are used.
+    """
     digitizers: dict[int, Digitizer] = {}
     compression: dict[int, int] = {}
     warnings = []
@@ -83,16 +77,16 @@ def read_descriptors(header: LasHeader) -> Descriptors:
         if vlr.user != "LASF_Spec" or not _FIRST_ID <= vlr.record_id <= _LAST_ID:
             continue
         index = vlr.record_id - _FIRST_ID + 1
-        if len(vlr.payload) < _DESCRIPTOR.size:
+        if len(vlr.payload) < DESCRIPTOR.size:
             warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
             continue
-        bits, kind, samples, spacing, gain, offset = _DESCRIPTOR.unpack_from(vlr.payload)
+        bits, kind, samples, spacing, gain, offset = DESCRIPTOR.unpack_from(vlr.payload)
         digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
         if index not in digitizers:
             digitizers[index], compression[index] = digitizer, kind
         elif digitizers[index] != digitizer:
             warnings.append(f"descriptor {index} is there twice with different content; the first one is used")
-    return Descriptors(digitizers, compression, tuple(warnings))
+    return digitizers, compression, warnings
 
 
 def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerless: bool) -> PacketPlace:
@@ -136,8 +130,7 @@ def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     header, path, size = checked.header, checked.path, checked.size
-    capped = replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS))
-    evlrs, _ = find_evlrs(path, capped)
+    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
     at, warnings = header.waveform_start, []
     if not at:
         at = next((evlr.start for evlr in evlrs if evlr.record_id == WAVEFORM_RECORD_ID), 0)
@@ -194,10 +187,8 @@ class PacketFile:
         self._file = None
         self._buffer = np.empty(0, np.uint8)
         if place.file is not None:
-            try:
+            with reporting_reads(place.file):
                 self._file = open(place.file, "rb", buffering=0)  # noqa: SIM115 - closed by close()
-            except OSError as error:
-                raise InputError(f"{place.file}: cannot be read: {error.strerror or error}") from error
 
     def close(self) -> None:
         """Close the file; may be called twice."""
@@ -220,11 +211,8 @@ class PacketFile:
         """
         width = n_samples * (bits // 8)
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
-        try:
+        with reporting_reads(self._place.file, "packets ", "; check the disk"):
             rows = self._gather(starts, width)
-        except OSError as error:
-            text = error.strerror or str(error)
-            raise InputError(f"{self._place.file}: packets cannot be read: {text}; check the disk") from error
         samples = rows.view(f"<u{bits // 8}")
         samples.flags.writeable = False
         return samples

@@ -85,7 +85,7 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
 
 def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> Rays:
     with np.errstate(all="ignore"):
-        away = -read_toward(points, scan.direction, scan.vector_form)
+        away = -read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
     good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)

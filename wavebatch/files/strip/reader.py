@@ -21,7 +21,7 @@ from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
-from wavebatch.files.strip.packet_vectors import OPTIONS, read_toward
+from wavebatch.files.strip.packet_vectors import OPTIONS, Decision, read_toward
 from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.files.strip.scanner import scan_strip, unique_entries
@@ -79,8 +79,7 @@ class Unit:
     """Row of `packets` for each context point, i4 (k,)."""
     point_flags: np.ndarray
     """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
-    direction: str
-    vector_form: str
+    vectors: Decision
 
 
 class StripReader(Closing):
@@ -156,9 +155,9 @@ class StripReader(Closing):
         """Return unit `number` (from 0): its points and their packets; `read_blocks` reads the samples."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
         points = self._points.read(start, stop)
-        judged = self._judge.judge(points, scan.vector_form, scan.overfull)
+        judged = self._judge.judge(points, scan.vectors.form, scan.overfull)
         entries = unique_entries(scan.context.read(number))
-        near = self._judge.judge(entries["record"], scan.vector_form, scan.overfull)
+        near = self._judge.judge(entries["record"], scan.vectors.form, scan.overfull)
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
         own = np.flatnonzero(judged.usable)
         index = np.concatenate([start + own, entries["index"]])
@@ -179,8 +178,7 @@ class StripReader(Closing):
             packet_of_point=packet_of_point,
             packet_of_context=packet_of[len(own) :],
             point_flags=judged.flags,
-            direction=scan.direction,
-            vector_form=scan.vector_form,
+            vectors=scan.vectors,
         )
 
     def read_blocks(self, unit: Unit, size: int, owned_only: bool) -> Iterator[tuple[WaveformBlock, np.ndarray]]:
@@ -257,7 +255,7 @@ class _Geometry:
         xyz = locate(records, self._facts.header)
         location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
-        toward = read_toward(records[owner], self._unit.direction, self._unit.vector_form)
+        toward = read_toward(records[owner], self._unit.vectors.direction, self._unit.vectors.form)
         owners = self._unit.packets.owner[rows]
         return WaveformBlock(
             digitizer=digitizer,

@@ -14,6 +14,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
+from wavebatch.files.strip.packet_vectors import Decision
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,10 +38,7 @@ class StripScan(Closing):
     """Points with a packet, by descriptor index."""
     reach: int
     """Largest distance in the file, in points, of two points that share a packet."""
-    direction: str
-    direction_evidence: str
-    vector_form: str
-    vector_ratio: float
+    vectors: Decision
     borders: np.ndarray
     """First point of each unit, then the number of points, i8 (units + 1,)."""
     overfull: np.ndarray
