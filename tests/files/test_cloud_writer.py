@@ -216,7 +216,7 @@ def test_extended_records_are_copied_and_what_is_not_is_said(tmp_path):
     with open(path, "r+b") as file:
         file.seek(243)
         file.write(b"\xff\xff\xff\xff")
-    with CloudWriter(layout, tmp_path / "b.las", provenance={}) as cloud:
+    with CloudWriter(plan_output(path, []), tmp_path / "b.las", provenance={}) as cloud:
         assert "4294967290 EVLRs" in cloud.dropped
 
 

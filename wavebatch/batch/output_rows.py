@@ -168,7 +168,7 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]
-    places = np.where(np.isnan(xyz), locate(records, layout), xyz)
+    places = np.where(np.isnan(xyz), locate(records, layout.source.header), xyz)
     number, total = _number_rows(find_pulses(unit.points["gps_time"])[rows.owner], places, direction, records)
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))

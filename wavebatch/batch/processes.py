@@ -98,16 +98,14 @@ def settle(future: Future, function: Callable, *arguments: Any) -> Future:
 @contextlib.contextmanager
 def _single_threaded() -> Iterator[None]:
     """Libraries of processes that are started inside use one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _start_worker(scratch: Path | None) -> None:

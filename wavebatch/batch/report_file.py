@@ -70,14 +70,11 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
 
 def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the results of scan and survey as plain values; `described` is from `describe_job`."""
-    scan = prepared.scan
+    vectors = prepared.scan.vectors
+    ratio = without_nan(vectors.ratio)
     fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
     return {
-        "direction": {
-            "sign": scan.vectors.direction,
-            "evidence": scan.vectors.evidence,
-            "vector_ratio": without_nan(scan.vectors.ratio),
-        },
+        "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
         **describe_survey(prepared.choice, prepared.job.request, fingerprint),
     }
@@ -110,6 +107,7 @@ def build_document(
         Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
+    packets, file, size = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     lost = {**layout.dropped, **dropped}
     return {
         "schema": STRIP_SCHEMA,
@@ -119,11 +117,7 @@ def build_document(
             "las_version": facts.version,
             "point_format": facts.header.point_format,
             "points": facts.header.point_count,
-            "packets": {
-                "file": facts.packets.file.name if facts.packets.file else None,
-                "internal": facts.packets.internal,
-                "bytes": facts.packets.end - facts.packets.start,
-            },
+            "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": size},
             **describe_strip(prepared, described),
         },
         "output": {

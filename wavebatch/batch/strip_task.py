@@ -150,12 +150,8 @@ class StripTask:
     def _open(self) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
-        described = self._described
-        provenance = {
-            **described,
-            **report_file.describe_chain(prepared),
-            **report_file.describe_strip(prepared, described),
-        }
+        provenance = {**self._described, **report_file.describe_chain(prepared)}
+        provenance |= report_file.describe_strip(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:

@@ -42,7 +42,7 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
-    from wavebatch.surveying.system_file import write_survey
+    from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
@@ -50,7 +50,7 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
             refuse_existing(target)
     saved, facts = _survey(strip, options)
     if output is not None:
-        write_survey(output, saved, overwrite=overwrite)
+        write_text(output, format_survey(saved), overwrite=overwrite)
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     print_result(as_json, _document(saved, facts), _lines(saved, facts))

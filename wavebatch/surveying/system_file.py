@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.text_file import read_text, write_text
+from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, check_number, format_toml, parse_toml, shorten
 from wavebatch.surveying import Decision, Survey
 
@@ -107,11 +107,6 @@ def format_survey(saved: SavedSurvey) -> str:
     comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
     comments[places[1]] = "a digitizer that records otherwise"
     return format_toml(document, heading=_HEADING, comments=comments)
-
-
-def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
-    """Write a survey file, whole or not at all; raises InputError where it exists or cannot be written."""
-    write_text(path, format_survey(saved), overwrite=overwrite)
 
 
 def load_survey(path: Path | str) -> SavedSurvey:

@@ -115,18 +115,9 @@ def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
     point_format = laspy.PointFormat(checked.header.point_format)
     for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
         dtype, scaling = record.dtype, record.scaling
-        dimension = DimensionInfo(
-            field,
-            DimensionKind.from_letter(dtype.base.kind),
-            8 * dtype.itemsize,
-            dtype.shape[0] if dtype.shape else 1,
-            is_standard=False,
-            description=record.description,
-            scales=None if scaling is None else np.array(scaling[:1]),
-            offsets=None if scaling is None else np.array(scaling[1:]),
-            no_data=record.no_data,
-        )
-        point_format.dimensions.append(dimension)
+        scales, offsets = (None, None) if scaling is None else np.array(scaling)[:, None]
+        dimension = DimensionInfo.from_dtype(field, dtype, False, record.description, offsets, scales)
+        point_format.dimensions.append(dimension._replace(no_data=record.no_data))
     return point_format
 
 

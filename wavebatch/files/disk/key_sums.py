@@ -30,7 +30,6 @@ class KeyedSums(Closing):
     """
 
     def __init__(self, columns: int, *, held: int = HELD) -> None:
-        self._columns = columns
         self._held = held
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []

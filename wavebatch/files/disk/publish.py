@@ -17,11 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from wavebatch.core.errors import InputError
-
-try:
-    import fcntl
-except ImportError:  # Windows has no fcntl: left-over files then stay until the user removes them
-    fcntl = None
+from wavebatch.files.disk import locks
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
@@ -62,7 +58,7 @@ class Draft(contextlib.AbstractContextManager):
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
         with reporting(self.target):
-            self.path, descriptor = _create(self.target.parent)
+            self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
         self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
         self.published = False
 
@@ -77,7 +73,7 @@ class Draft(contextlib.AbstractContextManager):
         with reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
-            if fcntl is None:  # Windows cannot rename an open file
+            if locks.fcntl is None:  # Windows cannot rename an open file
                 self.file.close()
             try:
                 if self.overwrite:
@@ -155,19 +151,8 @@ def remove_stale(folder: Path) -> list[Path]:
 
     A locked file is still being written and stays. On systems without file locks nothing is removed.
     """
-    removed: list[Path] = []
-    if fcntl is None:
-        return removed
-    for path in sorted(Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")):
-        with contextlib.suppress(OSError):
-            descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.unlink(path)
-                removed.append(path)
-            finally:
-                os.close(descriptor)
-    return removed
+    found = Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")
+    return locks.remove_unlocked(found, lambda path: os.open(path, locks.FLAGS), os.unlink)
 
 
 def _no_file(target: Path) -> str:
@@ -181,23 +166,9 @@ def _exists(target: Path) -> str:
 
 
 def _create(folder: Path) -> tuple[Path, int]:
-    """A new locked file; tries again if `remove_stale` of another process removed it before it was locked."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-    while True:
-        path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
-        descriptor = os.open(path, flags, 0o666)
-        if fcntl is None:
-            return path, descriptor
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            continue
-        except OSError:  # a file system without locks
-            return path, descriptor
-        if os.fstat(descriptor).st_nlink:
-            return path, descriptor
-        os.close(descriptor)
+    """A new file, open for reading and writing."""
+    path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
+    return path, os.open(path, locks.FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
 
 
 def _link(path: Path, target: Path) -> None:

@@ -21,7 +21,7 @@ _OVERLAP_CLASS = 12
 
 
 def locate(points: np.ndarray, header: LasHeader) -> np.ndarray:
-    """Return coordinates of records (n,), f8 (n, 3) [m]; header: anything with scales and offsets."""
+    """Return coordinates of records (n,), f8 (n, 3) [m]."""
     axes = zip("XYZ", header.scales, header.offsets, strict=True)
     return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
 

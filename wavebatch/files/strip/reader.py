@@ -87,8 +87,8 @@ class StripReader(Closing):
 
     Parameters
     ----------
-    path : Path or str
-        LAS or LAZ file of point format 4, 5, 9 or 10.
+    path : Path, str or StripFacts
+        LAS or LAZ file of point format 4, 5, 9 or 10. If its facts are given, its headers are not read again.
     direction : {"auto", "toward", "away"}
         Where packet vectors point; "auto" decides from the points.
     headerless : bool
@@ -100,21 +100,10 @@ class StripReader(Closing):
         If the strip cannot be read as what it claims to be.
     """
 
-    facts: StripFacts
-
-    def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
+    def __init__(self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False) -> None:
         if direction not in OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
-        self._open(find_facts(Path(path), direction, headerless))
-
-    @classmethod
-    def reopen(cls, facts: StripFacts) -> StripReader:
-        """Return a reader of a strip whose facts are known, so that its headers need not be read and checked again."""
-        reader = cls.__new__(cls)
-        reader._open(facts)
-        return reader
-
-    def _open(self, facts: StripFacts) -> None:
+        facts = path if isinstance(path, StripFacts) else find_facts(Path(path), direction, headerless)
         self.facts = facts
         self._points = open_points(facts)
         try:
@@ -164,8 +153,7 @@ class StripReader(Closing):
         keys = np.concatenate([judged.keys[own], keys])
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
-        packets, packet_of = _collect_packets(keys, index, sizes, n_samples)
-        packets = replace(packets, owned=(packets.owner >= start) & (packets.owner < stop))
+        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, (start, stop))
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
         return Unit(
@@ -288,9 +276,9 @@ def _read_scanner(records: np.ndarray) -> np.ndarray | None:
 
 
 def _collect_packets(
-    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray
+    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray, unit: tuple[int, int]
 ) -> tuple[PacketTable, np.ndarray]:
-    """Packets of points (n,) in order of their owners, all marked as owned, and the row of each point, i4 (n,)."""
+    """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
     by_index = np.argsort(index, kind="stable")
     groups = group_keys(keys[by_index])
     lead = by_index[groups.order[groups.starts]]
@@ -306,6 +294,6 @@ def _collect_packets(
         size=sizes[lead],
         n_samples=n_samples[lead],
         owner=index[lead],
-        owned=np.ones(len(lead), bool),
+        owned=(index[lead] >= unit[0]) & (index[lead] < unit[1]),
     )
     return table, packet_of
