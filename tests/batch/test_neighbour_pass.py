@@ -194,7 +194,7 @@ def layout(tiny_strip):
 def make_rows(layout, xyz, ray=(0, 0.1, -1)):
     rows = np.zeros(len(xyz), layout.extended(RAY).dtype)
     for axis, name in enumerate("XYZ"):
-        rows[name] = np.rint(np.asarray(xyz, float).reshape(-1, 3)[:, axis] / layout.scales[axis])
+        rows[name] = np.rint(np.asarray(xyz, float).reshape(-1, 3)[:, axis] / layout.source.header.scales[axis])
     for value, name in zip(ray, RAY, strict=True):
         rows[name] = value
     return rows

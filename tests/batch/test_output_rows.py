@@ -128,12 +128,12 @@ def test_every_row_of_echoes_mode_is_what_a_loop_makes(spoilt, tmp_path):
     assert outcome.error is None
     points, echoes, members, flags, prepared = _read_packets(spoilt)
     facts = prepared.facts
-    expected = _expect_rows(points, echoes, members, flags, facts.scales, facts.offsets)
+    expected = _expect_rows(points, echoes, members, flags, facts.header.scales, facts.header.offsets)
     found, xyz = read_cloud(tmp_path / "spoilt.las")
     assert len(found) == len(expected)
     assert found["point_source_id"].tolist() == [row["source"] for row in expected]
     assert found["echo_flags"].tolist() == [row["flags"] for row in expected]
-    assert np.abs(xyz - np.array([row["xyz"] for row in expected])).max() <= 0.5 * max(facts.scales) + 1e-9
+    assert np.abs(xyz - np.array([row["xyz"] for row in expected])).max() <= 0.5 * max(facts.header.scales) + 1e-9
     amplitude = [-9999.0 if row["amplitude"] is None else row["amplitude"] for row in expected]
     assert found["amplitude"].tolist() == amplitude
     numbers = _expect_numbers(expected, echoes, members, points)

@@ -134,5 +134,5 @@ def test_unexplained_extra_bytes_are_kept(tmp_path):
     wide["x"] = 7
     raw.points = wide
     with StripReader(raw.write(tmp_path / "a.las")) as reader:
-        assert reader.facts.extra_dimensions == ("ExtraBytes",)
+        assert [record.name for record in reader.facts.records] == ["ExtraBytes"]
         assert (reader.read_points(0, 3)["ExtraBytes"] == 7).all()

@@ -216,7 +216,7 @@ def test_extended_records_are_copied_and_what_is_not_is_said(tmp_path):
     with open(path, "r+b") as file:
         file.seek(243)
         file.write(b"\xff\xff\xff\xff")
-    with CloudWriter(layout, tmp_path / "b.las", provenance={}) as cloud:
+    with CloudWriter(plan_output(path, []), tmp_path / "b.las", provenance={}) as cloud:
         assert "4294967290 EVLRs" in cloud.dropped
 
 
@@ -361,8 +361,8 @@ def test_a_file_without_header_gets_one_and_offsets_follow(tmp_path):
     path = tmp_path / "a.las"
     points = write_strip(path, internal=False)
     before = packets_of(path, points)
-    places = {"packet_start": 0, "packet_base": 0, "packet_end": (tmp_path / "a.wdp").stat().st_size - 60}
-    facts = dataclasses.replace(facts_of(path), **places)
+    facts, end = facts_of(path), (tmp_path / "a.wdp").stat().st_size - 60
+    facts = dataclasses.replace(facts, packets=dataclasses.replace(facts.packets, start=0, base=0, end=end))
     (tmp_path / "a.wdp").write_bytes((tmp_path / "a.wdp").read_bytes()[60:])
     points["wavepacket_offset"] -= np.uint64(60)
     points["wavepacket_index"][3] = 0
@@ -495,7 +495,7 @@ from wavebatch.files.strip.reader import StripReader
 source, target = map(Path, sys.argv[1:3])
 with StripReader(source) as reader:
     facts = reader.facts
-layout = plan_output(facts.checked, ["amplitude"], packets=facts if target.stem == "keep" else None)
+layout = plan_output(facts, ["amplitude"], packets=facts if target.stem == "keep" else None)
 rows = layout.rows(np.frombuffer(np.random.default_rng(0).bytes(60000 * 59), dtype="V59").view(
     np.dtype([("a", "V59")])).view(__import__("wavebatch.files.las.header", fromlist="x").STANDARD_DTYPES[9]))
 rows["classification_flags"] &= 0b11001111

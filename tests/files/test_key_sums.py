@@ -36,7 +36,7 @@ def test_sums_are_those_of_a_dictionary(held, spread, seed, stride, monkeypatch)
         for key, value in parts:
             sums.add(key, value)
         pieces = list(sums.pieces())
-        assert bool(sums.spilled) == (min(spread, 3000) > held // 2)
+        assert bool(len(sums._runs)) == (min(spread, 3000) > held // 2)
     keys = np.concatenate([key for key, _ in pieces])
     values = np.concatenate([value for _, value in pieces])
     expected = slow_sums(parts)
@@ -49,7 +49,7 @@ def test_pieces_of_many_runs_are_small(monkeypatch):
     with KeyedSums(3, held=400) as sums:
         for key, value in draw_parts(5, 2**23, 400):
             sums.add(key, value)
-        runs = sums.spilled
+        runs = len(sums._runs)
         sizes = [len(key) for key, _ in sums.pieces()]
     assert runs > 50 and sum(sizes) > 30_000 and max(sizes) <= 400 + 8 * runs and min(sizes) > 0
 

@@ -26,8 +26,8 @@ def test_either_sign_gives_the_same_rays(tmp_path, toward, most_returns):
     raw = make_raw(toward=toward, most_returns=most_returns)
     path = raw.write(tmp_path / "a.las")
     scan = scan_of(path)
-    assert scan.direction == ("toward" if toward else "away")
-    assert scan.vector_ratio == pytest.approx(np.linalg.norm(TOWARD) * 1000 / 0.149896229)
+    assert scan.vectors.direction == ("toward" if toward else "away")
+    assert scan.vectors.ratio == pytest.approx(np.linalg.norm(TOWARD) * 1000 / 0.149896229)
     assert scan.warnings == ()
     for _, _, origin, direction in read_all(path).values():
         assert origin[2] == pytest.approx(500, abs=2e-3)
@@ -44,9 +44,9 @@ def test_witnesses_that_contradict_each_other_are_refused_unless_overridden(tmp_
     with pytest.raises(InputError, match=r"a\.las: packet vectors contradict each other: .*pass --direction"):
         scan_of(path)
     scan = scan_of(path, direction="toward")
-    assert (scan.direction, scan.problems) == ("toward", ())
+    assert (scan.vectors.direction, scan.problems) == ("toward", ())
     assert "--direction toward overrides" in scan.warnings[0]
-    assert scan_of(path, direction="away").direction == "away"
+    assert scan_of(path, direction="away").vectors.direction == "away"
 
 
 def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):
@@ -55,7 +55,7 @@ def test_vectors_that_say_nothing_are_refused_unless_overridden(tmp_path):
     path = raw.write(tmp_path / "a.las")
     with pytest.raises(InputError, match="is not clear.*--direction toward or away"):
         scan_of(path)
-    assert scan_of(path, direction="away").direction == "away"
+    assert scan_of(path, direction="away").vectors.direction == "away"
 
 
 def test_heights_that_vary_do_not_matter_where_packets_are_shared(tmp_path):
@@ -67,13 +67,13 @@ def test_heights_that_vary_do_not_matter_where_packets_are_shared(tmp_path):
     for axis, name in enumerate("XYZ"):
         raw.points[name] = np.rint(xyz[:, axis] / 0.001)
         raw.points[("x_t", "y_t", "z_t")[axis]] = -vector[:, axis]
-    assert scan_of(raw.write(tmp_path / "a.las")).direction == "away"
+    assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "away"
 
 
 def test_a_given_direction_that_the_file_denies_is_used_and_said(tmp_path):
     path = make_raw().write(tmp_path / "a.las")
     scan = scan_of(path, direction="away")
-    assert scan.direction == "away"
+    assert scan.vectors.direction == "away"
     assert "overrides the evidence of the file" in scan.warnings[0]
     assert scan_of(path, direction="toward").warnings == ()
 
@@ -89,7 +89,7 @@ def test_odd_lengths_are_used_as_stored_and_said(tmp_path, factor):
     turn(raw, factor)
     path = raw.write(tmp_path / "a.las")
     scan = scan_of(path)
-    assert scan.vector_form == "stored"
+    assert scan.vectors.form == "stored"
     assert "times c/2 long" in scan.warnings[0]
     direction = next(iter(read_all(path).values()))[3]
     np.testing.assert_allclose(direction, -1000 * TOWARD * factor, rtol=1e-5)
@@ -108,8 +108,8 @@ def test_vectors_as_long_as_the_path_are_divided_by_minus_the_location(tmp_path,
         raw.points[name] *= -raw.points["return_point_wave_location"]
     path = raw.write(tmp_path / "a.las")
     scan = scan_of(path)
-    assert (scan.vector_form, scan.direction) == ("range", "toward")
-    assert scan.vector_ratio == pytest.approx(0.9997, abs=0.01)
+    assert (scan.vectors.form, scan.vectors.direction) == ("range", "toward")
+    assert scan.vectors.ratio == pytest.approx(0.9997, abs=0.01)
     assert "divided by minus the return location" in scan.warnings[0]
     for _, _, origin, direction in read_all(path).values():
         assert origin[2] == pytest.approx(500, abs=2e-3)
@@ -129,4 +129,4 @@ def test_returns_that_meet_only_far_apart_still_vote(tmp_path, monkeypatch):
     raw.points = raw.points[np.argsort(raw.points["bit_fields"], kind="stable")]
     monkeypatch.setattr(reader_module, "UNIT_POINTS", 64)
     monkeypatch.setattr(shared_packets, "WINDOW", 64)
-    assert scan_of(raw.write(tmp_path / "a.las")).direction == "toward"
+    assert scan_of(raw.write(tmp_path / "a.las")).vectors.direction == "toward"

@@ -85,7 +85,7 @@ def test_headerless_wdp_is_refused_unless_forced(tmp_path):
     assert "--headerless" in refused(path, "does not begin with the 60-byte header")
     assert_read(path, raw, headerless=True)
     with StripReader(path, headerless=True) as reader:
-        assert (reader.facts.packet_base, reader.facts.packet_start) == (-60, 0)
+        assert (reader.facts.packets.base, reader.facts.packets.start) == (-60, 0)
 
 
 def test_headerless_wdp_whose_offsets_count_from_zero(tmp_path):
@@ -184,7 +184,7 @@ def test_records_behind_the_packets_are_no_packets(tmp_path):
     path.write_bytes(data)
     with StripReader(path) as reader:
         facts = reader.facts
-        assert facts.packet_end - facts.packet_start == len(raw.packets)
+        assert facts.packets.end - facts.packets.start == len(raw.packets)
         assert facts.warnings == ()
     assert_read(path, raw)
 

@@ -78,12 +78,12 @@ def test_real_files_give_every_packet_once(monkeypatch, name, packets, unit_poin
     with StripReader(path) as reader:
         facts = reader.facts
         kinds = {i: (d.bits, d.n_samples) for i, d in facts.digitizers.items()}
-        data = facts.packet_file.read_bytes()[facts.packet_base :]
+        data = facts.packets.file.read_bytes()[facts.packets.base :]
         with reader.scan() as scan:
             assert scan.packets == packets
             assert scan.with_waveform == len(points)
-            assert scan.direction == "toward"
-            assert abs(scan.vector_ratio - 0.9997) < 2e-4
+            assert scan.vectors.direction == "toward"
+            assert abs(scan.vectors.ratio - 0.9997) < 2e-4
     assert_same(read_all(path, size=100), read_plainly(points, data, kinds))
 
 
@@ -91,7 +91,7 @@ def _shuffled(tmp_path, points, order):
     source = data_file(RIEGL)
     with StripReader(source) as reader:
         start = source.read_bytes()[: source.stat().st_size - points.nbytes]
-        wdp = reader.facts.packet_file.read_bytes()
+        wdp = reader.facts.packets.file.read_bytes()
     path = tmp_path / "s.las"
     path.write_bytes(start + points[order].tobytes())
     path.with_suffix(".wdp").write_bytes(wdp)
@@ -124,8 +124,8 @@ def test_packets_and_returns_do_not_depend_on_the_order_of_points(tmp_path, monk
         assert (scan.packets, scan.with_waveform) == (2375, 2535)
         spans = [members[-1] - members[0] for _, members in plain.values()]
         assert scan.reach == max(spans)
-        assert scan.direction == "toward"
-        spooled = scan.spool
+        assert scan.vectors.direction == "toward"
+        spooled = scan.context.path
         assert spooled.exists()
     assert not spooled.exists()
 
@@ -364,7 +364,7 @@ def test_extra_bytes_and_crs_are_told(tmp_path):
     record[4:8] = b"tail"
     raw.vlrs += [vlr(b"LASF_Spec", 4, bytes(record)), vlr(b"LASF_Projection", 2112, b"PROJCS[\"x\"]\0")]
     with StripReader(raw.write(tmp_path / "a.las")) as reader, reader.scan() as scan:
-        assert reader.facts.extra_dimensions == ("tail",)
+        assert [record.name for record in reader.facts.records] == ["tail"]
         assert reader.facts.crs == 'PROJCS["x"]'
         assert reader.read_unit(0, scan).points["tail"].tolist() == list(range(len(wide)))
 
@@ -372,7 +372,7 @@ def test_extra_bytes_and_crs_are_told(tmp_path):
 def test_long_records_make_smaller_units(tmp_path, monkeypatch):
     monkeypatch.setattr(reader_module, "UNIT_BYTES", 57 * 100)
     with StripReader(make_raw(200).write(tmp_path / "a.las")) as reader:
-        assert reader.unit_count() == -(-reader.facts.point_count // 100)
+        assert reader.unit_count() == -(-reader.facts.header.point_count // 100)
 
 
 def test_a_file_that_shrinks_while_it_is_read_is_an_input_error(tmp_path):

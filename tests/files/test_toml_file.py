@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.text_file import MOST_BYTES, read_text
 from wavebatch.files.toml_file import (
     LARGEST_INTEGER,
-    MOST_BYTES,
     TomlTable,
     check_number,
     check_type,
     format_toml,
     parse_toml,
-    read_toml_text,
     shorten,
 )
 
@@ -97,15 +96,15 @@ def test_other_types_are_refused(value):
 def test_reading_is_bounded(tmp_path):
     path = tmp_path / "a.toml"
     path.write_bytes(b"#" * MOST_BYTES)
-    assert len(read_toml_text(path, "chain file")) == MOST_BYTES
+    assert len(read_text(path, "chain file")) == MOST_BYTES
     path.write_bytes(b"#" * (MOST_BYTES + 1))
     with pytest.raises(ConfigError, match="a.toml: chain file is larger than 4 MiB"):
-        read_toml_text(path, "chain file")
+        read_text(path, "chain file")
     path.write_bytes(b"a = '\xff'")
     with pytest.raises(ConfigError, match=r"a.toml: chain file is not UTF-8 text \(byte 5\)"):
-        read_toml_text(path, "chain file")
+        read_text(path, "chain file")
     with pytest.raises(ConfigError, match="none.toml: chain file cannot be read: No such file"):
-        read_toml_text(tmp_path / "none.toml", "chain file")
+        read_text(tmp_path / "none.toml", "chain file")
 
 
 @pytest.mark.parametrize("text", ["a", "a = 1\na = 2", "a = " + "[" * 10_000, "a = " + "9" * 5000, 'a = "\\ud835"'])

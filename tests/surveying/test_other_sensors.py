@@ -8,12 +8,13 @@ import pytest
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.pulse_shape import PulseShape, measure_pulse
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.stages.chain import STAGES
 from wavebatch.surveying import Survey, survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.system_file import SavedSurvey, load_survey, parse_survey, write_survey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey, parse_survey
 
 
 def flat_top(x):
@@ -173,7 +174,7 @@ def test_systems_of_digitizers_are_saved(tmp_path):
     own = SystemPulse(1.2, baseline=300.0, noise_by_kind={"quiet": 8.0}, components=((1.0, 0.0, 1.2), (0.1, 5.0, 1.0)))
     survey = Survey(SystemPulse(2.0, digitizers={4: own, 9: SystemPulse(3.0)}), 5, {}, ())
     path = tmp_path / "system.toml"
-    write_survey(path, SavedSurvey(survey), overwrite=False)
+    write_text(path, format_survey(SavedSurvey(survey)), overwrite=False)
     assert load_survey(path).survey == survey
     text = path.read_text()
     wrong = {

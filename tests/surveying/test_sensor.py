@@ -182,7 +182,7 @@ def test_what_is_not_in_metres_is_refused(wide_strip, units, ratio, message):
     with StripReader(wide_strip) as reader, reader.scan() as scan:
         reader.facts = replace(reader.facts, units=(CrsUnits("projected", 1.0), units))
         with pytest.raises(InputError, match=message) as caught:
-            find_sensor(reader, replace(scan, vector_ratio=ratio), SensorRequest())
+            find_sensor(reader, replace(scan, vectors=replace(scan.vectors, ratio=ratio)), SensorRequest())
     assert "\n" not in str(caught.value) and "project the strip" in str(caught.value)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
     SYSTEM_SCHEMA,
@@ -20,7 +21,6 @@ from wavebatch.surveying.system_file import (
     format_survey,
     load_survey,
     parse_survey,
-    write_survey,
 )
 from wavebatch.surveying.systems.system_table import QUANTITIES
 
@@ -175,11 +175,11 @@ def test_what_is_wrong_is_said_in_one_line(old, new, words):
 
 def test_files(tmp_path):
     path = tmp_path / "SYSTEM.toml"
-    write_survey(path, SAVED, overwrite=False)
+    write_text(path, format_survey(SAVED), overwrite=False)
     assert _same(load_survey(path), SAVED)
     with pytest.raises(InputError, match="exists already"):
-        write_survey(path, SAVED, overwrite=False)
-    write_survey(path, SavedSurvey(SURVEY), overwrite=True)
+        write_text(path, format_survey(SAVED), overwrite=False)
+    write_text(path, format_survey(SavedSurvey(SURVEY)), overwrite=True)
     assert load_survey(path).strip == ""
     assert [entry.name for entry in tmp_path.iterdir()] == ["SYSTEM.toml"]
     with pytest.raises(ConfigError, match=r"none\.toml: system file cannot be read"):
@@ -188,4 +188,4 @@ def test_files(tmp_path):
     with pytest.raises(ConfigError, match="not UTF-8"):
         load_survey(path)
     with pytest.raises(InputError, match="make the folder first"):
-        write_survey(tmp_path / "none" / "x.toml", SAVED, overwrite=False)
+        write_text(tmp_path / "none" / "x.toml", format_survey(SAVED), overwrite=False)

@@ -166,7 +166,7 @@ def two_channels(tmp_path_factory, edit_points):
     finally:
         strip._open_writer = open_writer
     with StripReader(path) as reader:
-        base = reader.facts.packet_base
+        base = reader.facts.packets.base
     length = scene.recording.n_samples
     weak: set[int] = set()
 

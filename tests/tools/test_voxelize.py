@@ -554,8 +554,8 @@ def test_real_strips(riegl, leica, tmp_path):
         assert summary.waveforms == waveforms and summary.with_signal > 0.99 * waveforms
         assert summary.anchored > 0.98 * summary.with_signal and summary.outside == 0
         with StripReader(path) as reader:
-            points = reader.read_points(0, reader.facts.point_count)
-            scales, offsets = np.array(reader.facts.scales), np.array(reader.facts.offsets)
+            points = reader.read_points(0, reader.facts.header.point_count)
+            scales, offsets = np.array(reader.facts.header.scales), np.array(reader.facts.header.offsets)
         xyz = np.stack([points[name] for name in "XYZ"], axis=1) * scales + offsets
         returns = np.floor((xyz - found["origin"]) / 0.5).astype(int)
         near = {tuple(one + off) for one in returns for off in np.ndindex(3, 3, 3)}

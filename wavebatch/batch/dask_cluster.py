@@ -22,6 +22,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, InvalidS
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch.processes import settle
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
@@ -280,14 +281,7 @@ def _knock(address: str) -> None:
 def _call_in_time(seconds: float, function: Callable) -> Any:
     """The result of `function()`; TimeoutError where it takes longer, while its thread goes on."""
     future: Future = Future()
-
-    def call() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=call, daemon=True).start()
+    threading.Thread(target=settle, args=(future, function), daemon=True).start()
     return future.result(timeout=seconds)
 
 

@@ -91,7 +91,7 @@ class SecondPass:
 
     def add(self, rows: np.ndarray) -> None:
         """Keep rows (m,), in the order in which they will be written."""
-        first = -len(self._rows) % self._every
+        first = -self._rows.count % self._every
         self._sample.append(self._place(rows[first :: self._every]))
         self._rows.add(rows)
         while sum(map(len, self._sample)) > SAMPLE:
@@ -107,7 +107,7 @@ class SecondPass:
         sample = sample[np.isfinite(sample).all(axis=1)]
         # Tiles much smaller than their buffers would list each point many times.
         tiles = cut_tiles(sample, max(self._tile_points // self._every, 1), 8 * reach)
-        self._found.extend(len(self._rows))
+        self._found.extend(self._rows.count)
         self._entries = Spool(len(tiles), _ENTRY)
         counts, at = np.zeros(len(tiles), np.int64), 0
         for rows in self._rows.pieces():
@@ -117,7 +117,7 @@ class SecondPass:
             counts += np.bincount(tile, minlength=len(tiles))
             self._entries.append(tile, _list_entries(rows, at)[able[index]])
             at += len(rows)
-        task = TileTask(self._step, tiles, self._entries.seal(), self._layout.scales)
+        task = TileTask(self._step, tiles, self._entries.seal(), self._layout.source.header.scales)
         self._blob = pickle.dumps(task, pickle.HIGHEST_PROTOCOL)
         for tile, count in enumerate(counts.tolist()):
             self._parts.extend((tile, part) for part in range(-(-count // PART_POINTS)))
@@ -172,7 +172,7 @@ class SecondPass:
             self._entries.close()
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
-        return np.stack([rows[name] for name in "XYZ"], axis=1) * np.array(self._layout.scales)
+        return np.stack([rows[name] for name in "XYZ"], axis=1) * np.array(self._layout.source.header.scales)
 
 
 def process_tile(blob: bytes, number: int, part: int) -> Found:

@@ -20,6 +20,7 @@ from wavebatch.core.no_data import count_reasons
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.las.point_formats import locate, split_numbers
 from wavebatch.kernels.geometry.group_returns import find_nearest, find_pulses, number_returns
 
 if TYPE_CHECKING:
@@ -167,8 +168,8 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
     xyz = np.stack([np.append(table.attributes[name], np.nan)[rows.echo] for name in "xyz"], axis=1)
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]
-    places = np.where(np.isnan(xyz), _coordinates(records, layout), xyz)
-    number, total = _number_rows(find_pulses(unit.points["gps_time"])[rows.owner], places, direction, records, layout)
+    places = np.where(np.isnan(xyz), locate(records, layout.source.header), xyz)
+    number, total = _number_rows(find_pulses(unit.points["gps_time"])[rows.owner], places, direction, records)
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
 
@@ -262,24 +263,17 @@ def _place_rows(
 
 
 def _number_rows(
-    pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray, layout: OutputLayout
+    pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return number and number of returns; pulses without any waveform keep those of the input."""
     number, total, known = number_returns(pulse, xyz, direction)
-    bits = records["bit_fields"].astype(np.int64)
-    width = 4 if layout.source_format >= 6 else 3
-    mask = (1 << width) - 1
-    return np.where(known, number, bits & mask), np.where(known, total, (bits >> width) & mask)
+    given = split_numbers(records)
+    return np.where(known, number, given[0]), np.where(known, total, given[1])
 
 
 def _locations(records: np.ndarray) -> np.ndarray:
     """Return locations [ns], which order points that share a packet; NaN comes first."""
     return np.nan_to_num(widen(records["return_point_wave_location"]) / PS_PER_NS, nan=-np.inf)
-
-
-def _coordinates(records: np.ndarray, layout: OutputLayout) -> np.ndarray:
-    counts = np.stack([records[name] for name in "XYZ"], axis=1)
-    return counts * np.array(layout.scales) + np.array(layout.offsets)
 
 
 def _columns(table: EchoTable, echo: np.ndarray, layout: OutputLayout) -> dict[str, np.ndarray]:

@@ -140,12 +140,12 @@ def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),
-        "points": facts.point_count,
-        "point_format": facts.point_format,
-        "packet_bytes": facts.packet_end - facts.packet_start,
+        "points": facts.header.point_count,
+        "point_format": facts.header.point_format,
+        "packet_bytes": facts.packets.end - facts.packets.start,
         "output": str(cloud_path(job, options.folder)),
         "output_point_format": layout.point_format,
         "columns": [written.record.name for written in layout.written],
         # LAZ takes about two fifths of LAS.
-        "estimated_bytes": math.ceil(facts.point_count * layout.dtype.itemsize * (0.4 if is_laz else 1.0)),
+        "estimated_bytes": math.ceil(facts.header.point_count * layout.dtype.itemsize * (0.4 if is_laz else 1.0)),
     }

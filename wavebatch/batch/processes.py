@@ -55,12 +55,12 @@ class Workers:
             if kind is None:
                 self._shut(cancel=False)
             else:
-                self.kill()
+                self.restart()
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
-            return _run_now(function, arguments)
+            return settle(Future(), function, *arguments)
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(
@@ -74,11 +74,7 @@ class Workers:
         return wait(futures, return_when=FIRST_COMPLETED).done
 
     def restart(self) -> None:
-        """End all processes after one has died; the next `submit` starts new ones."""
-        self.kill()
-
-    def kill(self) -> None:
-        """End all processes at once."""
+        """End all processes at once, for example after one has died; the next `submit` starts new ones."""
         if self._pool is not None:
             for child in set(multiprocessing.active_children()) - self._before:
                 child.kill()
@@ -90,8 +86,8 @@ class Workers:
             self._pool = None
 
 
-def _run_now(function: Callable, arguments: tuple) -> Future:
-    future: Future = Future()
+def settle(future: Future, function: Callable, *arguments: Any) -> Future:
+    """Run `function(*arguments)` here; its result or its error becomes that of `future`."""
     try:
         future.set_result(function(*arguments))
     except Exception as error:
@@ -102,16 +98,14 @@ def _run_now(function: Callable, arguments: tuple) -> Future:
 @contextlib.contextmanager
 def _single_threaded() -> Iterator[None]:
     """Libraries of processes that are started inside use one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in _ONE_THREAD:
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _start_worker(scratch: Path | None) -> None:

@@ -73,17 +73,14 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
 
 def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the results of scan and survey as plain values; `described` is from `describe_job`."""
-    scan = prepared.scan
+    vectors = prepared.scan.vectors
+    ratio = without_nan(vectors.ratio)
     fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
     seen = describe_survey(prepared.choice, prepared.job.request, fingerprint)
     if prepared.job.request.flight:
         seen["survey"]["flight"] = {"fits": not prepared.stranger, "reason": prepared.stranger or None}
     return {
-        "direction": {
-            "sign": scan.direction,
-            "evidence": scan.direction_evidence,
-            "vector_ratio": without_nan(scan.vector_ratio),
-        },
+        "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
         **seen,
     }
@@ -116,6 +113,7 @@ def build_document(
         Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
+    packets, file, size = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     lost = {**layout.dropped, **dropped}
     return {
         "schema": STRIP_SCHEMA,
@@ -123,13 +121,9 @@ def build_document(
         **describe_chain(prepared),
         "strip": {
             "las_version": facts.version,
-            "point_format": facts.point_format,
-            "points": facts.point_count,
-            "packets": {
-                "file": facts.packet_file.name if facts.packet_file else None,
-                "internal": facts.internal,
-                "bytes": facts.packet_end - facts.packet_start,
-            },
+            "point_format": facts.header.point_format,
+            "points": facts.header.point_count,
+            "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": size},
             **describe_strip(prepared, described),
         },
         "output": {

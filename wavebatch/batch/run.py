@@ -26,9 +26,10 @@ from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import remove_stale, reporting
+from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Survey
 from wavebatch.surveying.flight import read_samples, survey_flight, surveys_agree
-from wavebatch.surveying.system_file import SavedSurvey, load_survey, write_survey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +143,7 @@ def _survey_flight(
     path = flight_path(options.folder)
     flight = survey_flight(samples)
     try:
-        write_survey(path, flight.saved, overwrite=options.overwrite)
+        write_text(path, format_survey(flight.saved), overwrite=options.overwrite)
     except InputError:
         # Another run into this folder was faster: its survey counts, so that all strips have the same one.
         found = load_flight(jobs, options)

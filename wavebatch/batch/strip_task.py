@@ -90,7 +90,7 @@ class StripTask:
         options, job = self._options, self.job
         with job.open() as reader:
             self.facts = reader.facts
-        packet_file = self.facts.packet_file
+        packet_file = self.facts.packets.file
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
@@ -149,12 +149,8 @@ class StripTask:
     def _open(self) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
-        described = self._described
-        provenance = {
-            **described,
-            **report_file.describe_chain(prepared),
-            **report_file.describe_strip(prepared, described),
-        }
+        provenance = {**self._described, **report_file.describe_chain(prepared)}
+        provenance |= report_file.describe_strip(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:

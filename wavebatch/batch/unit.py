@@ -81,9 +81,8 @@ class StripJob:
 
     def absolute(self) -> StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
-        sensor = self.sensor
-        if sensor.trajectory is not None:
-            sensor = replace(sensor, trajectory=sensor.trajectory.absolute())
+        file = self.sensor.trajectory
+        sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
         return replace(self, path=self.path.absolute(), sensor=sensor)
 
     def open(self) -> StripReader:
@@ -175,7 +174,7 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
     """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
     options = job.options
     return plan_output(
-        facts.checked,
+        facts,
         options.columns,
         point_format=options.point_format,
         packets=facts if options.keep_packets else None,
@@ -275,7 +274,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     timing: dict[str, float] = {}
     echoes_mode = prepared.job.options.points == "echoes"
     start = time.perf_counter()
-    with StripReader.reopen(prepared.facts) as reader:
+    with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
         blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)

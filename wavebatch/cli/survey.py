@@ -56,7 +56,7 @@ def survey(
     from wavebatch.files.inputs import find_files
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
-    from wavebatch.surveying.system_file import write_survey
+    from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
     for target in (output, chain_file):
@@ -65,7 +65,7 @@ def survey(
     paths = find_files(strips)
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
-        write_survey(output, saved, overwrite=overwrite)
+        write_text(output, format_survey(saved), overwrite=overwrite)
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     print_result(as_json, _document(saved, facts), _lines(saved, facts))
@@ -90,9 +90,9 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             "strip": str(opened.facts.path),
             "points": scan.points,
             "packets": scan.packets,
-            "direction": {"sign": scan.direction, "evidence": scan.direction_evidence},
+            "direction": {"sign": scan.vectors.direction, "evidence": scan.vectors.evidence},
         }
-        packet_file = opened.facts.packet_file
+        packet_file = opened.facts.packets.file
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
 
 

@@ -98,13 +98,10 @@ _UNTOUCHED = ("backend", "backend_fallback", "interactive", "toolbar", "timezone
 
 def _save(figure: Figure, target: Path, overwrite: bool) -> None:
     suffix = target.suffix.lower()
-    draft = Draft(target, overwrite=overwrite)
-    try:
+    with Draft(target, overwrite=overwrite) as draft:
         with reporting(target):
             figure.savefig(draft.file, format=suffix[1:], metadata=_METADATA[suffix])
         draft.publish()
-    finally:
-        draft.discard()
 
 
 def plain_text(text: str, most: int = 80) -> str:

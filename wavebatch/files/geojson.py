@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.text_file import read_text
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,12 +62,8 @@ def load_polygons(path: Path | str) -> list[Polygon]:
 
     Raises ConfigError if the file cannot be read or holds anything else.
     """
-    try:
-        text = Path(path).read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: polygons cannot be read: {getattr(error, 'strerror', '') or error}") from error
     polygons = []
-    for number, (properties, rings) in enumerate(read_features(text, path), 1):
+    for number, (properties, rings) in enumerate(read_features(read_text(path, "polygon file", 1 << 30), path), 1):
         for ring in rings:
             if len(ring) < 3 or not np.isfinite(ring).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.text_file import read_text
 
 SUFFIXES = (".las", ".laz")
 
@@ -52,18 +53,16 @@ def _expand(argument: str, folder: Path) -> Iterator[Path]:
         return
     path = folder / argument
     if path.is_dir():
-        found = sorted(entry for entry in path.iterdir() if _is_strip(entry))
-        if not found:
-            raise ConfigError(f"{path}: the folder holds no .las or .laz file")
-        yield from found
+        found, problem = sorted(path.iterdir()), f"{path}: the folder holds"
     elif path.exists() or not glob.has_magic(argument):
         yield path
+        return
     else:
-        found = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]
-        strips = [entry for entry in found if _is_strip(entry)]
-        if not strips:
-            raise ConfigError(f"{argument}: matches no .las or .laz file")
-        yield from strips
+        found, problem = map(Path, sorted(glob.glob(str(path), recursive=True))), f"{argument}: matches"
+    strips = [entry for entry in found if _is_strip(entry)]
+    if not strips:
+        raise ConfigError(f"{problem} no .las or .laz file")
+    yield from strips
 
 
 def _is_strip(path: Path) -> bool:
@@ -71,11 +70,7 @@ def _is_strip(path: Path) -> bool:
 
 
 def _read_list(path: Path) -> Iterator[Path]:
-    try:
-        lines = path.read_text("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: the list cannot be read: {getattr(error, 'strerror', '') or error}") from error
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(path, "the list", 1 << 30).splitlines(), 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):
             if entry.startswith("@"):

@@ -1,13 +1,36 @@
-"""Small text files that appear whole or not at all.
+"""Small text files: read with a bound, and written so that they appear whole or not at all.
 
-The commands write their reports, system files and chain files with it. Large outputs use `disk/publish.py` directly.
+Chain, system and calibration files, lists of strips and reports use it. Large outputs use `disk/publish.py`.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
+
+MOST_BYTES = 4 << 20
+"""Largest TOML file that is read: five times a system file with 255 digitizers of 16 Gaussians each."""
+
+
+def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
+    """Return the text of a file of at most `most` bytes.
+
+    `what` names the kind of file in messages, for example "chain file".
+    Raises ConfigError where the file cannot be read, is too large or is not UTF-8 text.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(most + 1)
+    except OSError as error:
+        raise ConfigError(f"{path}: {what} cannot be read: {error.strerror or error}") from error
+    if len(data) > most:
+        raise ConfigError(f"{path}: {what} is larger than {most >> 20} MiB; name another file")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start})") from error
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:
@@ -20,10 +43,7 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
         with reporting(path), open_stream(path) as stream:
             stream.write(data)
         return
-    draft = Draft(path, overwrite=overwrite)
-    try:
+    with Draft(path, overwrite=overwrite) as draft:
         with reporting(path):
             draft.file.write(data)
         draft.publish()
-    finally:
-        draft.discard()

@@ -13,14 +13,10 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-
-MOST_BYTES = 4 << 20
-"""Largest file that is read: five times a system file with 255 digitizers of 16 Gaussians each."""
 
 LARGEST_INTEGER = 1 << 53
 """Largest integer that is taken for a number: a float64 holds all integers up to here exactly."""
@@ -111,25 +107,6 @@ def _format_key(key: str) -> str:
 
 def _one_line(text: str) -> str:
     return " ".join(text.split())
-
-
-def read_toml_text(path: Path | str, what: str) -> str:
-    """Return the text of a TOML file of at most `MOST_BYTES`.
-
-    `what` names the kind of file in messages, for example "chain file".
-    Raises ConfigError where the file cannot be read, is too large or is not UTF-8 text.
-    """
-    try:
-        with open(path, "rb") as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(f"{path}: {what} cannot be read: {error.strerror or error}") from error
-    if len(data) > MOST_BYTES:
-        raise ConfigError(f"{path}: {what} is larger than {MOST_BYTES >> 20} MiB; name another file")
-    try:
-        return data.decode()
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start})") from error
 
 
 def parse_toml(text: str, name: str) -> TomlTable:

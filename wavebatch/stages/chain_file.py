@@ -9,15 +9,8 @@ from typing import Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.toml_file import (
-    TomlTable,
-    check_range,
-    check_type,
-    format_toml,
-    format_value,
-    parse_toml,
-    read_toml_text,
-)
+from wavebatch.files.text_file import read_text
+from wavebatch.files.toml_file import TomlTable, check_range, check_type, format_toml, format_value, parse_toml
 from wavebatch.stages.chain import Chain, Stage, Step
 from wavebatch.stages.plugins import find_stage
 
@@ -68,7 +61,7 @@ def load_chain(path: Path | str) -> Chain:
     ConfigError
         Where the file or the chain is wrong; names file, table, key and the nearest known word.
     """
-    return parse_chain(read_toml_text(path, "chain file"), str(path))
+    return parse_chain(read_text(path, "chain file"), str(path))
 
 
 def parse_chain(text: str, name: str) -> Chain:

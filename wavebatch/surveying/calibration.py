@@ -15,7 +15,8 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml, read_toml_text
+from wavebatch.files.text_file import read_text
+from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml
 from wavebatch.stages.chain import STAGES, Chain, Step
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -171,7 +172,7 @@ def format_calibration(found: Calibration) -> str:
 
 def load_calibration(path: Path | str) -> Calibration:
     """Read a calibration file; raises ConfigError, in one line, where it cannot be read or is wrong."""
-    return parse_calibration(read_toml_text(path, "calibration file"), str(path))
+    return parse_calibration(read_text(path, "calibration file"), str(path))
 
 
 def parse_calibration(text: str, name: str) -> Calibration:

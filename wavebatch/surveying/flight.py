@@ -174,7 +174,7 @@ def read_samples(
                 share = max(-(-share // len(paths)), 1 if waveforms else LEAST_SHARE)
                 blocks = tuple(reader.sample_blocks(scan, share))
                 facts = {"points": scan.points, "packets": scan.packets}
-                fingerprint = take_fingerprint(path, reader.facts.packet_file)
+                fingerprint = take_fingerprint(path, reader.facts.packets.file)
             if not blocks:
                 raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
         except InputError as error:

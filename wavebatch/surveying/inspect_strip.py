@@ -73,10 +73,10 @@ def describe_strip(path: Path | str, *, direction: str = "auto", headerless: boo
             "packets": _describe_packets(facts, scan),
             "samples": _describe_samples(reader, scan),
             "vectors": {
-                "direction": scan.direction,
-                "evidence": scan.direction_evidence,
-                "length_over_half_c": without_nan(scan.vector_ratio),
-                "form": scan.vector_form,
+                "direction": scan.vectors.direction,
+                "evidence": scan.vectors.evidence,
+                "length_over_half_c": without_nan(scan.vectors.ratio),
+                "form": scan.vectors.form,
             },
             "notes": list(scan.notes),
             "warnings": [*facts.warnings, *scan.warnings],
@@ -121,7 +121,7 @@ def _check_chain(path: Path) -> Findings:
 
 
 def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
-    if scan.is_hopeless:
+    if scan.broken and not scan.with_waveform:
         return Findings(str(path), scan.problems[:1], ())
     facts = reader.facts
     problems = [*scan.problems, *scan.warnings, *facts.warnings]
@@ -130,7 +130,7 @@ def _check_strip(path: Path, reader: StripReader, scan: StripScan) -> Findings:
     except InputError as error:
         problems.append(_without_name(path, error))
     notes = [*_note_descriptors(facts, scan), *scan.notes, *audit_header(reader, scan)]
-    summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.direction} the sensor"
+    summary = f"{scan.points} points, {scan.packets} packets, vectors {scan.vectors.direction} the sensor"
     return Findings(str(path), tuple(problems), tuple(notes), summary)
 
 
@@ -172,12 +172,12 @@ def _describe_file(facts: StripFacts) -> dict[str, Any]:
         "file": str(facts.path),
         "bytes": facts.size,
         "las_version": facts.version,
-        "point_format": facts.point_format,
-        "compressed": facts.compressed,
+        "point_format": facts.header.point_format,
+        "compressed": facts.header.compressed,
         "crs": facts.crs,
-        "scales": list(facts.scales),
-        "offsets": list(facts.offsets),
-        "extra_dimensions": list(facts.extra_dimensions),
+        "scales": list(facts.header.scales),
+        "offsets": list(facts.header.offsets),
+        "extra_dimensions": [record.name for record in facts.records],
     }
 
 
@@ -195,9 +195,9 @@ def _describe_packets(facts: StripFacts, scan: StripScan) -> dict[str, Any]:
     used = {index: count for index, count in scan.by_descriptor.items() if index in facts.digitizers}
     return {
         "count": scan.packets,
-        "where": None if facts.packet_file is None else "internal" if facts.internal else "external",
-        "file": None if facts.packet_file is None else str(facts.packet_file),
-        "bytes": facts.packet_end - facts.packet_start,
+        "where": None if facts.packets.file is None else "internal" if facts.packets.internal else "external",
+        "file": None if facts.packets.file is None else str(facts.packets.file),
+        "bytes": facts.packets.end - facts.packets.start,
         "shorter_than_descriptor": scan.short,
         "farthest_shared": scan.reach,
         "descriptors": [_describe_descriptor(facts, scan, index, count) for index, count in used.items()],

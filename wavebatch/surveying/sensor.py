@@ -156,7 +156,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
     """Raise InputError where the coordinates are not in metres, or where the packet vectors make that doubtful."""
-    path, units, ratio = reader.facts.path, reader.facts.units, scan.vector_ratio
+    path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
     remedy = "project the strip to metres, or leave out the stages that measure in metres"
     for unit in units:
         if not unit.is_metric:

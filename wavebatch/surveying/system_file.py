@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch import __version__
-from wavebatch.files.text_file import write_text
-from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml, read_toml_text
+from wavebatch.files.text_file import read_text
+from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
 from wavebatch.surveying import Decision, Survey
 from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_numbers, read_system
 
@@ -55,14 +55,9 @@ def format_survey(saved: SavedSurvey) -> str:
     return format_toml(document, heading=_HEADING, comments=comment_system())
 
 
-def write_survey(path: Path, saved: SavedSurvey, *, overwrite: bool) -> None:
-    """Write a survey file, whole or not at all; raises InputError where it exists or cannot be written."""
-    write_text(path, format_survey(saved), overwrite=overwrite)
-
-
 def load_survey(path: Path | str) -> SavedSurvey:
     """Read a survey file; raises ConfigError, in one line, where it cannot be read or is wrong."""
-    return parse_survey(read_toml_text(path, "system file"), str(path))
+    return parse_survey(read_text(path, "system file"), str(path))
 
 
 def parse_survey(text: str, name: str) -> SavedSurvey:

@@ -10,7 +10,7 @@ import csv
 import datetime
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.geojson import find_inside, read_features
 from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.text_file import read_text
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.stages.chain_file import load_profile
@@ -80,11 +81,9 @@ def load_targets(path: Path | str) -> list[Target]:
     ConfigError
         In one line, where the file cannot be read, is empty or holds a wrong target.
     """
-    try:
-        text = Path(path).read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: targets cannot be read: {getattr(error, 'strerror', '') or error}") from error
-    rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(io.StringIO(text)))
+    text = read_text(path, "target file", 1 << 30)
+    lines = io.StringIO(text, newline=None)
+    rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
     targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
@@ -123,19 +122,6 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
     return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)
-
-
-@dataclass(slots=True)
-class _Found:
-    """Clean echoes on one target, one row each: x, y, z, range, amplitude, sigma, unit direction (3), channel."""
-
-    rows: list[np.ndarray] = field(default_factory=list)
-    number: int = 0
-
-    def add(self, rows: np.ndarray) -> None:
-        rows = rows[: max(MOST_ECHOES - self.number, 0)]
-        self.rows.append(rows)
-        self.number += len(rows)
 
 
 def calibrate_strip(
@@ -189,8 +175,8 @@ def calibrate_strip(
         if source.kind == "none":
             raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
         pulse = system or survey_blocks(read_sample(reader, scan)).system
-        found = _collect(reader, scan, targets, source, pulse)
-        fingerprint = take_fingerprint(path, reader.facts.packet_file)
+        found = [np.concatenate(parts)[:MOST_ECHOES] for parts in _collect(reader, scan, targets, source, pulse)]
+        fingerprint = take_fingerprint(path, reader.facts.packets.file)
     results = [_evaluate(target, found[i], attenuation) for i, target in enumerate(targets)]
     whole = _combine([result for result, _ in results], reflectance_error)
     if whole is None:
@@ -216,9 +202,12 @@ def calibrate_strip(
 
 def _collect(
     reader: StripReader, scan: Any, targets: Sequence[Target], source: SensorSource, system: SystemPulse
-) -> list[_Found]:
-    """Clean single echoes on every target; only waveforms with a return near a target are decomposed, to save time."""
-    chain, found = load_profile("balanced"), [_Found() for _ in targets]
+) -> list[list[np.ndarray]]:
+    """Clean single echoes on every target; only waveforms with a return near a target are decomposed, to save time.
+
+    A row is x, y, z, range, amplitude, sigma, unit direction (3), channel.
+    """
+    chain, found = load_profile("balanced"), [[np.empty((0, 10))] for _ in targets]
     corners = np.concatenate([target.corners for target in targets])
     low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
     for block in reader.all_blocks(scan, _BLOCK):
@@ -230,7 +219,7 @@ def _collect(
     return found
 
 
-def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Target], found: list[_Found]) -> None:
+def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Target], found: list[list]) -> None:
     alone = echoes.count(len(block))[echoes.waveform] == 1
     echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
     xyz = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
@@ -241,15 +230,15 @@ def _add_echoes(block: WaveformBlock, echoes: EchoTable, targets: Sequence[Targe
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(float)
     table = np.column_stack([*columns, np.full(len(echoes), SCANNERS * block.digitizer.index) + scanner])
     known = np.isfinite(table).all(axis=1)
-    for target, place in zip(targets, found, strict=True):
-        place.add(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
+    for target, parts in zip(targets, found, strict=True):
+        if sum(map(len, parts)) < MOST_ECHOES:
+            parts.append(table[known & target.contains(xyz[:, 0], xyz[:, 1])])
 
 
-def _evaluate(target: Target, found: _Found, attenuation: float) -> tuple[TargetResult, np.ndarray]:
+def _evaluate(target: Target, rows: np.ndarray, attenuation: float) -> tuple[TargetResult, np.ndarray]:
     """What one target gave, and the channel and the constant of each of its echoes, f8 (n, 2)."""
-    if found.number < LEAST_ECHOES:
-        return TargetResult(target.name, target.reflectance, found.number), np.empty((0, 2))
-    rows = np.concatenate(found.rows)
+    if len(rows) < LEAST_ECHOES:
+        return TargetResult(target.name, target.reflectance, len(rows)), np.empty((0, 2))
     xyz, (distance, amplitude, sigma), unit = rows[:, :3], rows[:, 3:6].T, rows[:, 6:9]
     if target.incidence is None:
         angle = np.arccos(np.clip(np.abs(unit @ fit_normal(xyz)), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Extra bytes and waveform packets that are copied unchanged from a strip to its output cloud.
+"""Extra bytes that are copied unchanged from a strip to its output cloud.
 
 `layout.plan_output` calls it. Rows of new echoes have no extra bytes, so a dimension is copied only if it has a free
 value for "no data".
@@ -7,25 +7,10 @@ value for "no data".
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from wavebatch.core.errors import InputError
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, choose_no_data
-from wavebatch.files.las.header import EVLR_HEADER_SIZE, STANDARD_DTYPES
-from wavebatch.files.strip.facts import StripFacts
-
-
-@dataclass(frozen=True, slots=True)
-class PacketSource:
-    """The bytes of all packets of the input, and how offsets change in the output."""
-
-    path: Path
-    start: int
-    end: int
-    internal: bool
-    shift: int
-    """Added to each byte offset: 60 if offsets count from the first byte of a .wdp without header, else 0."""
+from wavebatch.files.las.header import STANDARD_DTYPES
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +39,3 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[tuple[Carried, ..
             carried.append(Carried(record.with_no_data(empty), at))
         at += record.dtype.itemsize
     return tuple(carried), dropped
-
-
-def find_packets(facts: StripFacts) -> PacketSource:
-    """Return the packets of a strip; raises InputError if it has none."""
-    if facts.packet_file is None:
-        raise InputError(f"{facts.path}: has no packets to keep; leave --keep-packets out")
-    shift = max(0, EVLR_HEADER_SIZE - (facts.packet_start - facts.packet_base))
-    return PacketSource(facts.packet_file, facts.packet_start, facts.packet_end, facts.internal, shift)

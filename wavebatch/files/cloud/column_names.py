@@ -34,6 +34,11 @@ class Naming:
     """Written as 10 log10 of the value."""
 
 
+def _in_camel_case(*columns: str) -> dict[str, Naming]:
+    """Columns named like EchoWidth."""
+    return {column: Naming(column.title().replace("_", "")) for column in columns}
+
+
 STYLES: dict[str, dict[str, Naming]] = {
     "wavebatch": {},
     # Of the standard extra bytes of ASPRS one is a wavebatch column: pulse width, full width at half maximum in ns.
@@ -45,35 +50,25 @@ STYLES: dict[str, dict[str, Naming]] = {
     },
     # PDAL's Amplitude is in dB and its PulseWidth in samples of the digitizer, so these two names are not used.
     "pdal": {
+        **_in_camel_case(
+            "echo_time", "echo_width", "energy", "cross_section", "backscatter_coefficient", "incidence_angle",
+            "incidence_angle_normals", "echo_width_err", "incidence_angle_err", "incidence_angle_normals_err",
+            "echo_flags",
+        ),
         "amplitude": Naming("PeakAmplitude"),
-        "echo_time": Naming("EchoTime"),
-        "echo_width": Naming("EchoWidth"),
-        "energy": Naming("Energy"),
-        "range": Naming("EchoRange"),
-        "cross_section": Naming("CrossSection"),
-        "backscatter_coefficient": Naming("BackscatterCoefficient"),
-        "reflectance": Naming("Reflectance", unit="dB", decibel=True),
-        "incidence_angle": Naming("IncidenceAngle"),
-        "incidence_angle_normals": Naming("IncidenceAngleNormals"),
-        "range_err": Naming("EchoRangeErr"),
         "amplitude_err": Naming("PeakAmplitudeErr"),
-        "echo_width_err": Naming("EchoWidthErr"),
-        "incidence_angle_err": Naming("IncidenceAngleErr"),
-        "incidence_angle_normals_err": Naming("IncidenceAngleNormalsErr"),
+        "range": Naming("EchoRange"),
+        "range_err": Naming("EchoRangeErr"),
+        "reflectance": Naming("Reflectance", unit="dB", decibel=True),
         "pulse_deviation": Naming("PulseShapeDeviation"),
-        "echo_flags": Naming("EchoFlags"),
     },
-    "opals": {
-        "amplitude": Naming("Amplitude"),
-        "echo_width": Naming("EchoWidth"),
-        "range": Naming("Range"),
-        "cross_section": Naming("CrossSection"),
-        "backscatter_coefficient": Naming("BackscatterCoefficient"),
-        "reflectance": Naming("Reflectance"),
-    },
-}
+    "opals": _in_camel_case(
+        "amplitude", "echo_width", "range", "cross_section", "backscatter_coefficient", "reflectance"
+    ),
+}  # fmt: skip
 """Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 
+_RELATIVE = ("backscatter", "cross_section", "reflectance")
 _SHORT = {
     "amplitude": "peak above the baseline",
     "echo_time": "echo after first sample",
@@ -84,12 +79,8 @@ _SHORT = {
     "incidence_angle_normals": "ray to plane of points",
     "incidence_angle_normals_err": "1 sigma of angle to plane",
     "pulse_deviation": "Gauss-Hermite deviation",
-    "relative_backscatter": "relative to strip only",
-    "relative_cross_section": "relative to strip only",
-    "relative_reflectance": "relative to strip only",
-    "relative_backscatter_err": "1 sigma, relative",
-    "relative_cross_section_err": "1 sigma, relative",
-    "relative_reflectance_err": "1 sigma, relative",
+    **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
+    **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }
 """Short meanings of columns whose declared meaning does not fit into the 32 bytes of a description."""
 

@@ -18,6 +18,7 @@ from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.read_points import open_points
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
@@ -25,15 +26,9 @@ CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_
 
 CLOUD_DTYPE = np.dtype(
     [
-        ("gps_time", "<f8"),
-        ("xyz", "<f8", 3),
-        ("ray", "<f4", 3),
-        ("flags", "<u2"),
-        ("number", "u1"),
-        ("total", "u1"),
-        ("intensity", "<u2"),
-        *((name, "<f4") for name in CLOUD_COLUMNS),
-    ]
+        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("ray", "<f4", 3), ("flags", "<u2"), ("number", "u1"), ("total", "u1"),
+        ("intensity", "<u2"), *((name, "<f4") for name in CLOUD_COLUMNS),
+    ]  # fmt: skip
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
 bits, return number and number of returns, intensity, and columns (NaN: no data)."""
@@ -120,26 +115,10 @@ def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
     point_format = laspy.PointFormat(checked.header.point_format)
     for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
         dtype, scaling = record.dtype, record.scaling
-        dimension = DimensionInfo(
-            field,
-            DimensionKind.from_letter(dtype.base.kind),
-            8 * dtype.itemsize,
-            dtype.shape[0] if dtype.shape else 1,
-            is_standard=False,
-            description=record.description,
-            scales=None if scaling is None else np.array(scaling[:1]),
-            offsets=None if scaling is None else np.array(scaling[1:]),
-            no_data=record.no_data,
-        )
-        point_format.dimensions.append(dimension)
+        scales, offsets = (None, None) if scaling is None else np.array(scaling)[:, None]
+        dimension = DimensionInfo.from_dtype(field, dtype, False, record.description, offsets, scales)
+        point_format.dimensions.append(dimension._replace(no_data=record.no_data))
     return point_format
-
-
-def split_numbers(raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the return numbers and numbers of returns of raw records, u1 (n,) each."""
-    if "classification_flags" in raw.dtype.names:
-        return raw["bit_fields"] & 15, raw["bit_fields"] >> 4
-    return raw["bit_fields"] & 7, raw["bit_fields"] >> 3 & 7
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:

@@ -14,32 +14,32 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.carried_bytes import Carried, PacketSource, find_packets, plan_carried
+from wavebatch.files.cloud.carried_bytes import Carried, plan_carried
 from wavebatch.files.cloud.column_names import Naming, WrittenColumn, describe, name_columns
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record
 from wavebatch.files.las.point_formats import choose_format, copy_standard
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.packets import PacketPlace
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputLayout:
     """Layout of the output points of one strip; picklable, so that workers can make rows with it."""
 
-    source: Path
+    source: CheckedHeader
+    """Of the input; the output has its scales and offsets."""
     version: tuple[int, int]
     point_format: int
-    source_format: int
-    scales: tuple[float, float, float]
-    offsets: tuple[float, float, float]
     dtype: np.dtype
     """One output record: the standard fields with laspy's names, then the extra dimensions."""
     carried: tuple[Carried, ...]
     written: tuple[WrittenColumn, ...]
     whole: bool
     """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
-    packets: PacketSource | None
+    packets: PacketPlace | None
+    """The packets of the input, if the output keeps them."""
     dropped: Mapping[str, str]
     """Extra bytes of the input that are not copied, and why."""
 
@@ -60,11 +60,9 @@ class OutputLayout:
 
     def extended(self, columns: Sequence[str]) -> OutputLayout:
         """Return the layout with temporary columns at the end, which a second pass needs and the cloud does not get."""
-        more = []
-        for name in columns:
-            column = COLUMNS[name]
-            more.append(WrittenColumn(name, ExtraRecord.build(name, column.dtype, describe(column)), Naming(name)))
-        dtype = build_dtype(self.point_format, [*self.extra_records, *(column.record for column in more)])
+        records = [ExtraRecord.build(name, COLUMNS[name].dtype, describe(COLUMNS[name])) for name in columns]
+        more = [WrittenColumn(name, record, Naming(name)) for name, record in zip(columns, records, strict=True)]
+        dtype = build_dtype(self.point_format, [*self.extra_records, *records])
         return replace(self, dtype=dtype, written=(*self.written, *more))
 
     def rows(
@@ -106,7 +104,7 @@ class OutputLayout:
         """
         columns = columns or {}
         rows = np.zeros(len(source), self.dtype)
-        copy_standard(np.ascontiguousarray(source), rows, self.source_format, self.point_format)
+        copy_standard(np.ascontiguousarray(source), rows, self.source.header.point_format, self.point_format)
         if xyz is not None and len(rows):
             self._set_coordinates(rows, np.asarray(xyz, np.float64))
         self._set_returns(rows, return_number, number_of_returns)
@@ -124,16 +122,17 @@ class OutputLayout:
 
     def _set_coordinates(self, rows: np.ndarray, xyz: np.ndarray) -> None:
         new = ~np.isnan(xyz).all(axis=1)
-        for axis, name in enumerate("XYZ"):
+        header = self.source.header
+        for axis, (name, scale, offset) in enumerate(zip("XYZ", header.scales, header.offsets, strict=True)):
             with np.errstate(all="ignore"):
-                counts = np.rint((xyz[:, axis] - self.offsets[axis]) / np.float64(self.scales[axis]))
+                counts = np.rint((xyz[:, axis] - offset) / np.float64(scale))
             bad = new & ~(np.abs(counts) <= 2**31 - 1)
             if bad.any():
                 row = int(np.argmax(bad))
                 raise InputError(
-                    f"{self.source}: {name.lower()} = {xyz[row, axis]:.3f} of output row {row} does not fit 32-bit "
-                    f"integers at scale {self.scales[axis]:g} and offset {self.offsets[axis]:g}; rescale the strip "
-                    "(las2las -rescale ... -reoffset ...) and run again"
+                    f"{self.source.path}: {name.lower()} = {xyz[row, axis]:.3f} of output row {row} does not fit "
+                    f"32-bit integers at scale {scale:g} and offset {offset:g}; rescale the strip (las2las "
+                    "-rescale ... -reoffset ...) and run again"
                 )
             rows[name] = np.where(new, counts, rows[name])
 
@@ -208,18 +207,20 @@ def plan_output(
     _check_crs(path, header, target)
     carried, dropped = plan_carried(checked, points == "returns")
     written = name_columns(columns, names, [entry.record.name for entry in carried])
+    dtype = build_dtype(target, [entry.record for entry in (*carried, *written)])
+    if dtype.itemsize > 65535:
+        raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
+    if packets is not None and packets.packets.file is None:
+        raise InputError(f"{path}: has no packets to keep; leave --keep-packets out")
     return OutputLayout(
-        source=path,
+        source=checked,
         version=header.version if target < 6 else max(header.version, (1, 4)),
         point_format=target,
-        source_format=header.point_format,
-        scales=header.scales,
-        offsets=header.offsets,
-        dtype=_build_dtype(path, target, [*carried, *written]),
+        dtype=dtype,
         carried=carried,
         written=tuple(written),
         whole=points == "returns",
-        packets=None if packets is None else find_packets(packets),
+        packets=None if packets is None else packets.packets,
         dropped=dropped,
     )
 
@@ -233,10 +234,3 @@ def _check_crs(path: Path, header: LasHeader, target: int) -> None:
             f"{path}: its CRS is given by GeoTIFF keys only, point format {target} needs WKT, and wavebatch does not "
             "convert them; leave --point-format out, or add a WKT record to the strip first"
         )
-
-
-def _build_dtype(path: Path, target: int, extra: Sequence[Carried | WrittenColumn]) -> np.dtype:
-    dtype = build_dtype(target, [entry.record for entry in extra])
-    if dtype.itemsize > 65535:
-        raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
-    return dtype

@@ -12,24 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.echo_reader import CloudReader, split_numbers
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.las.extra_bytes import build_dtype
 from wavebatch.files.las.header import LasHeader
-from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES
+from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, split_numbers
 from wavebatch.files.las.write_points import PointFile
 
 RETURN_DTYPE = np.dtype(
     [
-        ("gps_time", "<f8"),
-        ("xyz", "<f8", 3),
-        ("number", "u1"),
-        ("total", "u1"),
-        ("intensity", "<u2"),
-        ("angle", "<f4"),
-        ("echo_width", "<f4"),
-        ("flags", "<u2"),
-        ("source", "<u2"),
-    ]
+        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("intensity", "<u2"),
+        ("angle", "<f4"), ("echo_width", "<f4"), ("flags", "<u2"), ("source", "<u2"),
+    ]  # fmt: skip
 )
 """One return: time [s], position [m], return number and number of returns, intensity, scan angle [deg], full width at
 half maximum [ns] (NaN: unknown), EchoFlag bits, point source id."""

@@ -35,7 +35,6 @@ from wavebatch.files.las.header import (
     decode_text,
     find_evlrs,
     has_record,
-    read_header,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 
@@ -57,13 +56,12 @@ class CloudWriter(PointFile):
     ) -> None:
         self._layout = layout
         self._refuse_input(Path(target))
-        source = read_header(layout.source)
-        self._evlrs, self.dropped = _choose_evlrs(layout.source, source)
-        header = _build_header(layout, source, provenance, self._evlrs)
+        self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
+        header = _build_header(layout, provenance, self._evlrs)
         super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
     def _append_records(self) -> None:
-        with reporting(self._layout.source), open(self._layout.source, "rb") as source:
+        with reporting(self._layout.source.path), open(self._layout.source.path, "rb") as source:
             for evlr in self._evlrs:
                 start = evlr.start + EVLR_HEADER_SIZE
                 source.seek(evlr.start)
@@ -72,7 +70,7 @@ class CloudWriter(PointFile):
         if packets is None:
             return
         head = waveform_head(packets.end - packets.start)
-        with reporting(self.target), open(packets.path, "rb") as source:
+        with reporting(self.target), open(packets.file, "rb") as source:
             if packets.internal:
                 self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
@@ -85,7 +83,7 @@ class CloudWriter(PointFile):
 
     def _refuse_input(self, target: Path) -> None:
         packets = self._layout.packets
-        for path in (self._layout.source, *([packets.path] if packets else [])):
+        for path in (self._layout.source.path, *([packets.file] if packets else [])):
             if target.exists() and os.path.samefile(target, path):
                 raise InputError(f"{target}: is the input itself; choose another output folder")
 
@@ -111,12 +109,11 @@ def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, 
     return kept, dropped
 
 
-def _build_header(
-    layout: OutputLayout, source: LasHeader, provenance: Mapping[str, Any], evlrs: list[Evlr]
-) -> LasHeader:
+def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: list[Evlr]) -> LasHeader:
+    source = layout.source.header
     vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
     earlier = sum(vlr.user == _USER_ID for vlr in vlrs)
-    vlrs.append(_encode_provenance(layout.source, source, provenance, earlier + 1))
+    vlrs.append(_encode_provenance(layout.source.path, source, provenance, earlier + 1))
     encoding = source.global_encoding & ~(WAVES_INTERNAL | WAVES_EXTERNAL)
     if layout.packets is not None:
         encoding |= WAVES_INTERNAL if layout.packets.internal else WAVES_EXTERNAL
@@ -128,8 +125,8 @@ def _build_header(
         version=layout.version,
         point_format=layout.point_format,
         point_length=layout.dtype.itemsize,
-        scales=layout.scales,
-        offsets=layout.offsets,
+        scales=source.scales,
+        offsets=source.offsets,
         vlrs=vlrs,
         padding=source.padding,
         user_bytes=source.user_bytes,

@@ -5,20 +5,11 @@ Readers of strips and clouds and the temporary stores use it; writers abort inst
 
 from __future__ import annotations
 
-from typing import Self
+from contextlib import AbstractContextManager
 
 
-class Closing:
+class Closing(AbstractContextManager):
     """A context manager that calls `close` at its end."""
-
-    __slots__ = ()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
-
-    def close(self) -> None:
-        """Close all files; may be called twice."""
-        raise NotImplementedError

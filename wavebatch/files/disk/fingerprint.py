@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from wavebatch.core.errors import InputError
+from wavebatch.files.disk.raw_bytes import reporting_reads
 
 _ENDS = 1 << 20
 _PIECE = 1 << 14
@@ -29,17 +29,14 @@ def take_fingerprint(path: Path, packet_file: Path | None = None) -> dict[str, A
 
 
 def _sample(path: Path) -> dict[str, Any]:
-    try:
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            digest = hashlib.sha256(size.to_bytes(8, "little"))
-            digest.update(file.read(_ENDS))
-            between = max(size - 2 * _ENDS, 0)
-            for piece in range(_PIECES if between else 0):
-                file.seek(_ENDS + between * piece // _PIECES)
-                digest.update(file.read(_PIECE))
-            file.seek(max(size - _ENDS, 0))
-            digest.update(file.read(_ENDS))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with reporting_reads(path), open(path, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        digest = hashlib.sha256(size.to_bytes(8, "little"))
+        digest.update(file.read(_ENDS))
+        between = max(size - 2 * _ENDS, 0)
+        for piece in range(_PIECES if between else 0):
+            file.seek(_ENDS + between * piece // _PIECES)
+            digest.update(file.read(_PIECE))
+        file.seek(max(size - _ENDS, 0))
+        digest.update(file.read(_ENDS))
     return {"size": size, "sha256_sampled": digest.hexdigest()}

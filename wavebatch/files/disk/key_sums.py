@@ -30,7 +30,6 @@ class KeyedSums(Closing):
     """
 
     def __init__(self, columns: int, *, held: int = HELD) -> None:
-        self._columns = columns
         self._held = held
         self._dtype = np.dtype([("key", "<u8"), ("value", "<i8", (columns,))])
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
@@ -43,11 +42,6 @@ class KeyedSums(Closing):
         self._parts = []
         if self._file is not None:
             self._file.close()
-
-    @property
-    def spilled(self) -> int:
-        """Number of runs on disk."""
-        return len(self._runs)
 
     def add(self, key: np.ndarray, value: np.ndarray) -> None:
         """Add rows: key u8 (m,), value i8 (m, columns)."""

@@ -17,11 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from wavebatch.core.errors import InputError
-
-try:
-    import fcntl
-except ImportError:  # Windows has no fcntl: left-over files then stay until the user removes them
-    fcntl = None
+from wavebatch.files.disk import locks
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
@@ -48,10 +44,11 @@ def _remedy(error: OSError) -> str:
     return "choose another output folder"
 
 
-class Draft:
+class Draft(contextlib.AbstractContextManager):
     """A file that is being written: `file` is open under a temporary name, also for reading, and locked.
 
     target: its final name. overwrite: whether publishing replaces an existing file.
+    As a context manager it discards the file unless it was published.
     Raises InputError if the folder cannot be written, or the name is that of a device or a pipe.
     """
 
@@ -61,9 +58,12 @@ class Draft:
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
         with reporting(self.target):
-            self.path, descriptor = _create(self.target.parent)
+            self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
         self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
         self.published = False
+
+    def __exit__(self, *error: object) -> None:
+        self.discard()
 
     def publish(self, *, same_is_fine: bool = False) -> None:
         """Give the finished file its final name in one step; without overwrite an existing file is never replaced.
@@ -73,7 +73,7 @@ class Draft:
         with reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
-            if fcntl is None:  # Windows cannot rename an open file
+            if locks.fcntl is None:  # Windows cannot rename an open file
                 self.file.close()
             try:
                 if self.overwrite:
@@ -151,19 +151,8 @@ def remove_stale(folder: Path) -> list[Path]:
 
     A locked file is still being written and stays. On systems without file locks nothing is removed.
     """
-    removed: list[Path] = []
-    if fcntl is None:
-        return removed
-    for path in sorted(Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")):
-        with contextlib.suppress(OSError):
-            descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.unlink(path)
-                removed.append(path)
-            finally:
-                os.close(descriptor)
-    return removed
+    found = Path(folder).glob(f"{_PREFIX}*{_SUFFIX}")
+    return locks.remove_unlocked(found, lambda path: os.open(path, locks.FLAGS), os.unlink)
 
 
 def _no_file(target: Path) -> str:
@@ -177,23 +166,9 @@ def _exists(target: Path) -> str:
 
 
 def _create(folder: Path) -> tuple[Path, int]:
-    """A new locked file; tries again if `remove_stale` of another process removed it before it was locked."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-    while True:
-        path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
-        descriptor = os.open(path, flags, 0o666)
-        if fcntl is None:
-            return path, descriptor
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            continue
-        except OSError:  # a file system without locks
-            return path, descriptor
-        if os.fstat(descriptor).st_nlink:
-            return path, descriptor
-        os.close(descriptor)
+    """A new file, open for reading and writing."""
+    path = folder / f"{_PREFIX}{os.getpid()}-{secrets.token_hex(6)}{_SUFFIX}"
+    return path, os.open(path, locks.FLAGS | os.O_CREAT | os.O_EXCL, 0o666)
 
 
 def _link(path: Path, target: Path) -> None:

@@ -64,6 +64,17 @@ def widen(values: np.ndarray) -> np.ndarray:
 
 
 @contextlib.contextmanager
+def reporting_reads(path: Path, what: str = "", remedy: str = "") -> Iterator[None]:
+    """Turn an error of the operating system while `path` is read into one InputError line."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, InputError) and str(error).startswith(str(path)):
+            raise
+        raise InputError(f"{path}: {what}cannot be read: {error.strerror or error}{remedy}") from error
+
+
+@contextlib.contextmanager
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
     try:
@@ -74,14 +85,9 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
         raise InputError(f"{path}: points {start} to {stop}: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: points {start} to {stop} cannot be read: {error.strerror or error}") from error
-    except Exception as error:
-        raise _undecodable(path, start, stop, error) from error
     except BaseException as error:
-        if type(error).__name__ != "PanicException":  # lazrs raises this when its Rust code panics
+        # lazrs raises PanicException, which is no Exception, when its Rust code panics.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        raise _undecodable(path, start, stop, error) from error
-
-
-def _undecodable(path: Path, start: int, stop: int, error: BaseException) -> InputError:
-    what = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return damaged(path, f"points {start} to {stop} cannot be decompressed ({what})")
+        what = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise damaged(path, f"points {start} to {stop} cannot be decompressed ({what})") from error

@@ -29,9 +29,6 @@ class RowStore:
         self.count = 0
         self._draft = Draft(target, overwrite=True)
 
-    def __len__(self) -> int:
-        return self.count
-
     def add(self, rows: np.ndarray) -> None:
         """Append rows (m,) of `dtype`."""
         with reporting(self._draft.target):

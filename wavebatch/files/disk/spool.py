@@ -31,18 +31,14 @@ class Spool:
     def __init__(self, buckets: int, dtype: np.dtype) -> None:
         self.buckets = buckets
         self.dtype = np.dtype(dtype)
-        self.folder: Path | None = None
+        self.path: Path | None = None
+        """The temporary file; None while all entries are in memory."""
         self.count = 0
         self._pending: list[tuple[np.ndarray, np.ndarray]] = []
         self._held = 0
         self._segments: list[int] = []
         self._memory: tuple[np.ndarray, np.ndarray] | None = None
         self._sealed = False
-
-    @property
-    def path(self) -> Path | None:
-        """The temporary file; None while all entries are in memory."""
-        return None if self.folder is None else self.folder / "spool"
 
     def append(self, bucket: np.ndarray, entries: np.ndarray) -> None:
         """Add entries (k,) to buckets (k,)."""
@@ -91,8 +87,8 @@ class Spool:
 
     def close(self) -> None:
         """Remove the temporary file; may be called twice."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        if self.path is not None:
+            shutil.rmtree(self.path.parent, ignore_errors=True)
         self._pending, self._memory = [], None
 
     def _take_pending(self) -> tuple[np.ndarray, np.ndarray]:
@@ -109,8 +105,8 @@ class Spool:
     def _flush(self) -> None:
         starts, entries = self._take_pending()
         with reporting_scratch():
-            if self.folder is None:
-                self.folder = make_folder()
+            if self.path is None:
+                self.path = make_folder() / "spool"
             with open(self.path, "ab") as file:
                 self._segments.append(file.tell())
                 file.write(starts.data)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import os
 import re
 import shutil
@@ -18,11 +19,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from wavebatch.core.errors import InputError
-
-try:
-    import fcntl
-except ImportError:  # Windows has no fcntl: folders of killed processes then stay until the user removes them
-    fcntl = None
+from wavebatch.files.disk import locks
 
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
@@ -92,20 +89,8 @@ def remove_orphans(parent: Path) -> list[Path]:
     Only folders of this user and this machine: a locked folder is in use, and whether a process of another machine is
     alive cannot be known. On systems without file locks nothing is removed.
     """
-    removed: list[Path] = []
-    if fcntl is None:
-        return removed
-    for folder in sorted(parent.glob(f"*{_prefix()}*")):
-        with contextlib.suppress(OSError):
-            if not folder.name.removeprefix(".").startswith(_prefix()) or not _is_ours(folder):
-                continue
-            descriptor = _take_lock(folder)
-            try:
-                shutil.rmtree(folder, ignore_errors=True)
-                removed.append(folder)
-            finally:
-                os.close(descriptor)
-    return removed
+    found = [*parent.glob(f"{_prefix()}*"), *parent.glob(f".{_prefix()}*")]
+    return locks.remove_unlocked(found, _open_lock, functools.partial(shutil.rmtree, ignore_errors=True))
 
 
 class _Owned:
@@ -113,44 +98,31 @@ class _Owned:
 
     def __init__(self, parent: Path, hidden: str) -> None:
         remove_orphans(parent)
-        while True:
-            self.folder = Path(tempfile.mkdtemp(prefix=f"{hidden}{_prefix()}{os.getpid()}-", dir=parent))
-            self._lock: int | None = None
-            if fcntl is None:
-                return
-            try:
-                self._lock = _take_lock(self.folder)
-            except (BlockingIOError, FileNotFoundError):  # another process removed it as left over
-                continue
-            except OSError:  # a file system without locks
-                return
-            if (self.folder / _LOCK).exists():
-                return
-            os.close(self._lock)
+        self.folder, self._lock = locks.make_locked(lambda: _make_folder(parent, hidden))
 
     def close(self) -> None:
         """Remove the folder with its content; may be called twice."""
-        shutil.rmtree(self.folder, ignore_errors=True)
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def _take_lock(folder: Path) -> int:
-    """Takes the lock of the folder and returns its descriptor; BlockingIOError if another process holds it."""
-    descriptor = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
+def _make_folder(parent: Path, hidden: str) -> tuple[Path, int]:
+    """A new folder and the descriptor of its lock file."""
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=f"{hidden}{_prefix()}{os.getpid()}-", dir=parent))
+        with contextlib.suppress(FileNotFoundError):  # another process removed it as left over
+            return folder, os.open(folder / _LOCK, locks.FLAGS | os.O_CREAT, 0o600)
+
+
+def _open_lock(folder: Path) -> int:
+    """The descriptor of a folder's lock file; OSError for links and folders of other users."""
+    if folder.is_symlink() or folder.lstat().st_uid != os.getuid():
+        raise FileNotFoundError(folder)
+    return os.open(folder / _LOCK, locks.FLAGS | os.O_CREAT, 0o600)
 
 
 def _prefix() -> str:
     """Start of the names of this machine's folders."""
     return f"wavebatch-{re.sub('[^A-Za-z0-9.]', '_', socket.gethostname())}-"
-
-
-def _is_ours(folder: Path) -> bool:
-    return folder.is_dir() and not folder.is_symlink() and folder.lstat().st_uid == os.getuid()

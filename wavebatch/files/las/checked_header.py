@@ -44,6 +44,11 @@ class CheckedHeader:
     """Byte at which the points end: exact for LAS; for LAZ the start of what follows them."""
     warnings: tuple[str, ...]
 
+    @property
+    def version(self) -> str:
+        """The LAS version, for example 1.4."""
+        return "{}.{}".format(*self.header.version)
+
 
 def read_checked_header(path: Path, *, waveforms: bool = True) -> CheckedHeader:
     """Return the checked header of a full-waveform strip; its VLRs are read, its points and EVLRs are not.

@@ -6,11 +6,12 @@ cannot be read counts as missing, and nothing here raises an error for it.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import struct
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from wavebatch.files.las.header import EVLR_HEADER_SIZE, GEOTIFF_ID, WKT_ID, LasHeader, find_evlrs, is_projection
@@ -20,10 +21,8 @@ DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 _MAX_RECORD = 1 << 20
 """Longest record that is read: the WKT of real files has a few kilobytes."""
-_MAX_DEPTH = 64
-"""Deepest nesting of WKT keywords; real ones have fewer than ten levels."""
 
-_TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)|([-+]?[0-9.][-+0-9.eE]*)|([\[(])|([\])])|,|\s+')
+_TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
 _MODEL, _LINEAR, _LINEAR_SIZE, _VERTICAL = 1024, 3076, 3077, 4099
 _MODELS = {1: "projected", 2: "geographic", 3: "geocentric"}
@@ -91,7 +90,7 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
-    evlrs, _ = find_evlrs(path, replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS)))
+    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
     for evlr in evlrs:
         new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= _MAX_RECORD:
@@ -107,22 +106,13 @@ def parse_geotiff(directory: bytes, doubles: bytes = b"", texts: bytes = b"") ->
     If no key gives the unit, a citation that names feet does: the EPSG code of a projected CRS implies a unit, but
     only the EPSG tables know it.
     """
-    keys = dict(_read_keys(directory))
+    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
+    keys = {key: (place, value) for key, place, _, value in rows[1 : rows[0][3] + 1]} if rows else {}
     kind = _MODELS.get(keys.get(_MODEL, (0, 0))[1])
     horizontal = _read_unit(keys, _LINEAR, doubles)
     if horizontal is None and kind != "geographic":
         horizontal = _guess_unit(texts.decode("latin-1"))
     return CrsUnits(kind, horizontal, _read_unit(keys, _VERTICAL, doubles))
-
-
-def _read_keys(directory: bytes) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Pairs of key and (record, value or offset in it), as many as claimed, but no more than the bytes hold."""
-    if len(directory) < 8:
-        return
-    count = min(struct.unpack_from("<4H", directory)[3], len(directory) // 8 - 1)
-    for number in range(count):
-        key, place, _, value = struct.unpack_from("<4H", directory, 8 + 8 * number)
-        yield key, (place, value)
 
 
 def _read_unit(keys: Mapping[int, tuple[int, int]], key: int, doubles: bytes) -> float | None:
@@ -146,58 +136,46 @@ def _guess_unit(text: str) -> float | None:
     return 0.3048 if re.search(r"\b(feet|foot|ft)\b", words) else None
 
 
-@dataclass(slots=True)
-class _Node:
-    word: str
-    children: list[_Node] = field(default_factory=list)
-    values: list[str] = field(default_factory=list)
-
-    def find(self, *words: str) -> _Node | None:
-        return next((child for child in self.children if child.word in words), None)
-
-
 _PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
 _GEOGRAPHIC = ("GEOGCS", "GEOGCRS", "GEOGRAPHICCRS")
 _GEODETIC = ("GEOCCS", "GEODCRS", "GEODETICCRS")
 _UPRIGHT = ("VERT_CS", "VERTCRS", "VERTICALCRS")
 _COMPOUND = ("COMPD_CS", "COMPOUNDCRS")
-_BOUND = {"BOUNDCRS": "SOURCECRS"}
 
 
 def parse_wkt(text: str) -> CrsUnits:
     """Return kind and units of the WKT (version 1 or 2) of a CRS."""
-    root = _parse_nodes(text)
+    root = _parse_wkt(text)
     if root is None:
         return CrsUnits()
-    systems = [_unwrap(node) for node in (root.children if root.word in _COMPOUND else [root])]
-    upright = next((node for node in systems if node.word in _UPRIGHT), None)
+    systems = [_unwrap(node) for node in (root if root[0] in _COMPOUND else [root]) if isinstance(node, list)]
+    upright = _find(systems, *_UPRIGHT)
     vertical = None if upright is None else _find_unit(upright)
     for node in systems:
-        if node.word in _GEOGRAPHIC:
+        if node[0] in _GEOGRAPHIC:
             return CrsUnits("geographic", None, vertical)
-        if node.word in _GEODETIC:
-            shape = node.find("CS")
-            flat = shape is not None and "ellipsoidal" in [value.lower() for value in shape.values]
-            return CrsUnits("geographic" if flat else "geocentric", None, vertical)
-        if node.word in _PROJECTED:
+        if node[0] in _GEODETIC:
+            shape = [value.lower() for value in _find(node, "CS") or () if isinstance(value, str)]
+            return CrsUnits("geographic" if "ellipsoidal" in shape else "geocentric", None, vertical)
+        if node[0] in _PROJECTED:
             vertical = _find_unit(node, last=True) if vertical is None else vertical
             return CrsUnits("projected", _find_unit(node), vertical)
     return CrsUnits(None, None, vertical)
 
 
-def _unwrap(node: _Node) -> _Node:
+def _unwrap(node: list) -> list:
     """The source CRS of a bound CRS, or the node itself."""
-    source = node.find(_BOUND[node.word]) if node.word in _BOUND else None
-    return source.children[0] if source is not None and source.children else node
+    source = _find(node, "SOURCECRS") if node[0] == "BOUNDCRS" else None
+    return next((child for child in source or () if isinstance(child, list)), node)
 
 
-def _find_unit(node: _Node, *, last: bool = False) -> float | None:
+def _find_unit(node: list, *, last: bool = False) -> float | None:
     """Metres per unit of a CRS: its unit, else that of its first axis; last: only that of its third axis."""
-    axes = [axis.find("LENGTHUNIT", "UNIT") for axis in node.children if axis.word == "AXIS"]
-    unit = (axes[2] if len(axes) > 2 else None) if last else node.find("LENGTHUNIT", "UNIT") or next(iter(axes), None)
+    axes = [_find(axis, "LENGTHUNIT", "UNIT") for axis in node if isinstance(axis, list) and axis[0] == "AXIS"]
+    unit = (axes[2] if len(axes) > 2 else None) if last else _find(node, "LENGTHUNIT", "UNIT") or next(iter(axes), None)
     if unit is None:
         return None
-    for value in unit.values[1:]:
+    for value in [value for value in unit[1:] if isinstance(value, str)][1:]:
         try:
             metres = float(value)
         except ValueError:
@@ -206,26 +184,25 @@ def _find_unit(node: _Node, *, last: bool = False) -> float | None:
     return math.nan
 
 
-def _parse_nodes(text: str) -> _Node | None:
-    """The outermost keyword of WKT with its content; None if the text is not WKT."""
-    top = _Node("")
-    stack, at = [top], 0
-    while at < len(text):
-        token = _TOKEN.match(text, at)
-        if token is None:
-            return None
-        at = token.end()
-        quoted, word, number, opens, closes = token.groups()
-        if quoted is not None or number:
-            stack[-1].values.append(number or quoted or "")
-        elif word and text[at : at + 1] in ("[", "("):
-            stack.append(_Node(word.upper()))
-            at += 1
-        elif word:
-            stack[-1].values.append(word)
-        elif opens or (closes and len(stack) == 1) or len(stack) > _MAX_DEPTH:
-            return None
-        elif closes:
-            done = stack.pop()
-            stack[-1].children.append(done)
-    return top.children[0] if len(stack) == 1 and top.children else None
+def _parse_wkt(text: str) -> list | None:
+    """The outermost keyword of WKT as nested lists [keyword, text or list ...]; None if the text is not WKT.
+
+    The text is turned into JSON: Python reads that fast, and reports what is not well formed or nested too deeply.
+    """
+    try:
+        top = json.loads(f'[""{_TOKEN.sub(_to_json, text)}]')
+    except (ValueError, RecursionError):
+        return None
+    return next((item for item in top if isinstance(item, list)), None)
+
+
+def _to_json(token: re.Match) -> str:
+    quoted, word, opens, number, closes = token.groups()
+    if opens:
+        return f',["{word.upper()}"'
+    value = word or number or quoted
+    return "]" if closes else "" if value is None else f",{json.dumps(value)}"
+
+
+def _find(node: list, *words: str) -> list | None:
+    return next((child for child in node if isinstance(child, list) and child[0] in words), None)

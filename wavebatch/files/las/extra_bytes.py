@@ -18,7 +18,7 @@ RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
-_AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_OFFSET, _AT_DESCRIPTION = 40, 64, 88, 112, 136, 160
+_AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 40, 64, 88, 112, 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,7 @@ class ExtraRecord:
         """Scale and offset of a scalar's stored value; None if the stored value is not scaled."""
         if not self.data[3] & _SCALE or not 1 <= self.code <= 10:
             return None
-        (scale,) = struct.unpack_from("<d", self.data, _AT_SCALE)
-        (offset,) = struct.unpack_from("<d", self.data, _AT_OFFSET)
+        scale, offset = struct.unpack_from("<d16xd", self.data, _AT_SCALE)
         return scale, offset if self.data[3] & _OFFSET else 0.0
 
     @property

@@ -17,7 +17,7 @@ from laspy import PointFormat
 
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.raw_bytes import damaged, open_regular
+from wavebatch.files.disk.raw_bytes import damaged, open_regular, reporting_reads
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}
 """Bytes of the header by LAS version."""
@@ -182,13 +182,8 @@ def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
     Raises InputError if it is not a LAS file of version `least` to 1.5, or if its header is too large or contradicts
     itself.
     """
-    try:
-        with open_regular(path) as file:
-            return read_header_of(file, path, least)
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; check name and permissions") from error
+    with reporting_reads(path, remedy="; check name and permissions"), open_regular(path) as file:
+        return read_header_of(file, path, least)
 
 
 def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
@@ -222,8 +217,9 @@ def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) 
     )  # fmt: skip
     _read_tail(header, file.read(standard - _FRONT.size))
     header.user_bytes = file.read(size - standard)
-    header.vlrs = list(_read_vlrs(file.read(offset - size), n_vlrs, path))
-    header.padding = _read_padding(file, header)
+    records = file.read(offset - size)
+    header.vlrs = list(_read_vlrs(records, n_vlrs, path))
+    header.padding = records[sum(_VLR.size + len(vlr.payload) for vlr in header.vlrs) :]
     return header
 
 
@@ -251,16 +247,10 @@ def _read_vlrs(data: bytes, count: int, path: Path) -> Iterator[Vlr]:
         yield Vlr(user_id, record_id, data[at - length : at], description, reserved)
 
 
-def _read_padding(file: BinaryIO, header: LasHeader) -> bytes:
-    used = header.size + sum(_VLR.size + len(vlr.payload) for vlr in header.vlrs)
-    file.seek(used)
-    return file.read(header.offset_to_points - used)
-
-
-def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
+def find_evlrs(path: Path, header: LasHeader, most: int = 2**32) -> tuple[list[Evlr], int]:
     """Return the EVLRs that lie wholly inside a file, in file order, and how many more the header claims.
 
-    Payloads are not read. The search ends at the first record that runs over the end of the file.
+    Payloads are not read. The search ends after `most` records, or at the first that runs over the end of the file.
     """
     found: list[Evlr] = []
     points_end = header.offset_to_points
@@ -271,7 +261,7 @@ def find_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], int]:
     with open(path, "rb") as file:
         size = os.fstat(file.fileno()).st_size
         start = header.evlr_start
-        while len(found) < header.evlr_count and start + EVLR_HEADER_SIZE <= size:
+        while len(found) < min(header.evlr_count, most) and start + EVLR_HEADER_SIZE <= size:
             file.seek(start)
             _, user_id, record_id, length, _ = _EVLR.unpack(file.read(EVLR_HEADER_SIZE))
             if start + EVLR_HEADER_SIZE + length > size:

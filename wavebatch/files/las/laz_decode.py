@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import struct
 from pathlib import Path
+from typing import NamedTuple
 
 import lazrs
 import numpy as np
@@ -54,17 +55,15 @@ def open_laz(checked: CheckedHeader) -> LazPoints | LaszipPoints:
     return LaszipPoints(checked) if coding.newest > 3 else LazPoints(checked, coding)
 
 
-class _Coding:
+class _Coding(NamedTuple):
     """The checked content of the "laszip encoded" record."""
 
-    def __init__(self, payload: bytes, chunk_points: int, items: list[tuple[int, int, int]]) -> None:
-        self.payload = payload
-        self.chunk_points = chunk_points
-        self.items = items
-        self.newest = max(version for _, _, version in items)
-        self.layers = 0
-        if items[0][0] == 10:
-            self.layers = sum(size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items)
+    payload: bytes
+    chunk_points: int
+    newest: int
+    """Highest version of its items."""
+    layers: int
+    """Layers of a chunk; 0 in point formats 0 to 5."""
 
 
 def _read_coding(path: Path, header: LasHeader) -> _Coding:
@@ -89,7 +88,8 @@ def _read_coding(path: Path, header: LasHeader) -> _Coding:
         raise InputError(f"{path}: compressed without chunks; {remedy}")
     if MAX_CHUNK_POINTS < chunk_points < _VARIABLE:
         raise InputError(f"{path}: LAZ chunks of {chunk_points} points do not fit into memory; {remedy}")
-    return _Coding(payload, chunk_points, items)
+    layers = (size if kind in _BYTES else _LAYERS[kind] for kind, size, _ in items) if kinds[0] == 10 else ()
+    return _Coding(payload, chunk_points, max(version for _, _, version in items), sum(layers))
 
 
 class LazPoints:

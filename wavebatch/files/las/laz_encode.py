@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import lazrs
 import numpy as np
@@ -30,12 +30,18 @@ _ITEMS_AT = 34
 """Offset of the list of items in the "laszip encoded" record."""
 
 
-class PointEncoder(Protocol):
-    """Writes records to the file; `finish` ends the points and must be called once."""
+class PointEncoder:
+    """Writes records to the file as they are; `finish` ends the points and must be called once."""
 
-    def write(self, rows: np.ndarray) -> None: ...
+    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
+        self._file = file
+        file.write(header.encode())
 
-    def finish(self) -> None: ...
+    def write(self, rows: np.ndarray) -> None:
+        self._file.write(rows.view(np.uint8).data)
+
+    def finish(self) -> None:
+        """Write what is left to be written."""
 
 
 def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
@@ -44,7 +50,7 @@ def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
     For a compressed file the "laszip encoded" record is added to `header.vlrs`.
     """
     if not header.compressed:
-        return _PlainEncoder(file, header)
+        return PointEncoder(file, header)
     if header.point_format in (9, 10) and laszip is not None:
         return _LaszipEncoder(file, header)
     return _LazrsEncoder(file, header)
@@ -56,23 +62,16 @@ class _WatchedFile:
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self._error: OSError | None = None
-        self.tell, self.read = file.tell, file.read
 
-    def write(self, data: bytes) -> int:
-        return self._watch(self._file.write, data)
+    def __getattr__(self, name: str) -> Callable:
+        def watched(*arguments: Any) -> Any:
+            try:
+                return getattr(self._file, name)(*arguments)
+            except OSError as error:
+                self._error = self._error or error
+                raise
 
-    def seek(self, *place: int) -> int:
-        return self._watch(self._file.seek, *place)
-
-    def flush(self) -> None:
-        self._watch(self._file.flush)
-
-    def _watch(self, function: Callable, *arguments: Any) -> Any:
-        try:
-            return function(*arguments)
-        except OSError as error:
-            self._error = self._error or error
-            raise
+        return watched
 
     @contextlib.contextmanager
     def explaining(self) -> Iterator[None]:
@@ -82,19 +81,7 @@ class _WatchedFile:
             raise self._error or InputError(f"the points cannot be compressed: {error}") from error
 
 
-class _PlainEncoder:
-    def __init__(self, file: BinaryIO, header: LasHeader) -> None:
-        self._file = file
-        file.write(header.encode())
-
-    def write(self, rows: np.ndarray) -> None:
-        self._file.write(rows.view(np.uint8).data)
-
-    def finish(self) -> None:
-        pass
-
-
-class _LazrsEncoder:
+class _LazrsEncoder(PointEncoder):
     """lazrs 0.8 writes wrong packet fields in formats 9 and 10 after a change of scanner channel; refused here."""
 
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:
@@ -102,7 +89,7 @@ class _LazrsEncoder:
         vlr = lazrs.LazVlr.new_for_compression(header.point_format, extra)
         payload = _patch_wave_item(bytes(vlr.record_data()))
         header.vlrs.append(Vlr(b"laszip encoded", 22204, payload, b"http://laszip.org"))
-        file.write(header.encode())
+        super().__init__(file, header)
         self._guarded = header.point_format in (9, 10)
         self._channel: int | None = None
         self._watched = _WatchedFile(file)
@@ -129,7 +116,7 @@ class _LazrsEncoder:
             self._compressor.done()
 
 
-class _LaszipEncoder:
+class _LaszipEncoder(PointEncoder):
     """LASzip 3.5 writes LAS 1.5 in a coding that lazrs cannot read, so it gets a LAS 1.4 header of the same size."""
 
     def __init__(self, file: BinaryIO, header: LasHeader) -> None:

@@ -20,6 +20,18 @@ ANGLE_UNIT = 0.006
 _OVERLAP_CLASS = 12
 
 
+def locate(points: np.ndarray, header: LasHeader) -> np.ndarray:
+    """Return coordinates of records (n,), f8 (n, 3) [m]."""
+    axes = zip("XYZ", header.scales, header.offsets, strict=True)
+    return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
+
+
+def split_numbers(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the return numbers and numbers of returns of records (n,), u1 (n,) each."""
+    bits = points["bit_fields"]
+    return (bits & 15, bits >> 4) if "classification_flags" in points.dtype.names else (bits & 7, bits >> 3 & 7)
+
+
 def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool) -> int:
     """Return the point format of the output: that of the input without waveforms, or the `wanted` one.
 

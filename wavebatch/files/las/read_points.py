@@ -5,22 +5,12 @@ The strip reader and the cloud readers open their points here. Add a new kind of
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from wavebatch.files.disk.raw_bytes import guarded, read_exactly
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.laz_decode import open_laz
-
-
-class PointSource(Protocol):
-    """A reader of points by index."""
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Return records [start, stop), a writable structured array."""
-
-    def close(self) -> None: ...
+from wavebatch.files.las.laszip_decode import LaszipPoints
+from wavebatch.files.las.laz_decode import LazPoints, open_laz
 
 
 def open_points(checked: CheckedHeader) -> PointSource:
@@ -32,11 +22,14 @@ def open_points(checked: CheckedHeader) -> PointSource:
 
 
 class _PlainPoints:
+    """Reads points that are not compressed; all readers of points have these two methods."""
+
     def __init__(self, checked: CheckedHeader) -> None:
         self._checked = checked
         self._file = open(checked.path, "rb", buffering=0)  # noqa: SIM115 - closed by close()
 
     def read(self, start: int, stop: int) -> np.ndarray:
+        """Return records [start, stop), a writable structured array."""
         rows = np.empty(stop - start, self._checked.dtype)
         at = self._checked.header.offset_to_points + start * rows.itemsize
         with guarded(self._checked.path, start, stop):
@@ -45,3 +38,7 @@ class _PlainPoints:
 
     def close(self) -> None:
         self._file.close()
+
+
+PointSource = _PlainPoints | LazPoints | LaszipPoints
+"""A reader of points by index."""

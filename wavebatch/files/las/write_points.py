@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 import numpy as np
 
@@ -23,7 +24,7 @@ _COPY_SIZE = 1 << 22
 _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
 
 
-class PointFile:
+class PointFile(contextlib.AbstractContextManager):
     """Writes points of one dtype to `target`: `write` in order, then `commit`; `.laz` is compressed.
 
     header: of the output; counts, bounds and offsets are filled in here.
@@ -54,9 +55,6 @@ class PointFile:
         except BaseException:
             self.draft.discard()
             raise
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.abort()
@@ -124,17 +122,14 @@ class PointFile:
     def _place_extra_bytes(self, records: Sequence[ExtraRecord] | None = None) -> None:
         records = self._records if records is None else records
         vlrs = self._header.vlrs
-        places = [index for index, vlr in enumerate(vlrs) if has_record([vlr], *_EXTRA_BYTES)]
+        old = next((vlr for vlr in vlrs if has_record([vlr], *_EXTRA_BYTES)), None)
+        self._header.vlrs = [vlr for vlr in vlrs if not has_record([vlr], *_EXTRA_BYTES)]
         payload = b"".join(record.data for record in records)
         if len(payload) > 65535:
             raise InputError(f"{self.target}: a LAS file can describe at most 341 extra bytes, not {len(records)}")
-        if places and records:
-            old = vlrs[places[0]]
-            vlrs[places[0]] = Vlr(old.user_id, old.record_id, payload, old.description, old.reserved)
-            places = places[1:]
-        elif records:
-            vlrs.append(Vlr(b"LASF_Spec", EXTRA_BYTES_RECORD_ID, payload, b"Extra bytes"))
-        self._header.vlrs = [vlr for index, vlr in enumerate(vlrs) if index not in places]
+        if records:
+            new = replace(old or Vlr(b"LASF_Spec", EXTRA_BYTES_RECORD_ID, b"", b"Extra bytes"), payload=payload)
+            self._header.vlrs.insert(vlrs.index(old) if old else len(vlrs), new)
 
     @contextlib.contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -158,7 +153,7 @@ class Statistics:
         self._bits = np.zeros(256, np.int64)
         self._format_bits = 4 if "classification_flags" in dtype.names else 3
         self._axes = [name for name in ("X", "Y", "Z", "gps_time") if name in dtype.names]
-        self._extremes: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._extremes: dict[tuple[str, int], tuple[np.generic, np.generic]] = {}
 
     def add(self, rows: np.ndarray) -> None:
         """Count the rows (m,) and widen the extremes."""
@@ -171,23 +166,15 @@ class Statistics:
                 self._widen(field, rows[field], record.no_data)
 
     def _widen(self, name: str, values: np.ndarray, no_data: np.ndarray | None = None) -> None:
-        values = np.ascontiguousarray(values)
-        if values.ndim > 1:
-            for element in range(values.shape[1]):
-                empty = None if no_data is None else no_data[element : element + 1]
-                self._widen(f"{name}\0{element}", values[:, element], empty)
-            return
-        good = np.ones(len(values), bool) if no_data is None else values != no_data[0]
-        if values.dtype.kind == "f":
-            good &= np.isfinite(values)
-        if not good.all():
-            values = values[good]
-        if len(values):
-            least, largest = values.min(), values.max()
-            if name in self._extremes:
-                old = self._extremes[name]
-                least, largest = min(least, old[0]), max(largest, old[1])
-            self._extremes[name] = (least, largest)
+        for element, column in enumerate(np.atleast_2d(values.T)):
+            column = np.ascontiguousarray(column)
+            good = np.isfinite(column)
+            if no_data is not None:
+                good &= column != no_data[element]
+            column = column if good.all() else column[good]
+            if len(column):
+                least, largest = self._extremes.get((name, element), (column[0], column[0]))
+                self._extremes[name, element] = min(column.min(), least), max(column.max(), largest)
 
     def fill(self, header: LasHeader) -> None:
         """Set counts and bounds of the header; an empty file gets zeros."""
@@ -198,11 +185,11 @@ class Statistics:
         bounds = []
         for axis, name in enumerate("XYZ"):
             scale, offset = header.scales[axis], header.offsets[axis]
-            least, largest = self._extremes.get(name, (None, None))
+            least, largest = self._extremes.get((name, 0), (None, None))
             bounds.append((0.0, 0.0) if least is None else sorted((least * scale + offset, largest * scale + offset)))
         header.mins, header.maxs = tuple(b[0] for b in bounds), tuple(b[1] for b in bounds)
         if header.version >= (1, 5):
-            least, largest = self._extremes.get("gps_time", (0.0, 0.0))
+            least, largest = self._extremes.get(("gps_time", 0), (0.0, 0.0))
             header.gps_range = (float(largest), float(least))
 
     def ranged(self) -> list[ExtraRecord]:
@@ -210,11 +197,10 @@ class Statistics:
         return [self._range(field, record) for field, record in self._records.items()]
 
     def _range(self, field: str, record: ExtraRecord) -> ExtraRecord:
-        shape = record.dtype.shape
-        names = [f"{field}\0{element}" for element in range(shape[0])] if shape else [field]
-        if any(name not in self._extremes for name in names):
+        found = [self._extremes.get((field, element)) for element in range(*record.dtype.shape or (1,))]
+        if None in found:
             return record.with_range(None, None)
-        least, largest = zip(*(self._extremes[name] for name in names), strict=True)
+        least, largest = zip(*found, strict=True)
         return record.with_range(np.array(least), np.array(largest))
 
 

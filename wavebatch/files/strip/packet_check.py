@@ -102,8 +102,7 @@ class Judge:
                 self._odd[index] = digitizer.bits not in WHOLE_BITS
                 if digitizer.bits in PACKED_BITS:
                     self._packed[index] = packed_bytes(digitizer.n_samples, digitizer.bits)
-        self._least = facts.packet_start - facts.packet_base
-        self._end = facts.packet_end - facts.packet_base
+        self._least, self._end = facts.packets.offsets
 
     def judge(self, points: np.ndarray, form: str, overfull: np.ndarray | None = None) -> Judged:
         """Check the packets of points.

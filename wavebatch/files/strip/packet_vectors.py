@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen
 
@@ -62,7 +61,7 @@ class DirectionTally:
 
     def add_points(self, points: np.ndarray) -> None:
         """Add the votes of usable points (n,): length and height of their vectors."""
-        some = _spread(points)
+        some = points[:: max(1, len(points) // _PER_CALL)]
         height = read_toward(some, "toward", self.form)[:, 2]
         self.heights[0] += int((height > 0).sum())
         self.heights[1] += int((height < 0).sum())
@@ -101,13 +100,6 @@ def measure_ratio(points: np.ndarray, form: str) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             length = length / np.abs(widen(points["return_point_wave_location"]))
     return length
-
-
-def check_option(option: str) -> str:
-    """Return the value of --direction; raises ConfigError for an unknown one."""
-    if option not in OPTIONS:
-        raise ConfigError(f"direction {option!r}: must be one of {', '.join(OPTIONS)}")
-    return option
 
 
 def stack_vectors(points: np.ndarray) -> np.ndarray:
@@ -162,7 +154,3 @@ def _verdict(toward: int, away: int, share: float) -> str:
     if total and toward >= share * total:
         return "toward"
     return "away" if total and away >= share * total else ""
-
-
-def _spread(points: np.ndarray) -> np.ndarray:
-    return points[:: max(1, len(points) // _PER_CALL)]

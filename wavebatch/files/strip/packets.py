@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.raw_bytes import damaged, read_exactly
+from wavebatch.files.disk.raw_bytes import damaged, read_exactly, reporting_reads
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
@@ -33,7 +33,7 @@ MAX_EVLRS = 4096
 """Most EVLRs that are looked at: a damaged header can claim 4 billion."""
 BLOCK_BYTES = 1 << 25
 """Most bytes of samples in one block, for any number of waveforms."""
-_DESCRIPTOR = struct.Struct("<BBIIdd")
+DESCRIPTOR = struct.Struct("<BBIIdd")
 _FIRST_ID, _LAST_ID = 100, 354
 _SPARSE = 4
 """A span of bytes is read in one piece if it is at most this many times as long as the wanted packets,"""
@@ -54,18 +54,22 @@ class PacketPlace:
     end: int
     warnings: tuple[str, ...] = ()
 
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Limits of the byte offsets that points may have."""
+        return self.start - self.base, self.end - self.base
 
-@dataclass(frozen=True, slots=True)
-class Descriptors:
-    """The wave packet descriptors of a strip, by index."""
-
-    digitizers: dict[int, Digitizer]
-    compression: dict[int, int]
-    warnings: tuple[str, ...]
+    @property
+    def shift(self) -> int:
+        """What a copy of the packets adds to byte offsets that count from the first byte of a .wdp without header."""
+        return max(0, EVLR_HEADER_SIZE - self.offsets[0])
 
 
-def read_descriptors(header: LasHeader) -> Descriptors:
-    """Return all descriptors among the VLRs, also unused and empty ones; `packet_check` checks those that are used."""
+def read_descriptors(header: LasHeader) -> tuple[dict[int, Digitizer], dict[int, int], list[str]]:
+    """Return digitizers and compression types by index, and warnings.
+
+    All descriptors among the VLRs count, also unused and empty ones; `packet_check` checks those that are used.
+    """
     digitizers: dict[int, Digitizer] = {}
     compression: dict[int, int] = {}
     warnings = []
@@ -73,16 +77,16 @@ def read_descriptors(header: LasHeader) -> Descriptors:
         if vlr.user != "LASF_Spec" or not _FIRST_ID <= vlr.record_id <= _LAST_ID:
             continue
         index = vlr.record_id - _FIRST_ID + 1
-        if len(vlr.payload) < _DESCRIPTOR.size:
+        if len(vlr.payload) < DESCRIPTOR.size:
             warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
             continue
-        bits, kind, samples, spacing, gain, offset = _DESCRIPTOR.unpack_from(vlr.payload)
+        bits, kind, samples, spacing, gain, offset = DESCRIPTOR.unpack_from(vlr.payload)
         digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
         if index not in digitizers:
             digitizers[index], compression[index] = digitizer, kind
         elif digitizers[index] != digitizer:
             warnings.append(f"descriptor {index} is there twice with different content; the first one is used")
-    return Descriptors(digitizers, compression, tuple(warnings))
+    return digitizers, compression, warnings
 
 
 def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerless: bool) -> PacketPlace:
@@ -96,23 +100,19 @@ def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerle
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & WAVES_INTERNAL:
         return _locate_internal(checked)
-    packet_file = _find_packet_file(path)
-    if header.global_encoding & WAVES_EXTERNAL:
-        if packet_file is None:
-            if _find_packet_file(path, "wdz") is not None:
-                raise refuse_compressed(path, 1)
-            raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
-        return _locate_external(checked, packet_file, headerless)
+    packet_file, external = _find_packet_file(path), header.global_encoding & WAVES_EXTERNAL
     warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
-    if header.waveform_start:
-        place = _locate_internal(checked)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from the record in the file"))
-    if packet_file is not None:
-        place = _locate_external(checked, packet_file, headerless)
-        return replace(place, warnings=(*place.warnings, f"{warning}; they are read from {packet_file.name}"))
-    if _find_packet_file(path, "wdz") is not None:
+    if header.waveform_start and not external:
+        place, where = _locate_internal(checked), "the record in the file"
+    elif packet_file is not None:
+        place, where = _locate_external(checked, packet_file, headerless), packet_file.name
+    elif _find_packet_file(path, "wdz") is not None:
         raise refuse_compressed(path, 1)
-    return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
+    elif external:
+        raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
+    else:
+        return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
+    return place if external else replace(place, warnings=(*place.warnings, f"{warning}; they are read from {where}"))
 
 
 def refuse_compressed(path: Path, kind: int) -> InputError:
@@ -124,16 +124,13 @@ def refuse_compressed(path: Path, kind: int) -> InputError:
 
 
 def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
-    for candidate in (path.with_suffix(f".{suffix}"), path.with_suffix(f".{suffix.upper()}")):
-        if candidate.is_file():
-            return candidate
-    return None
+    candidates = (path.with_suffix(f".{name}") for name in (suffix, suffix.upper()))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     header, path, size = checked.header, checked.path, checked.size
-    capped = replace(header, evlr_count=min(header.evlr_count, MAX_EVLRS))
-    evlrs, _ = find_evlrs(path, capped)
+    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
     at, warnings = header.waveform_start, []
     if not at:
         at = next((evlr.start for evlr in evlrs if evlr.record_id == WAVEFORM_RECORD_ID), 0)
@@ -190,10 +187,8 @@ class PacketFile:
         self._file = None
         self._buffer = np.empty(0, np.uint8)
         if place.file is not None:
-            try:
+            with reporting_reads(place.file):
                 self._file = open(place.file, "rb", buffering=0)  # noqa: SIM115 - closed by close()
-            except OSError as error:
-                raise InputError(f"{place.file}: cannot be read: {error.strerror or error}") from error
 
     def close(self) -> None:
         """Close the file; may be called twice."""
@@ -221,11 +216,8 @@ class PacketFile:
     def read_bytes(self, offsets: np.ndarray, width: int) -> np.ndarray:
         """Return the first `width` bytes of packets that were checked before, u1 (n, width)."""
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
-        try:
+        with reporting_reads(self._place.file, "packets ", "; check the disk"):
             return self._gather(starts, width)
-        except OSError as error:
-            text = error.strerror or str(error)
-            raise InputError(f"{self._place.file}: packets cannot be read: {text}; check the disk") from error
 
     def _gather(self, starts: np.ndarray, width: int) -> np.ndarray:
         n = len(starts)

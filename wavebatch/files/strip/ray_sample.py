@@ -12,9 +12,9 @@ import numpy as np
 
 from wavebatch.core.units import HALF_C, PS_PER_NS
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.packet_vectors import read_toward
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.files.strip.scanner import locate
 
 MOST_SLICES = 4096
 """Most places of a strip at which rays are read."""
@@ -54,7 +54,7 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
 
     def take(start: int, stop: int) -> float:
         points = reader.read_points(start, stop)
-        xyz, time = locate(points, reader.facts), widen(points["gps_time"])
+        xyz, time = locate(points, reader.facts.header), widen(points["gps_time"])
         pairs.append(_pair_returns(xyz, time))
         rows = np.arange(0, len(points), max(1, len(points) // RAYS_PER_SLICE))
         kept.append(_read_vectors(points[rows], xyz[rows], time[rows], scan))
@@ -85,7 +85,7 @@ def _choose_units(scan: StripScan) -> list[tuple[int, int]]:
 
 def _read_vectors(points: np.ndarray, xyz: np.ndarray, time: np.ndarray, scan: StripScan) -> Rays:
     with np.errstate(all="ignore"):
-        away = -read_toward(points, scan.direction, scan.vector_form)
+        away = -read_toward(points, scan.vectors.direction, scan.vectors.form)
         ratio = np.sqrt((away * away).sum(axis=1)) * (PS_PER_NS / HALF_C)
         good = (points["wavepacket_index"] > 0) & (ratio > _LEAST_RATIO) & (ratio < _LARGEST_RATIO)
     good &= np.isfinite(time) & np.isfinite(xyz).all(axis=1)

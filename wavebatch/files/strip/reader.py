@@ -7,23 +7,25 @@ exactly one of them; results must not depend on blocks or processes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
-from wavebatch.files.strip.packet_vectors import check_option, read_toward
-from wavebatch.files.strip.packets import PacketFile, PacketPlace, block_rows
+from wavebatch.files.strip.packet_vectors import OPTIONS, Decision, read_toward
+from wavebatch.files.strip.packets import PacketFile, block_rows
 from wavebatch.files.strip.sample_form import PLAIN, SampleForm, read_samples
-from wavebatch.files.strip.scan_result import StripScan, raise_problem
-from wavebatch.files.strip.scanner import locate, scan_strip, unique_entries
+from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.files.strip.scanner import scan_strip, unique_entries
 from wavebatch.files.strip.shared_packets import expand, group_keys
 from wavebatch.kernels.signal.signal import find_fill, quiet_fill, recorded_lengths
 
@@ -80,8 +82,7 @@ class Unit:
     """Row of `packets` for each context point, i4 (k,)."""
     point_flags: np.ndarray
     """EchoFlag.NO_WAVEFORM, EchoFlag.BROKEN_PACKET or 0, u2 (n,)."""
-    direction: str
-    vector_form: str
+    vectors: Decision
     forms: Mapping[int, SampleForm]
     """How samples are stored, by descriptor index; see `StripScan.forms`."""
 
@@ -91,8 +92,8 @@ class StripReader(Closing):
 
     Parameters
     ----------
-    path : Path or str
-        LAS or LAZ file of point format 4, 5, 9 or 10.
+    path : Path, str or StripFacts
+        LAS or LAZ file of point format 4, 5, 9 or 10. If its facts are given, its headers are not read again.
     direction : {"auto", "toward", "away"}
         Where packet vectors point; "auto" decides from the points.
     headerless : bool
@@ -104,26 +105,15 @@ class StripReader(Closing):
         If the strip cannot be read as what it claims to be.
     """
 
-    facts: StripFacts
-
-    def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
-        check_option(direction)
-        self._open(find_facts(Path(path), direction, headerless))
-
-    @classmethod
-    def reopen(cls, facts: StripFacts) -> StripReader:
-        """Return a reader of a strip whose facts are known, so that its headers need not be read and checked again."""
-        reader = cls.__new__(cls)
-        reader._open(facts)
-        return reader
-
-    def _open(self, facts: StripFacts) -> None:
+    def __init__(self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False) -> None:
+        if direction not in OPTIONS:
+            raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
+        facts = path if isinstance(path, StripFacts) else find_facts(Path(path), direction, headerless)
         self.facts = facts
-        self._points = open_points(facts.checked)
+        self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
-            place = (facts.packet_file, facts.internal, facts.packet_base, facts.packet_start, facts.packet_end)
-            self._packets = PacketFile(PacketPlace(*place))
+            self._packets = PacketFile(facts.packets)
         except BaseException:
             self._points.close()
             raise
@@ -139,16 +129,17 @@ class StripReader(Closing):
         tolerant: put reasons against processing into `problems` instead of raising InputError.
         """
         scan = scan_strip(self.facts, self._points, self._packets, self._unit_points())
-        if not tolerant:
-            raise_problem(self.facts, scan)
+        if scan.problems and not tolerant:
+            scan.close()
+            raise InputError(f"{self.facts.path}: {scan.problems[0]}")
         return scan
 
     def unit_count(self) -> int:
         """Return the number of units."""
-        return -(-self.facts.point_count // self._unit_points())
+        return -(-self.facts.header.point_count // self._unit_points())
 
     def _unit_points(self) -> int:
-        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.point_length))
+        return max(1, min(UNIT_POINTS, UNIT_BYTES // self.facts.header.point_length))
 
     def read_points(self, start: int, stop: int) -> np.ndarray:
         """Return records [start, stop) of the file."""
@@ -158,9 +149,9 @@ class StripReader(Closing):
         """Return unit `number` (from 0): its points and their packets; `read_blocks` reads the samples."""
         start, stop = int(scan.borders[number]), int(scan.borders[number + 1])
         points = self._points.read(start, stop)
-        judged = self._judge.judge(points, scan.vector_form, scan.overfull)
+        judged = self._judge.judge(points, scan.vectors.form, scan.overfull)
         entries = unique_entries(scan.context.read(number))
-        near = self._judge.judge(entries["record"], scan.vector_form, scan.overfull)
+        near = self._judge.judge(entries["record"], scan.vectors.form, scan.overfull)
         entries, keys, n_samples = entries[near.usable], near.keys[near.usable], near.n_samples[near.usable]
         packed = near.packed[near.usable]
         own = np.flatnonzero(judged.usable)
@@ -169,8 +160,7 @@ class StripReader(Closing):
         sizes = np.concatenate([points["wavepacket_size"][own], entries["record"]["wavepacket_size"]])
         n_samples = np.concatenate([judged.n_samples[own], n_samples])
         packed = np.concatenate([judged.packed[own], packed])
-        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, packed)
-        packets = replace(packets, owned=(packets.owner >= start) & (packets.owner < stop))
+        packets, packet_of = _collect_packets(keys, index, sizes, n_samples, packed, (start, stop))
         packet_of_point = np.full(len(points), -1, np.int32)
         packet_of_point[own] = packet_of[: len(own)]
         return Unit(
@@ -183,8 +173,7 @@ class StripReader(Closing):
             packet_of_point=packet_of_point,
             packet_of_context=packet_of[len(own) :],
             point_flags=judged.flags,
-            direction=scan.direction,
-            vector_form=scan.vector_form,
+            vectors=scan.vectors,
             forms=scan.forms,
         )
 
@@ -284,10 +273,10 @@ class _Geometry:
         counts = self._counts[rows]
         place = expand(self._starts[rows], counts)
         records = self._take(self._entry[place])
-        xyz = locate(records, self._facts)
+        xyz = locate(records, self._facts.header)
         location = widen(records["return_point_wave_location"])
         owner = np.cumsum(counts) - counts
-        toward = read_toward(records[owner], self._unit.direction, self._unit.vector_form)
+        toward = read_toward(records[owner], self._unit.vectors.direction, self._unit.vectors.form)
         owners = self._unit.packets.owner[rows]
         return WaveformBlock(
             digitizer=digitizer,
@@ -321,9 +310,14 @@ def _read_scanner(records: np.ndarray) -> np.ndarray | None:
 
 
 def _collect_packets(
-    keys: np.ndarray, index: np.ndarray, sizes: np.ndarray, n_samples: np.ndarray, packed: np.ndarray
+    keys: np.ndarray,
+    index: np.ndarray,
+    sizes: np.ndarray,
+    n_samples: np.ndarray,
+    packed: np.ndarray,
+    unit: tuple[int, int],
 ) -> tuple[PacketTable, np.ndarray]:
-    """Packets of points (n,) in order of their owners, all marked as owned, and the row of each point, i4 (n,)."""
+    """Packets of points (n,) in order of their owners, and the row of each point, i4 (n,)."""
     by_index = np.argsort(index, kind="stable")
     groups = group_keys(keys[by_index])
     lead = by_index[groups.order[groups.starts]]
@@ -339,7 +333,7 @@ def _collect_packets(
         size=sizes[lead],
         n_samples=n_samples[lead],
         owner=index[lead],
-        owned=np.ones(len(lead), bool),
+        owned=(index[lead] >= unit[0]) & (index[lead] < unit[1]),
         packed=packed[lead],
     )
     return table, packet_of

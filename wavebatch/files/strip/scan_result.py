@@ -7,15 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_check import REASON_TEXTS, Reason
+from wavebatch.files.strip.packet_vectors import Decision
 from wavebatch.files.strip.sample_form import SampleForm
 
 
@@ -40,10 +39,7 @@ class StripScan(Closing):
     """Points with a packet, by descriptor index."""
     reach: int
     """Largest distance in the file, in points, of two points that share a packet."""
-    direction: str
-    direction_evidence: str
-    vector_form: str
-    vector_ratio: float
+    vectors: Decision
     borders: np.ndarray
     """First point of each unit, then the number of points, i8 (units + 1,)."""
     overfull: np.ndarray
@@ -61,16 +57,6 @@ class StripScan(Closing):
         """What a user should know about how samples are stored, one line each."""
         return tuple(note for form in self.forms.values() for note in form.notes)
 
-    @property
-    def is_hopeless(self) -> bool:
-        """Whether points have packets, but none can be used."""
-        return self.broken > 0 and not self.with_waveform
-
-    @property
-    def spool(self) -> Path | None:
-        """Temporary file of shared packets; None if there are few."""
-        return self.context.path
-
     def close(self) -> None:
         """Remove the temporary file."""
         self.context.close()
@@ -78,17 +64,17 @@ class StripScan(Closing):
 
 def describe_hopeless(facts: StripFacts, reasons: dict[Reason, tuple[int, int]]) -> str:
     """Return the message about a strip without any usable packet."""
-    if facts.packet_file is None:
+    if facts.packets.file is None:
         name = facts.path.with_suffix(".wdp").name
         return f"points refer to packets that are neither in the file nor next to it: put {name} next to the strip"
     reason = max(reasons, key=lambda r: reasons[r][0])
     count, first = reasons[reason]
-    remedy = f"{facts.packet_file.name} is cut, damaged or belongs to another strip: get it again"
+    remedy = f"{facts.packets.file.name} is cut, damaged or belongs to another strip: get it again"
     if reason is Reason.PACKED:
         remedy = "write the packets with 8, 16 or 32 bits per sample"
     return (
-        f"no packet can be used: {count} of {facts.point_count} points (first: point {first}) {REASON_TEXTS[reason]}; "
-        f"{remedy}"
+        f"no packet can be used: {count} of {facts.header.point_count} points (first: point {first}) "
+        f"{REASON_TEXTS[reason]}; {remedy}"
     )
 
 
@@ -98,10 +84,3 @@ def describe_oddities(reasons: dict[Reason, tuple[int, int]], short: int) -> Ite
         yield f"{count} points (first: point {first}) {REASON_TEXTS[reason]}; they are written unchanged"
     if short:
         yield f"{short} points have packets with fewer samples than their descriptor gives; these samples are used"
-
-
-def raise_problem(facts: StripFacts, scan: StripScan) -> None:
-    """Raise InputError with the first reason why the strip cannot be processed, if there is one."""
-    if scan.problems:
-        scan.close()
-        raise InputError(f"{facts.path}: {scan.problems[0]}")

@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.files.disk.raw_bytes import take_records
 from wavebatch.files.disk.spool import Spool
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import PointSource
 from wavebatch.files.strip import shared_packets
 from wavebatch.files.strip.facts import StripFacts
@@ -69,16 +70,16 @@ class _Scanner:
         self._form = find_form(self._take_first())
         self._tally, self._votes = _Tally(), DirectionTally(self._form)
         self._borders = [0]
-        units = -(-facts.point_count // unit_points)
+        units = -(-facts.header.point_count // unit_points)
         self._context = Spool(units, np.dtype([("index", "<i8"), ("record", facts.dtype)]))
-        low = facts.packet_start - facts.packet_base
-        self._near = NearSharing(low, max(low, facts.packet_end - facts.packet_base), self._context)
+        low, high = facts.packets.offsets
+        self._near = NearSharing(low, max(low, high), self._context)
         self._window: list[_Part] = []
 
     def _take_first(self) -> np.ndarray:
         """Those of the first points that have packets."""
-        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.point_length)
-        points = self._source.read(0, min(self._facts.point_count, most))
+        most = min(_FIRST_POINTS, _FIRST_BYTES // self._facts.header.point_length)
+        points = self._source.read(0, min(self._facts.header.point_count, most))
         return points[(points["wavepacket_index"] > 0) & (points["wavepacket_size"] > 0)]
 
     def run(self) -> StripScan:
@@ -105,7 +106,7 @@ class _Scanner:
 
     def _cut_units(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yields first index and points of each unit, and collects the borders."""
-        step, count = self._unit_points, self._facts.point_count
+        step, count = self._unit_points, self._facts.header.point_count
         held = np.empty(0, self._facts.dtype)
         for begin in range(0, count, step):
             part = self._source.read(begin, min(begin + step, count))
@@ -150,7 +151,8 @@ class _Scanner:
         place = place[own[groups.order[place]]]
         place = place[:: max(1, len(place) // _PAIRS)]
         first, second = parts.take(groups.order[place - 1]), parts.take(groups.order[place])
-        self._votes.add_pairs(np.stack([locate(first, self._facts), locate(second, self._facts)]), first, second)
+        xyz = np.stack([locate(records, self._facts.header) for records in (first, second)])
+        self._votes.add_pairs(xyz, first, second)
 
     def _go_far(self, suspects: np.ndarray) -> tuple[int, int, np.ndarray]:
         """Finds points anywhere in the strip that share packets of suspect bins, and adds them to the context."""
@@ -207,27 +209,24 @@ class _Scanner:
             self._tally.reasons[Reason.USABLE] -= many
 
     def _finish(self, packets: int, reach: int, overfull: np.ndarray) -> StripScan:
-        tally, facts = self._tally, self._facts
+        tally, facts, points = self._tally, self._facts, self._facts.header.point_count
         usable, missing = int(tally.reasons[Reason.USABLE]), int(tally.reasons[Reason.NO_WAVEFORM])
         decision = decide(self._votes, facts.direction_option)
         reasons = tally.describe()
         problems = list(decision.problems)
-        if not usable and missing < facts.point_count:
+        if not usable and missing < points:
             problems.insert(0, describe_hopeless(facts, reasons))
         return StripScan(
-            points=facts.point_count,
+            points=points,
             with_waveform=usable,
             without_waveform=missing,
-            broken=facts.point_count - usable - missing,
+            broken=points - usable - missing,
             packets=packets,
             short=tally.short,
             reasons=reasons,
             by_descriptor={i: int(tally.by_descriptor[i]) for i in np.flatnonzero(tally.by_descriptor).tolist()},
             reach=reach,
-            direction=decision.direction,
-            direction_evidence=decision.evidence,
-            vector_form=decision.form,
-            vector_ratio=decision.ratio,
+            vectors=decision,
             borders=np.array(self._borders),
             overfull=overfull,
             context=self._context,
@@ -288,12 +287,6 @@ def _find_cut(before: np.ndarray, after: np.ndarray) -> int:
     after_border = int(head[0]) if len(head) else len(after)
     before_border = int(tail[0]) if len(tail) else len(before)
     return after_border if after_border + before_border < LONGEST_RUN else 0
-
-
-def locate(points: np.ndarray, facts: StripFacts) -> np.ndarray:
-    """Return coordinates of records (n,), f8 (n, 3) [m]."""
-    axes = zip("XYZ", facts.scales, facts.offsets, strict=True)
-    return np.stack([points[name] * scale + offset for name, scale, offset in axes], axis=1)
 
 
 def unique_entries(entries: np.ndarray) -> np.ndarray:

@@ -18,11 +18,9 @@ from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import EVLR_HEADER_SIZE, WAVES_EXTERNAL, WAVES_INTERNAL, LasHeader, Vlr
 from wavebatch.files.las.write_points import PointFile, waveform_head
+from wavebatch.files.strip.packets import DESCRIPTOR
 
 _FORMATS = {(1, 3): (4, 5), (1, 4): (4, 5, 9, 10), (1, 5): (9, 10)}
-_DESCRIPTOR = np.dtype(
-    [("bits", "u1"), ("compression", "u1"), ("samples", "<u4"), ("ps", "<u4"), ("gain", "<f8"), ("offset", "<f8")]
-)
 
 
 class FullwaveWriter(PointFile):
@@ -157,6 +155,5 @@ def _check_digitizers(target: Path, digitizers: Sequence[Digitizer]) -> None:
 
 def _build_descriptor(digitizer: Digitizer) -> Vlr:
     spacing = round(digitizer.spacing * PS_PER_NS)
-    values = (digitizer.bits, 0, digitizer.n_samples, spacing, digitizer.gain, digitizer.offset)
-    payload = np.array([values], _DESCRIPTOR).tobytes()
+    payload = DESCRIPTOR.pack(digitizer.bits, 0, digitizer.n_samples, spacing, digitizer.gain, digitizer.offset)
     return Vlr(b"LASF_Spec", 99 + digitizer.index, payload, b"wave packet descriptor")

@@ -18,7 +18,8 @@ import scipy  # parts of it load when they are first asked for
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.toml_file import parse_toml, read_toml_text
+from wavebatch.files.text_file import read_text
+from wavebatch.files.toml_file import parse_toml
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import maximum
@@ -93,7 +94,7 @@ def known_systems() -> tuple[KnownSystem, ...]:
 
 
 def _load(path: Path) -> KnownSystem:
-    table = parse_toml(read_toml_text(path, "system file"), str(path))
+    table = parse_toml(read_text(path, "system file"), str(path))
     spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
     return KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system")))
 

@@ -43,7 +43,7 @@ class Strip(Closing):
 
     def __repr__(self) -> str:
         """Return path and number of points."""
-        return f"<Strip {self.facts.path}: {self.facts.point_count} points>"
+        return f"<Strip {self.facts.path}: {self.facts.header.point_count} points>"
 
     @property
     def facts(self) -> StripFacts:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.files.strip.scanner import locate
 
 LEAST_CELL = 4.0
 """Least cell of the map [m]."""
@@ -106,5 +106,5 @@ def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size:
     """The ceiling of a strip; reads all of its points."""
     ceiling = Ceiling(middle, size)
     for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        ceiling.add(locate(reader.read_points(begin, end), reader.facts))
+        ceiling.add(locate(reader.read_points(begin, end), reader.facts.header))
     return ceiling.finish()
