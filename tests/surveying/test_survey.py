@@ -20,7 +20,7 @@ def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
     system = survey_block(make_block(scene, 3000, seed=3)[0]).system
     # Half a sample is less than a width can be measured with (0.85): there it only has to be found.
-    assert system.sigma_ref == pytest.approx(sigma, rel=0.03 if sigma > 0.5 else 0.05)
+    assert system.sigma_ref == pytest.approx(sigma, rel=0.03 if sigma > 0.5 else 0.1)
     assert system.noise_std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
 
 

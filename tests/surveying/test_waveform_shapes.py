@@ -89,18 +89,21 @@ def test_ordinary_strips_keep_all_quiet_samples():
 
 
 def optech(x):
-    """A steep front and a tail, as Optech's receivers give."""
-    return (bell(x) + 0.15 * bell((x - 1.6) / 1.2) + 0.02 * bell((x - 4.2) / 1.6)) / 1.04
+    """A steep front, a tail, and ripples that no sum of a few Gaussians follows, as Optech's receivers give."""
+    ripples = ((1.7, 1), (3.1, -1), (5.3, 0.7), (7.9, -0.6), (13, 0.5))
+    front = bell(x) + 0.15 * bell((x - 1.6) / 1.2) + 0.02 * bell((x - 4.2) / 1.6)
+    tail = 0.01 * np.exp(-np.maximum(x - 3, 0) / 12) / (1 + np.exp(-3 * (x - 3)))
+    return front / 1.04 + tail + 0.01 * sum(share * bell((x - lag) / 0.6) for lag, share in ripples)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_clipped_tops_stay_one_echo(seed):
+def test_clipped_echoes_stay_one(seed):
     """Amplitudes to four times the range of the digitizer, noise that rounding nearly hides, widened echoes too."""
-    plain, rows, time, height = render(optech, seed, n=3000, s=100, width=3.0, amplitude=(8, 980))
-    wide = render(optech, seed, n=3000, s=100, width=3.25, amplitude=(8, 980))[0]
+    plain, *_, height = render(optech, seed, s=100, width=1.6, amplitude=(8, 980))
+    wide = render(optech, seed, s=100, width=1.73, amplitude=(8, 980))[0]
     widened = np.random.default_rng(seed).random((3000, 1)) < 0.3
     block = digitize(np.where(widened, wide, plain), seed, noise=0.3, base=10)
     system, echoes = decompose(block)
     number, clipped = echoes.count(3000), height > 250
     assert system.saturation == 255 and len(system.components) > 1
-    assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.98
+    assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.97
