@@ -160,8 +160,9 @@ def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
     found = find_likeness(survey.system, survey.figures.get("spacing_ns", 0.0))
     if found is None:
         return None
-    taken = find_source(survey.system) is not None
-    return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken}
+    taken = "known_pulse_misfit" in survey.figures and find_source(survey.system) is not None
+    return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
+            "sentence": found.describe()}  # fmt: skip
 
 
 def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
@@ -227,8 +228,8 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
         yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
     like = _find_likeness(saved)
     if like is not None:
-        seen = f"looks like {like['sensor']}; it differs by {100 * like['difference']:.2g} %"
-        yield _line("sensor", f"{like['sensor']}: its shipped pulse is used" if like["taken"] else f"this pulse {seen}")
+        taken = f"{like['sensor']}: its shipped pulse is used"
+        yield _line("sensor", taken if like["taken"] else like["sentence"])
     yield _line("pulse models", f"from {figures.get('isolated_echoes', 0):.0f} isolated echoes; misfit per amplitude")
     if "misfit_goal" not in figures:
         model = "a shipped pulse" if system.components else "a Gaussian of their width"

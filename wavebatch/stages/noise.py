@@ -15,11 +15,13 @@ from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
 
-LEAST_QUIET, LEAST_QUIET_SHARE = 16, 0.3
-"""Quiet samples from which the level of one recording of a packet counts: canopy may fill a short recording."""
+LEAST_QUIET, LOWEST_TENTH = 6, 1.28
+"""Quiet samples from which they give the level of a recording; how far, in standard deviations, the lowest tenth of
+normal noise lies below its mean."""
 
-APART = 4.0
-"""Standard errors from which recordings of one packet have levels of their own: 1 in 16,000 waveforms by chance."""
+APART, MARGIN = 4.0, 0.5
+"""A recording has a level of its own if it differs from its waveform's baseline by APART standard errors and MARGIN
+times the noise, as much as the foot of an echo can raise its quiet samples."""
 
 
 @stage("noise")
@@ -69,15 +71,14 @@ def pooled(
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.baseline + trust * mean
     noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32))
-    return noise if block.missing is None else _split_levels(block, noise, system, reach, limit)
+    return noise if block.missing is None else _split_levels(block, noise, system, limit)
 
 
-def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, reach: int, limit: float) -> Noise:
-    """The noise with a level for each recording of the waveforms whose recordings differ in level.
+def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, limit: float) -> Noise:
+    """The noise with a level of its own for each recording that differs from the baseline of its waveform.
 
-    The level of a recording is that of its quiet samples, found from itself; it counts if they are at least
-    LEAST_QUIET, and a share LEAST_QUIET_SHARE of the recording. Recordings differ if one is APART standard errors from
-    the mean of all.
+    The level of a recording is that of its quiet samples, found from itself. Where echoes leave fewer than LEAST_QUIET
+    it is that of its lowest samples: too high a level loses the foot of an echo, too low a one makes echoes of nothing.
     """
     row, start, end = find_stretches(~block.missing)
     several = np.bincount(row, minlength=len(block))[row] > 1
@@ -88,24 +89,18 @@ def _split_levels(block: WaveformBlock, noise: Noise, system: SystemPulse, reach
     # Each recording as a column, repeated up to the length of the waveform, so that quantiles stay what they are.
     signal = block.samples[row, start + np.arange(s)[:, None] % length].astype(np.float32)
     std = float(noise.std[0])
-    level, quiet, _ = find_levels(signal, std, reach, limit)
+    level, quiet, _ = find_levels(signal, std, int(np.ceil(system.sigma_ref / block.spacing)), limit)
     number = (quiet & (np.arange(s)[:, None] < length)).sum(axis=0)
-    known = (number >= LEAST_QUIET) & (number >= LEAST_QUIET_SHARE * length)
-    weight = np.where(known, number, 0).astype(np.float64)
-    total = np.maximum(np.bincount(row, weight, len(block)), 1e-9)
-    mean = (np.bincount(row, weight * level, len(block)) / total)[row]
+    lowest = np.partition(signal, s // 10, axis=0)[s // 10] + np.float32(LOWEST_TENTH * std)
+    level = np.where(number >= LEAST_QUIET, level, lowest)
     # The mean of correlated samples scatters more than that of as many independent ones.
     spread = std * np.sqrt(max(1.0, 1.0 + 2.0 * float(np.sum(system.correlation))))
-    error = spread * np.sqrt(1 / np.maximum(weight, 1) + 1 / total[row])
-    apart = known & (np.abs(level - mean) > APART * error)
-    differs = np.zeros(len(block), bool)
-    differs[row[apart]] = True
-    if not differs.any():
+    apart = np.abs(level - noise.baseline[row]) > APART * spread / np.sqrt(np.maximum(number, 1)) + MARGIN * std
+    if not apart.any():
         return noise
     of_sample = np.repeat(noise.baseline[:, None], s, axis=1)
-    chosen = np.flatnonzero(differs[row] & known)
-    run, place = list_samples(*(row[chosen] * s + edge[chosen] for edge in (start, end)))
-    of_sample.reshape(-1)[place] = level[chosen][run]
+    run, place = list_samples(*((row * s + edge)[apart] for edge in (start, end)))
+    of_sample.reshape(-1)[place] = level[apart][run]
     return replace(noise, of_sample=of_sample)
 
 

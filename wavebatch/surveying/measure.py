@@ -127,7 +127,7 @@ def _gaussian_system(block: WaveformBlock, width: float, saturation: float | Non
     missing = None if block.missing is None else block.missing.T
     noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
     correlation = tuple(noise.correlation.tolist())
-    seen = noise.std * noise_factors(GAUSSIAN, width, correlation)[0]
+    seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
     known = noise.std if noise.share >= LEAST_QUIET else 0.0
     hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
@@ -344,7 +344,7 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
     # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
     floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
-    return replace(system, noise_std=max(seen, std, hidden, floor), noise_by_kind=kinds, correlation=correlation)
+    return replace(system, noise_std=float(max(seen, std, hidden, floor)), noise_by_kind=kinds, correlation=correlation)
 
 
 def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:

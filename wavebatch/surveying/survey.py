@@ -432,13 +432,15 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
     """Why the pulse is, or is not, a sum of Gaussians."""
-    source = find_source(system)
+    source = find_source(system) if "known_pulse_misfit" in figures else None
     if source is not None:
         known, gaussian = (figures.get(f"known_pulse_{name}", 0.0) for name in ("misfit", "gaussian_misfit"))
         misfits = f"it misses strong echoes by {known:.4f} of the amplitude, a Gaussian by {gaussian:.4f}"
         return f"pulse from the shipped {source.name}: {misfits}"
     if "misfit_1_gaussians" not in figures:
-        return f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
+        few = f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
+        ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"
+        return f"{few}; {ringing}" if system.ringing else few
     one = figures["misfit_1_gaussians"]
     number = len(system.components)
     if number > 1:

@@ -6,6 +6,8 @@ is what makes NumPy fast here.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from wavebatch.kernels.signal.runs import find_stretches
@@ -20,7 +22,7 @@ samples that are all at least LEAST_LEVEL.
 """
 
 STEP_FROM_ZERO, STEP_FROM_TOP = 3 / 4, 15 / 16
-"""Share of the way from fill to the level of the recording beside it that the first recorded sample must go. From the
+"""Share of the way from fill to the level of the next recording that the first recorded sample must go. From the
 largest count it is more: a clipped echo of 8 samples falls by up to three quarters from one sample to the next.
 """
 
@@ -99,33 +101,65 @@ def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:
     row, start, end = find_stretches(samples == value)
     long = end - start >= LEAST_PADDING
     row, start, end = row[long], start[long], end[long]
-    good = _steps(samples, row, start, -1, value) & _steps(samples, row, end - 1, 1, value)
-    good &= (start > 0) | (end < s)
+    marks = _mark_runs(row, start, end, n, s)
+    edges = _look_at_edges(samples, marks, np.r_[row, row], np.r_[start - 1, end], np.repeat([-1, 1], len(row)))
+    good = _step_from_zero(edges, n) if value == 0 else _step_from_top(edges, value)
+    good = (good[: len(row)] & good[len(row) :]) & ((start > 0) | (end < s))
     if value == 0:
-        marks = _mark_runs(row, start, end, n, s)
         low = ((samples < LEAST_LEVEL) & ~marks).any(axis=1)
         low[row[~good]] = True
         good &= ~low[row]
     return _mark_runs(row[good], start[good], end[good], n, s)
 
 
-def _steps(samples: np.ndarray, row: np.ndarray, last: np.ndarray, side: int, value: int) -> np.ndarray:
-    """Whether a waveform steps from the run that ends at sample `last` (k,) to its level beside it, bool (k,).
+class _Edges(NamedTuple):
+    """The recorded samples next to both ends of k / 2 runs, each array (k,)."""
 
-    side: 1 after the run, -1 before it. The level is the lower quartile of the next LEAST_RECORDED samples. Also true
-    where the waveform ends with the run.
-    """
+    row: np.ndarray
+    outside: np.ndarray
+    """Where the waveform ends with the run."""
+    known: np.ndarray
+    """Where LEAST_RECORDED samples are recorded next to the run."""
+    first: np.ndarray
+    """The first of them [count]."""
+    level: np.ndarray
+    """The third least of them [count]."""
+    middle: np.ndarray
+    """Their median [count]."""
+
+
+def _look_at_edges(
+    samples: np.ndarray, marks: np.ndarray, row: np.ndarray, first: np.ndarray, side: np.ndarray
+) -> _Edges:
+    """Edges of runs, all of which `marks` (n, s) holds; first: sample next to the run, side: away from it, 1 or -1."""
     s = samples.shape[1]
-    at = last[:, None] + side * np.arange(1, LEAST_RECORDED + 1)
-    ends = (at[:, 0] < 0) | (at[:, 0] >= s)
-    inside = (at[:, -1] >= 0) & (at[:, -1] < s)
-    near = samples[row[:, None], np.clip(at, 0, s - 1)].astype(np.float64)
-    level = np.partition(near, LEAST_RECORDED // 4 - 1, axis=1)[:, LEAST_RECORDED // 4 - 1]
-    if value == 0:
-        step = near[:, 0] >= STEP_FROM_ZERO * level
-    else:
-        step = (value - near[:, 0] >= STEP_FROM_TOP * (value - level)) & (near[:, 0] <= 0.5 * value)
-    return ends | (inside & step)
+    at = first[:, None] + side[:, None] * np.arange(LEAST_RECORDED)
+    place = row[:, None], np.clip(at, 0, s - 1)
+    known = ((at >= 0) & (at < s) & ~marks[place]).all(axis=1)
+    near = samples[place].astype(np.float64)
+    ordered = np.sort(near, axis=1)
+    return _Edges(row, (first < 0) | (first >= s), known, near[:, 0], ordered[:, 2], ordered[:, LEAST_RECORDED // 2])
+
+
+def _step_from_top(edges: _Edges, value: int) -> np.ndarray:
+    """Whether the waveform falls from the largest count to its level within one sample, bool (k,)."""
+    step = (value - edges.first >= STEP_FROM_TOP * (value - edges.level)) & (edges.first <= 0.5 * value)
+    return edges.outside | (edges.known & step)
+
+
+def _step_from_zero(edges: _Edges, n: int) -> np.ndarray:
+    """Whether the waveform rises from zeros to its level, or to an echo, within one sample, bool (k,).
+
+    At half of the edges of a waveform at least there is no echo; the level there counts at the others.
+    """
+    # The flank of a clipped echo that goes down lies far below a level that hardly varies.
+    least = np.maximum(STEP_FROM_ZERO * edges.level, edges.level - 4 * (edges.middle - edges.level) - 1)
+    sure = edges.known & ~edges.outside & (edges.first >= least)
+    level = np.full(n, np.inf)
+    np.minimum.at(level, edges.row[sure], edges.level[sure])
+    enough = 2 * np.bincount(edges.row[sure], minlength=n) >= np.bincount(edges.row[~edges.outside], minlength=n)
+    rises = sure | (edges.known & (edges.first >= STEP_FROM_ZERO * level[edges.row]))
+    return edges.outside | (rises & enough[edges.row])
 
 
 def _mark_runs(row: np.ndarray, start: np.ndarray, end: np.ndarray, n: int, s: int) -> np.ndarray:

@@ -66,6 +66,9 @@ NOT_A_GAUSSIAN = 0.5
 LEAST_RINGING, RINGING_ERRORS = 0.01, 4.0
 """Least share of an echo, and least number of standard errors, of an after-pulse that echoes show together."""
 
+NO_FIT = 1e6
+"""Misfit of an echo to which the pulse cannot be fitted."""
+
 LARGEST_RINGING = 0.12
 """Largest share of an echo that is taken for an after-pulse where no pulse is known: what is higher is a target."""
 
@@ -120,7 +123,7 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     Returns
     -------
     misfit : float64 (m,)
-        Root mean square of what is left from BEFORE to AFTER the echo, as a share of the amplitude; inf without a fit.
+        Root mean square of what is left from BEFORE to AFTER the echo, as a share of the amplitude; or NO_FIT.
     left : float64 (m, s)
         What is left of the waveform, as a share of the amplitude.
     lag : float64 (m, s)
@@ -130,6 +133,7 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     start = replace(lone, waveform=np.arange(m, dtype=np.int32))
     fitted = adaptive(part, pooled_noise(part, system), system, start, max_echoes=1, significance=0.0)
     fitted = fitted.take(find_strongest(fitted, m)[0])
+    fitted = fitted.take(np.flatnonzero(fitted.amplitude > 0))
     left = np.full(part.samples.shape, np.nan)
     lag = np.full(part.samples.shape, np.inf)
     rows = fitted.waveform
@@ -138,7 +142,7 @@ def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tup
     near = (lag > -BEFORE * system.sigma_ref) & (lag < AFTER * system.sigma_ref) & np.isfinite(left)
     number = near.sum(axis=1)
     power = np.where(near, left, 0.0) ** 2
-    return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), np.inf), left, lag
+    return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), NO_FIT), left, lag
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +191,13 @@ def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Tak
     if len(lone) < LEAST_ECHOES:
         return Taken(system, None, {})
     if guess:
-        system = replace(system, sigma_ref=float(np.quantile(lone.sigma, 0.25)))
+        # Not below half a sample, as for isolated echoes: spikes are no pulses.
+        # The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all
+        # echoes: noise makes the strongest of many weak ones both high and narrow.
+        every = find_lone(block, system, len(block))
+        low, middle = np.quantile(every.sigma, (0.25, 0.5))
+        width = min(low + 0.674 * float(np.median(every.sigma_err)), middle)
+        system = replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
         lone = find_lone(block, system)
     return Taken(replace(system, ringing=_find_ringing(block, system, lone)), None, {})
 
@@ -201,7 +211,7 @@ def _try_pulse(block: WaveformBlock, known: KnownSystem) -> tuple[float, Taken] 
         return None
     system = with_pulse(plain, known.system)
     misfit, gaussian = fit_alone(block, system, lone)[0], fit_alone(block, plain, lone)[0]
-    ratio = float(np.median(misfit / gaussian))
+    ratio = float(np.median(misfit / np.maximum(gaussian, 1 / NO_FIT)))
     left = float(np.median(misfit * lone.amplitude)) / plain.noise_std
     if ratio > CLEARLY_BETTER or np.mean(misfit < gaussian) < MOSTLY or left > NOISE_LEFT:
         return None
@@ -259,7 +269,7 @@ class Likeness(NamedTuple):
 
     def describe(self) -> str:
         """Return the sentence for people."""
-        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1g} %"
+        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1f} %"
 
 
 def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
