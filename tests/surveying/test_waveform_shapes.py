@@ -7,6 +7,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
 
@@ -107,3 +108,55 @@ def test_clipped_echoes_stay_one(seed):
     number, clipped = echoes.count(3000), height > 250
     assert system.saturation == 255 and len(system.components) > 1
     assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.97
+
+
+def scores(block, rows, time):
+    """The survey's system, and completeness and correctness of the default chain."""
+    system, echoes = decompose(block)
+    return system, *compare(echoes, rows, time)[:2]
+
+
+def test_spikes_of_one_sample_are_no_echoes():
+    signal, rows, time, _ = render(bell, 5, second=0.4)
+    rng = np.random.default_rng(5)
+    at, place = np.flatnonzero(rng.random(len(signal)) < 0.08), rng.integers(1, 79, len(signal))
+    signal[at, place[at]] += rng.uniform(6, 80, len(at)) * rng.choice([1, -1], len(at), p=[0.8, 0.2])
+    system, found, true = scores(digitize(signal, 5), rows, time)
+    assert system.spikes == pytest.approx(0.08, rel=0.25)
+    assert found > 0.985 and true > 0.985
+
+
+def test_converters_that_take_turns_are_made_alike():
+    signal, rows, time, _ = render(bell, 6, amplitude=(4, 40))
+    pattern = np.tile([0.6, -0.6], 40)
+    system, found, true = scores(digitize(signal + pattern, 6), rows, time)
+    assert system.pattern == pytest.approx([0.6, -0.6, 0.6, -0.6], abs=0.03)
+    assert system.noise_std == pytest.approx(np.hypot(0.7, 0.289), rel=0.06)
+    assert found > 0.9 and true > 0.985
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_jumps_at_the_start_are_no_echoes(everywhere):
+    signal, rows, time, _ = render(bell, 7)
+    rng = np.random.default_rng(7)
+    jump = 8.0 if everywhere else np.where(rng.random(3000) < 0.3, rng.uniform(4, 40, 3000), 0)
+    signal[:, 0] += jump
+    signal[:, 1] += 0.4 * jump
+    system, found, true = scores(digitize(signal, 7), rows, time)
+    assert 2 <= system.transient <= 3
+    assert found > 0.99 and true > 0.993
+
+
+def test_sloping_baselines_hide_no_echo():
+    signal, rows, time, _ = render(bell, 8, s=120, amplitude=(6, 100))
+    slope = 0.08 * np.random.default_rng(8).standard_normal((3000, 1))
+    system, found, true = scores(digitize(signal, 8, base=40 + slope * (np.arange(120) - 59.5)), rows, time)
+    assert system.slope_spread == pytest.approx(0.08, rel=0.1)
+    assert found > 0.99 and true > 0.99
+
+
+def test_strips_without_defects_keep_their_counts():
+    for pulse, seed in ((bell, 9), (tailed(0.012, 30.0), 10)):
+        block = digitize(render(pulse, seed, second=0.3)[0], seed)
+        system = survey_block(block).system
+        assert not system.has_defects and clean_block(block, system) is block
