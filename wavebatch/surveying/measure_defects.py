@@ -15,6 +15,7 @@ from wavebatch.kernels.signal.defects import find_pattern, find_spikes, find_tra
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
 from wavebatch.stages.clean import clean_block, sample_noise
+from wavebatch.surveying.measure import thin_block
 
 LEAST_SPIKES = 0.003
 """Spikes per waveform from which they are taken off."""
@@ -31,8 +32,8 @@ SLOPES, STEEP = 0.02, 5.0
 LEAST_RISE = 0.5
 """... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
 
-LEAST_WAVEFORMS = 50
-"""Waveforms from which defects are looked for."""
+LEAST_WAVEFORMS, MOST_WAVEFORMS = 50, 2048
+"""Waveforms from which defects are looked for, and how many are looked at."""
 
 
 def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
@@ -51,6 +52,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     """
     if len(block) < LEAST_WAVEFORMS:
         return system
+    block = thin_block(block, MOST_WAVEFORMS)
     signal = transpose_samples(block.samples)
     missing = None if block.missing is None else block.missing.T
     std, width = sample_noise(system), system.sigma_ref / block.spacing
@@ -80,9 +82,7 @@ def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
     return replace(system, transient=find_transient(above, std) * block.spacing)
 
 
-def _slope_spread(
-    signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None
-) -> float:
+def _slope_spread(signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None) -> float:
     """Standard deviation of the slopes of baselines [count per sample]; 0 where chance and tails explain them.
 
     A tail looks like a slope: where tails were found (`recovery`), slopes are not looked for.

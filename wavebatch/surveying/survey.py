@@ -332,7 +332,7 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
         return block, system
     block = clean_block(block, found)
     kept = {name: getattr(found, name) for name in ("pattern", "slope_spread", "spikes", "transient")}
-    return block, replace(measure_gaussian(block), **kept)
+    return block, replace(measure_gaussian(block, system.sigma_ref / block.spacing), **kept)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:

@@ -10,8 +10,10 @@ import numpy as np
 
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
 
-SPIKE = 4.5
-"""Least height of a spike above its higher neighbour [noise of a sample]: lower ones are no echoes either."""
+SPIKE, HEIGHT, HOLE = 4.5, 5.5, 6.5
+"""Least height of a spike above its higher neighbour and above the baseline, and least depth of a hole [noise of a
+sample]: lower ones are no echoes, and white noise makes one in 10^6 samples.
+"""
 
 CURVATURE = 1.5
 """How much more of its height than the system pulse an echo may lose to the next sample, as a factor."""
@@ -55,9 +57,9 @@ def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
         return spikes
     middle, left, right = above[1:-1], above[:-2], above[2:]
     high, low = np.maximum(left, right), np.minimum(left, right)
-    limit = np.float32(SPIKE * std)
-    spikes[1:-1] = middle - high > limit + drop * np.maximum(middle, 0)
-    spikes[1:-1] |= low - middle > limit + drop * np.maximum(high, 0)
+    spikes[1:-1] = middle - high > np.float32(SPIKE * std) + drop * np.maximum(middle, 0)
+    spikes[1:-1] &= middle > np.float32(HEIGHT * std)
+    spikes[1:-1] |= low - middle > np.float32(HOLE * std) + drop * np.maximum(high, 0)
     return spikes
 
 
@@ -164,4 +166,3 @@ def _first_lines(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     first, second = np.triu_indices(SEGMENTS, 1)
     slope = np.median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
     return np.median(low - slope * place[:, None], axis=0), slope
-
