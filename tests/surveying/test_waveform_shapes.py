@@ -7,6 +7,7 @@ from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.clean import clean_block
 from wavebatch.stages.score import match_echoes
 from wavebatch.surveying import survey_block, survey_blocks
 
@@ -89,18 +90,73 @@ def test_ordinary_strips_keep_all_quiet_samples():
 
 
 def optech(x):
-    """A steep front and a tail, as Optech's receivers give."""
-    return (bell(x) + 0.15 * bell((x - 1.6) / 1.2) + 0.02 * bell((x - 4.2) / 1.6)) / 1.04
+    """A steep front, a tail, and ripples that no sum of a few Gaussians follows, as Optech's receivers give."""
+    ripples = ((1.7, 1), (3.1, -1), (5.3, 0.7), (7.9, -0.6), (13, 0.5))
+    front = bell(x) + 0.15 * bell((x - 1.6) / 1.2) + 0.02 * bell((x - 4.2) / 1.6)
+    tail = 0.01 * np.exp(-np.maximum(x - 3, 0) / 12) / (1 + np.exp(-3 * (x - 3)))
+    return front / 1.04 + tail + 0.01 * sum(share * bell((x - lag) / 0.6) for lag, share in ripples)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_clipped_tops_stay_one_echo(seed):
+def test_clipped_echoes_stay_one(seed):
     """Amplitudes to four times the range of the digitizer, noise that rounding nearly hides, widened echoes too."""
-    plain, rows, time, height = render(optech, seed, n=3000, s=100, width=3.0, amplitude=(8, 980))
-    wide = render(optech, seed, n=3000, s=100, width=3.25, amplitude=(8, 980))[0]
+    plain, *_, height = render(optech, seed, s=100, width=1.6, amplitude=(8, 980))
+    wide = render(optech, seed, s=100, width=1.73, amplitude=(8, 980))[0]
     widened = np.random.default_rng(seed).random((3000, 1)) < 0.3
     block = digitize(np.where(widened, wide, plain), seed, noise=0.3, base=10)
     system, echoes = decompose(block)
     number, clipped = echoes.count(3000), height > 250
     assert system.saturation == 255 and len(system.components) > 1
-    assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.98
+    assert (number[clipped] == 1).mean() > 0.95 and (number[~clipped] == 1).mean() > 0.97
+
+
+def scores(block, rows, time):
+    """The survey's system, and completeness and correctness of the default chain."""
+    system, echoes = decompose(block)
+    return system, *compare(echoes, rows, time)[:2]
+
+
+def test_spikes_of_one_sample_are_no_echoes():
+    signal, rows, time, _ = render(bell, 5, second=0.4)
+    rng = np.random.default_rng(5)
+    at, place = np.flatnonzero(rng.random(len(signal)) < 0.08), rng.integers(1, 79, len(signal))
+    signal[at, place[at]] += rng.uniform(6, 80, len(at)) * rng.choice([1, -1], len(at), p=[0.8, 0.2])
+    system, found, true = scores(digitize(signal, 5), rows, time)
+    assert system.spikes == pytest.approx(0.08, rel=0.25)
+    assert found > 0.985 and true > 0.985
+
+
+def test_converters_that_take_turns_are_made_alike():
+    signal, rows, time, _ = render(bell, 6, amplitude=(4, 40))
+    pattern = np.tile([0.6, -0.6], 40)
+    system, found, true = scores(digitize(signal + pattern, 6), rows, time)
+    assert system.pattern == pytest.approx([0.6, -0.6, 0.6, -0.6], abs=0.03)
+    assert system.noise_std == pytest.approx(np.hypot(0.7, 0.289), rel=0.06)
+    assert found > 0.9 and true > 0.985
+
+
+@pytest.mark.parametrize("everywhere", [True, False])
+def test_jumps_at_the_start_are_no_echoes(everywhere):
+    signal, rows, time, _ = render(bell, 7)
+    rng = np.random.default_rng(7)
+    jump = 8.0 if everywhere else np.where(rng.random(3000) < 0.3, rng.uniform(4, 40, 3000), 0)
+    signal[:, 0] += jump
+    signal[:, 1] += 0.4 * jump
+    system, found, true = scores(digitize(signal, 7), rows, time)
+    assert 2 <= system.transient <= 3
+    assert found > 0.99 and true > 0.993
+
+
+def test_sloping_baselines_hide_no_echo():
+    signal, rows, time, _ = render(bell, 8, s=120, amplitude=(6, 100))
+    slope = 0.08 * np.random.default_rng(8).standard_normal((3000, 1))
+    system, found, true = scores(digitize(signal, 8, base=40 + slope * (np.arange(120) - 59.5)), rows, time)
+    assert system.slope_spread == pytest.approx(0.08, rel=0.1)
+    assert found > 0.99 and true > 0.99
+
+
+def test_strips_without_defects_keep_their_counts():
+    for pulse, seed in ((bell, 9), (tailed(0.012, 30.0), 10)):
+        block = digitize(render(pulse, seed, second=0.3)[0], seed)
+        system = survey_block(block).system
+        assert not system.has_defects and clean_block(block, system) is block

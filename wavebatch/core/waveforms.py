@@ -241,6 +241,14 @@ class SystemPulse:
     """Skew of the system pulse; 0 for a Gaussian."""
     components: tuple[tuple[float, float, float], ...] = ()
     """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
+    pattern: tuple[float, ...] = ()
+    """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
+    slope_spread: float = 0.0
+    """Standard deviation of the slopes of baselines [count/ns]; 0 where baselines are level."""
+    spikes: float = 0.0
+    """Spikes of one sample per waveform; 0 where they are not taken off."""
+    transient: float = 0.0
+    """Time at the start of every waveform in which its receiver is not at rest [ns]."""
     ringing: float = 0.0
     """Largest after-pulse as a share of the amplitude."""
     saturation: float | None = None
@@ -278,6 +286,11 @@ class SystemPulse:
         """Checks the one value that everything divides by."""
         if not self.sigma_ref > 0:
             raise ValueError(f"sigma_ref must be positive, got {self.sigma_ref}")
+
+    @property
+    def has_defects(self) -> bool:
+        """Whether waveforms must be cleaned before they are read."""
+        return bool(self.pattern or self.slope_spread or self.spikes or self.transient)
 
     def of(self, block: WaveformBlock) -> SystemPulse:
         """The system of the block's digitizer: its pulse and noise, and what is known of the whole strip."""

@@ -20,6 +20,7 @@ import numpy as np
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.stages.clean import clean_block
 
 KINDS: dict[str, tuple[tuple[str, ...], type]] = {
     "noise": (("block", "system"), Noise),
@@ -258,7 +259,8 @@ class Chain:
         StageError
             Where a stage fails: a bug.
         """
-        data: dict[str, Any] = {"block": block, "system": system.of(block)}
+        system = system.of(block)
+        data: dict[str, Any] = {"block": clean_block(block, system), "system": system}
         slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
         for step in self.steps:
             start = time.perf_counter()

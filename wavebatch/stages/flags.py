@@ -23,6 +23,11 @@ RINGING_FACTOR = 1.2
 TAIL_FACTOR = 1.5
 """An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place."""
 
+CLIPPED_TAIL = 0.005
+"""Share of a clipped echo that an echo must exceed anywhere in its waveform: tails of echoes beyond the digitizer's
+range were never measured, and 0.2 % of four times the range is many times the noise.
+"""
+
 LEAST_RATIO = 0.02
 """Share of a stronger neighbour that an echo must exceed: no learned pulse is better known (docs/algorithms.md R3)."""
 
@@ -65,7 +70,7 @@ def flag_echoes(block: WaveformBlock, noise: Noise, system: SystemPulse, table: 
     return _flag_saturated(block, noise, clip_level(block, system), table)
 
 
-def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
+def drop_unproven(table: EchoTable, system: SystemPulse, top: float = np.inf) -> EchoTable:
     """Drop echoes that are so faint next to a stronger one that an error of the learned pulse explains them.
 
     Parameters
@@ -74,6 +79,8 @@ def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
         Fitted echoes.
     system : SystemPulse
         With the components of the learned pulse.
+    top : float
+        Height above the baseline from which echoes are clipped [count].
 
     Returns
     -------
@@ -83,6 +90,12 @@ def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
     delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
     reach = max([4 * system.sigma_ref, *delays])
     faint = _faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)
+    if (table.amplitude >= top).any():
+        clipped = np.where(table.amplitude >= top, CLIPPED_TAIL * table.amplitude, 0)
+        for step in range(1, min(NEIGHBOURS, len(table) - 1) + 1):
+            same = table.waveform[step:] == table.waveform[:-step]
+            faint[step:] |= same & (table.amplitude[step:] < clipped[:-step])
+            faint[:-step] |= same & (table.amplitude[:-step] < clipped[step:])
     if system.tail_misfit:
         faint |= _explained_by_tails(table, np.array(system.tail_misfit))
     return table.take(np.flatnonzero(~faint))

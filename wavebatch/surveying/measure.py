@@ -18,6 +18,7 @@ from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.noise import estimate_noise, residual_noise
 from wavebatch.kernels.signal.signal import transpose_samples
+from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import matched_filter, maximum
 from wavebatch.stages.noise import pooled as pooled_noise
@@ -239,6 +240,7 @@ def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
 
 
 def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    block = clean_block(block, system)
     noise = pooled_noise(block, system)
     return adaptive(block, noise, system, matched_filter(block, noise, system))
 

@@ -86,6 +86,8 @@ def predict_errors(block: WaveformBlock, system: SystemPulse, chains: Mapping[st
     truth = adaptive(block, noise, system, maximum(block, noise, system))
     sure = truth.amplitude >= LEAST_SNR * noise.std[truth.waveform]
     truth = truth.take(np.flatnonzero(sure & ((truth.flags & int(_DOUBTFUL)) == 0)))
+    # Simulated waveforms have no defects.
+    system = replace(system, pattern=(), slope_spread=0.0, spikes=0.0, transient=0.0)
     trial = simulate_again(block, system, truth, np.random.default_rng(SEED))
     bounds = bound_time(truth.amplitude, truth.sigma.astype(np.float64), system.noise_std, block.spacing) * HALF_C
     bound = _rms(bounds)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NO
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
+from wavebatch.stages.clean import clean_block
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse, refine_pulse
 from wavebatch.surveying.measure import (
@@ -30,6 +31,7 @@ from wavebatch.surveying.measure import (
     measure_residuals,
     thin_block,
 )
+from wavebatch.surveying.measure_defects import measure_defects
 from wavebatch.surveying.systems.known_systems import find_source, take_pulse
 
 SAMPLE = 8192
@@ -118,6 +120,7 @@ def survey_blocks(blocks: Iterable[WaveformBlock], *, learn: bool = True) -> Sur
         members = [block for block in members if block.digitizer.index not in strangers]
         main = pool_blocks(members)
         plain = measure_gaussian(main)
+    main, plain = clean_sample(main, plain)
     found = _survey(main, plain, learn=learn)
     found.figures["descriptors_pooled"] = float(len(members))
     if not others:
@@ -319,7 +322,17 @@ def survey_block(block: WaveformBlock, *, learn: bool = True) -> Survey:
     """Survey of one block: noise and width of isolated echoes, the pulse's shape, noise again, the threshold."""
     if not len(block):
         return Survey(SystemPulse(sigma_ref=FIRST_WIDTH), 0, {}, ())
-    return _survey(block, measure_gaussian(block), learn=learn)
+    return _survey(*clean_sample(block, measure_gaussian(block)), learn=learn)
+
+
+def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlock, SystemPulse]:
+    """The block without the defects of its waveforms, and the system with them, once more from what is left."""
+    found = measure_defects(block, system)
+    if not found.has_defects:
+        return block, system
+    block = clean_block(block, found)
+    kept = {name: getattr(found, name) for name in ("pattern", "slope_spread", "spikes", "transient")}
+    return block, replace(measure_gaussian(block, system.sigma_ref / block.spacing), **kept)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
@@ -346,7 +359,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     echoes = decompose_sample(part, system)
     system = replace(system, width_scatter=_measure_scatter(part, system, echoes))
     figures.update(_describe(part, system, echoes))
-    return Survey(system, len(block), figures, _decide(system, block.spacing, figures))
+    decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))
+    return Survey(system, len(block), figures, decisions)
 
 
 def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:
@@ -428,6 +442,19 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
             f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse",
         ),
     )
+
+
+def _decide_defects(system: SystemPulse) -> Iterator[Decision]:
+    """What is taken off the waveforms before anything else, of those that have it."""
+    if system.pattern:
+        offsets = ", ".join(f"{offset:+.2f}" for offset in system.pattern)
+        yield Decision("pattern taken off", True, f"samples differ in turn by {offsets} DN: several converters")
+    if system.slope_spread:
+        yield Decision("slopes taken off", True, f"baselines rise or fall, by {system.slope_spread:.3g} DN/ns (std)")
+    if system.spikes:
+        yield Decision("spikes taken off", True, f"{system.spikes:.3g} spikes of one sample per waveform")
+    if system.transient:
+        yield Decision("start left out", True, f"the first {system.transient:g} ns of the waveforms jump")
 
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:

@@ -313,9 +313,7 @@ def _estimate_drifting(
     return PooledNoise(float(known.mean()), std, smoothed, spread, float(quiet.mean()), correlation, recovery)
 
 
-def _split_variance(
-    deviation: np.ndarray, quiet: np.ndarray, number: np.ndarray, apart: int
-) -> tuple[float, float]:
+def _split_variance(deviation: np.ndarray, quiet: np.ndarray, number: np.ndarray, apart: int) -> tuple[float, float]:
     """Standard deviation within waveforms and between their levels, from deviations (0 where not quiet).
 
     What two samples more than `apart` from each other have in common is their waveform's level: neighbours also share

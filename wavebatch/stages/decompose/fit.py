@@ -271,7 +271,7 @@ def describe_solutions(
     )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
-        table = drop_unproven(table, system)
+        table = drop_unproven(table, system, clip_level(block, system) - system.baseline)
     return flag_echoes(block, noise, system, clear_lone(table))
 
 

@@ -36,6 +36,9 @@ QUANTITIES: dict[str, Quantity] = {
     "noise_std_dn": Quantity("noise_std", 1e-3, 1e10, "noise of one sample, for thresholds and errors"),
     "noise_gain": Quantity("noise_gain", 0.0, 1e6, "growth of the noise's variance per count of signal"),
     "kappa": Quantity("kappa", -0.9, 0.9, "skew of the pulse; 0 is a Gaussian"),
+    "slope_spread_dn_ns": Quantity("slope_spread", 0.0, 1e9, "of baselines within a waveform, taken off", True),
+    "spikes": Quantity("spikes", 0.0, 1e6, "of one sample, per waveform, taken off", optional=True),
+    "transient_ns": Quantity("transient", 0.0, 1e9, "at the start of waveforms, left out", optional=True),
     "ringing": Quantity("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
     "saturation_dn": Quantity("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
     "acceptance": Quantity("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
@@ -52,6 +55,9 @@ COMPONENT_LIMITS = ((-10.0, 10.0), (-1e4, 1e4), (1e-3, 1e4))
 CORRELATION_LIMITS = ((-1.0, 1.0),)
 """Allowed correlation of the noise at a lag."""
 
+PATTERN_LIMITS = ((-1e6, 1e6),)
+"""Allowed offset of a pattern [count]."""
+
 TAIL_LIMITS = ((-1e5, 1e5), (0.0, 10.0))
 """Allowed lag [ns] and share of the misfit of a tail."""
 
@@ -59,9 +65,10 @@ MOST_LAGS = 1024
 """Lags that the correlation and the tail of a pulse in a file may have; a survey finds fewer than 64."""
 
 _NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
-_CORRELATION, _TAIL = "correlation", "tail_misfit"
+_CORRELATION, _TAIL, _PATTERN = "correlation", "tail_misfit", "pattern_dn"
 _ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
 _ABOUT_CORRELATION = "of the noise of two samples 1, 2, ... spacings apart; empty: white noise"
+_ABOUT_PATTERN = "offsets that repeat along the samples, taken off; empty: none"
 _ABOUT_TAIL = "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes"
 REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
 """What to do where a key is missing."""
@@ -79,6 +86,7 @@ def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
         **{key: None if value is None else float(value) for key, value in values.items()},
         _NOISE: {kind: float(value) for kind, value in system.noise_by_kind.items()},
         _CORRELATION: [float(value) for value in system.correlation],
+        _PATTERN: [float(value) for value in system.pattern],
         _COMPONENTS: [[float(value) for value in component] for component in system.components],
         _TAIL: [[float(value) for value in row] for row in system.tail_misfit],
     }
@@ -88,6 +96,7 @@ def comment_system() -> dict[str, str]:
     """Return the comments of a file by dotted key."""
     meanings = {key: quantity.meaning for key, quantity in QUANTITIES.items()}
     meanings |= {_COMPONENTS: _ABOUT_COMPONENTS, _CORRELATION: _ABOUT_CORRELATION, _TAIL: _ABOUT_TAIL}
+    meanings[_PATTERN] = _ABOUT_PATTERN
     places = ("system", f"system.{_DIGITIZERS}")
     comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
     comments[places[1]] = "a digitizer that records otherwise"
@@ -108,7 +117,7 @@ def read_system(table: TomlTable) -> SystemPulse:
 def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
     """A pulse from a table that may hold one extra key."""
     needed = (*(key for key, quantity in QUANTITIES.items() if not quantity.optional), _COMPONENTS, _NOISE)
-    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, extra), needed, REMEDY)
+    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, _PATTERN, extra), needed, REMEDY)
     values = {
         quantity.field: table.number(key, quantity.low, quantity.high)
         for key, quantity in QUANTITIES.items()
@@ -119,6 +128,7 @@ def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
         **values,
         noise_by_kind=read_numbers(table.table(_NOISE), low=0.0),
         correlation=tuple(row[0] for row in correlation),
+        pattern=tuple(row[0] for row in _read_rows(table, _PATTERN, PATTERN_LIMITS, "numbers")),
         components=_read_components(table),
         tail_misfit=_read_rows(table, _TAIL, TAIL_LIMITS, "[lag, share]"),
     )

@@ -1,0 +1,168 @@
+"""What receivers add to waveforms besides noise: spikes of one sample, a pattern of the converter, slopes, transients.
+
+The survey measures which of these a strip has, and stages/clean.py takes them off. Arrays are (s, n), as in `signal`.
+Before a change: an echo of the strip's pulse must never look like a defect, at any phase of the samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet
+
+SPIKE, HEIGHT, HOLE = 4.5, 5.5, 6.5
+"""Least height of a spike above its higher neighbour and above the baseline, and least depth of a hole [noise of a
+sample]: lower ones are no echoes, and white noise makes one in 10^6 samples.
+"""
+
+CURVATURE = 1.5
+"""How much more of its height than the system pulse an echo may lose to the next sample, as a factor."""
+
+PERIOD = 4
+"""Samples after which a pattern repeats: converters are two or four, which take samples in turn."""
+
+SEGMENTS = 6
+"""Parts of a waveform whose lower quartiles give its first slope."""
+
+LOOK = 8
+"""Samples at the start in which transients are looked for; as many after them show what is usual."""
+
+WILD = 1.6
+"""Scatter of a sample at the start, over that of later ones, from which it holds transients."""
+
+OFF = 0.5
+"""Mean of a sample at the start, in noise, from which it holds transients."""
+
+
+def find_spikes(above: np.ndarray, std: float, width: float) -> np.ndarray:
+    """Single samples that are too high or too low for their neighbours to be part of an echo.
+
+    Parameters
+    ----------
+    above : float32 (s, n), count
+        Waveforms above their baseline.
+    std : float, count
+        Noise of a sample.
+    width : float, samples
+        Of the system pulse, at least 1.5.
+
+    Returns
+    -------
+    bool (s, n)
+        Never the first or the last sample.
+    """
+    drop = np.float32(CURVATURE * (1 - np.exp(-0.5 / width**2)))
+    spikes = np.zeros(above.shape, bool)
+    if len(above) < 3:
+        return spikes
+    middle, left, right = above[1:-1], above[:-2], above[2:]
+    high, low = np.maximum(left, right), np.minimum(left, right)
+    spikes[1:-1] = middle - high > np.float32(SPIKE * std) + drop * np.maximum(middle, 0)
+    spikes[1:-1] &= middle > np.float32(HEIGHT * std)
+    spikes[1:-1] |= low - middle > np.float32(HOLE * std) + drop * np.maximum(high, 0)
+    return spikes
+
+
+def fill_spikes(signal: np.ndarray, spikes: np.ndarray) -> None:
+    """Replaces spikes by the mean of their neighbours, in place."""
+    sample, waveform = np.nonzero(spikes)
+    signal[sample, waveform] = 0.5 * (signal[sample - 1, waveform] + signal[sample + 1, waveform])
+
+
+def find_pattern(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean deviation of every PERIOD-th quiet sample from those around it, and its standard error, (PERIOD,) each.
+
+    The mean over one period around a sample holds level, slope and tail, but no pattern.
+    """
+    half = PERIOD // 2
+    inner = len(signal) - 2 * half
+    mean, error = np.zeros(PERIOD), np.full(PERIOD, np.inf)
+    if inner < PERIOD:
+        return mean, error
+    around = 0.5 * (signal[:inner] + signal[2 * half :])
+    calm = quiet[:inner] & quiet[2 * half :]
+    for step in range(1, PERIOD):
+        around += signal[step : step + inner]
+        calm &= quiet[step : step + inner]
+    deviation = signal[half : half + inner] - around / PERIOD
+    for phase in range(PERIOD):
+        first = (phase - half) % PERIOD
+        values = deviation[first::PERIOD][calm[first::PERIOD]]
+        if len(values) > 1:
+            mean[phase], error[phase] = np.mean(values, dtype=np.float64), np.std(values) / np.sqrt(len(values))
+    return mean - mean.mean(), error
+
+
+def find_transient(above: np.ndarray, std: float) -> int:
+    """Samples at the start of the waveforms that jump, in the mean or in many of them; 0 where echoes begin there.
+
+    above: waveforms above their baseline, float32 (s, n).
+    """
+    if len(above) < 3 * LOOK:
+        return 0
+    usual = above[LOOK : 2 * LOOK]
+    low, middle, high = np.quantile(usual, [0.05, 0.5, 0.95], axis=1)
+    if np.mean(np.abs(usual - middle[:, None]) < 4 * std + 0.5) < 0.8:
+        return 0
+    spread, centre = max(float(np.median(high - low)), 2 * std), float(np.median(middle))
+    first_low, first_high = np.quantile(above[:LOOK], [0.05, 0.95], axis=1)
+    inner = np.clip(above[:LOOK], first_low[:, None], first_high[:, None]).mean(axis=1)
+    jumps = (first_high - first_low > WILD * spread) | (np.abs(inner - centre) > max(OFF * std, 0.3))
+    return 0 if jumps.all() else int(np.argmin(jumps))
+
+
+def fit_slopes(
+    signal: np.ndarray, std: float, reach: int, limit: float = 4.0, missing: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slope of the baseline of each waveform, from its quiet samples.
+
+    Parameters
+    ----------
+    signal : float32 (s, n), count
+        Waveforms.
+    std : float, count
+        Noise of a sample.
+    reach : int, samples
+        Samples this near to signal are not quiet.
+    limit : float
+        A smoothed sample further from the line than this many standard deviations is signal.
+    missing : bool (s, n), optional
+        Samples that were not recorded.
+
+    Returns
+    -------
+    slope : float64 (n,), count per sample
+    error : float64 (n,)
+        Standard deviation in white noise; infinite where too few samples are quiet, or only one end of the waveform.
+    """
+    s = len(signal)
+    x = (np.arange(s, dtype=np.float32) - np.float32(0.5 * (s - 1)))[:, None]
+    level, slope = _first_lines(signal)
+    number = total = np.zeros(signal.shape[1])
+    for extra in (2.0, 1.0, 0.0):
+        rest = signal - (level + slope * x)
+        quiet = find_quiet(rest, np.float32(limit * (SMOOTH_GAIN + extra) * std + 0.25), reach)
+        if missing is not None:
+            quiet &= ~missing
+        number = np.maximum(quiet.sum(axis=0), 1)
+        middle = (quiet * x).sum(axis=0) / number
+        centred = np.where(quiet, x - middle, np.float32(0))
+        total = (centred * centred).sum(axis=0)
+        change = (centred * rest).sum(axis=0) / np.maximum(total, 1)
+        level = level + np.where(quiet, rest, np.float32(0)).sum(axis=0) / number - change * middle
+        slope = slope + change
+    enough = (number >= s // 5) & (total > number * (0.15 * s) ** 2)
+    error = np.where(enough, std / np.sqrt(np.maximum(total, 1e-9)), np.inf)
+    return slope.astype(np.float64), error.astype(np.float64)
+
+
+def _first_lines(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level at the middle and slope of each waveform: the median slope between lower quartiles of its parts."""
+    s = len(signal)
+    edges = np.linspace(0, s, SEGMENTS + 1).astype(int)
+    parts = [signal[begin:end] for begin, end in zip(edges, edges[1:], strict=False)]
+    low = np.stack([np.partition(part, len(part) // 4, axis=0)[len(part) // 4] for part in parts])
+    place = (0.5 * (edges[1:] + edges[:-1] - 1) - 0.5 * (s - 1)).astype(np.float32)
+    first, second = np.triu_indices(SEGMENTS, 1)
+    slope = np.median((low[second] - low[first]) / (place[second] - place[first])[:, None], axis=0)
+    return np.median(low - slope * place[:, None], axis=0), slope
