@@ -15,7 +15,6 @@ from wavebatch.kernels.signal.runs import find_stretches, list_samples
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
 
-
 LEAST_QUIET, LOWEST_TENTH = 6, 1.28
 """Quiet samples from which they give the level of a recording; how far, in standard deviations, the lowest tenth of
 normal noise lies below its mean."""

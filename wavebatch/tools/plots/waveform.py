@@ -118,7 +118,8 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
         views.append(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
-                np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table, returns,
+                np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table,
+                returns,
             )  # fmt: skip
         )
     return views
