@@ -8,7 +8,7 @@ from pathlib import Path
 import lazrs
 import numpy as np
 
-from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.files.las.header import STANDARD_DTYPES, read_header
 from wavebatch.files.strip.reader import StripReader
 
 HEADER_SIZES = {3: 235, 4: 375, 5: 393}
@@ -144,6 +144,21 @@ def make_raw(
     minor = minor or (3 if point_format < 9 else 4)
     packets = bytes(first_offset - 60) + samples.tobytes()
     return Raw(points, packets, point_format, minor, internal, [descriptor(1, bits=bits, samples=n_samples)])
+
+
+def cut_strip(source: Path, target: Path, points: int) -> Path:
+    """A copy of a LAS file with its first points only; all its packets stay."""
+    header = read_header(source)
+    data = bytearray(source.read_bytes())
+    if data[25] >= 4:
+        struct.pack_into("<Q", data, 247, points)
+    if struct.unpack_from("<I", data, 107)[0]:
+        struct.pack_into("<I", data, 107, points)
+    if source.with_suffix(".wdp").exists():
+        data = data[: header.offset_to_points + points * header.point_length]
+        target.with_suffix(".wdp").write_bytes(source.with_suffix(".wdp").read_bytes())
+    target.write_bytes(data)
+    return target
 
 
 def read_plainly(points: np.ndarray, data: bytes, kinds: dict[int, tuple[int, int]]) -> dict:

@@ -4,6 +4,8 @@ import json
 
 import pytest
 from click.testing import CliRunner
+from helpers_scenes import make_scene
+from strips import cut_strip
 
 from wavebatch.cli import main
 from wavebatch.files.disk.fingerprint import take_fingerprint
@@ -121,3 +123,48 @@ def test_what_is_no_strip_gives_one_line(tmp_path, data):
         assert result.exit_code == 1 and result.stdout == ""
         assert result.stderr.count("\n") == 1 and path.name in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_strips_of_a_flight_are_surveyed_together(flat_strip, tmp_path):
+    other, odd = tmp_path / "b.las", tmp_path / "odd.las"
+    simulate_strip("urban", other, pulses=1200, seed=2)
+    simulate_strip(make_scene("flat", baseline=15.0), odd, pulses=1200, seed=3)
+    result = _survey(flat_strip, tmp_path, "-o", tmp_path / "1.toml", "--waveforms", 2400)
+    assert result.exit_code == 1, "a strip does not belong to the others"
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("strips") and "2 of 3 belong together" in lines[0]
+    assert lines[1].strip().startswith(f"{odd}: does not belong to them: its level is 1")
+    saved = load_survey(tmp_path / "1.toml")
+    assert saved.strip == "2 strips" and saved.survey.waveforms == 1600
+    listed = tmp_path / "list.txt"
+    listed.write_text(f"b.las\n{flat_strip}\n")
+    again = _survey(f"@{listed}", odd, "--json", "--waveforms", 2400, "-o", tmp_path / "2.toml")
+    assert (tmp_path / "2.toml").read_text() == (tmp_path / "1.toml").read_text()
+    told = json.loads(again.stdout)
+    assert [(strip["strip"], strip["fits"]) for strip in told["strips"]] == [
+        (str(other), True), (str(flat_strip), True), (str(odd), False)
+    ]  # fmt: skip
+    assert told["misfits"] == [str(odd)] and told["failed"] == [] and told["looks_like"] is None
+    good = _survey(flat_strip, other, "--waveforms", 1600)
+    assert good.exit_code == 0 and "2 of 2 belong together" in good.stdout and good.stderr == ""
+
+
+def test_a_strip_of_a_flight_that_cannot_be_read_is_one_line(flat_strip, tmp_path):
+    result = _survey(flat_strip, tmp_path / "none.las", "--waveforms", 600)
+    assert result.exit_code == 1 and "1 of 1 belong together" in result.stdout
+    assert result.stderr.count("\n") == 1 and "none.las" in result.stderr
+    none = _survey(tmp_path / "none.las", tmp_path / "nor.las")
+    assert none.exit_code == 1 and none.stdout == "" and "none of 2 strips can be surveyed" in none.stderr
+
+
+def test_the_sensor_that_a_pulse_looks_like_is_named(riegl, flat_strip, tmp_path):
+    sentence = "this strip's pulse looks like RIEGL LMS-Q680i; it differs by "
+    assert any(line.startswith("sensor") and sentence in line for line in _survey(riegl).stdout.splitlines())
+    small = _survey(cut_strip(riegl, tmp_path / "small.las", 54)).stdout
+    assert "RIEGL LMS-Q680i: its shipped pulse is used" in small and "pulse from the shipped riegl-q680i" in small
+    assert "looks like" not in _survey(flat_strip).stdout
+    told = CliRunner().invoke(main, ["info", "-v", str(riegl)])
+    assert told.exit_code == 0 and sentence in told.stdout
+    assert "pulse   " not in CliRunner().invoke(main, ["info", str(riegl)]).stdout
+    other = json.loads(CliRunner().invoke(main, ["info", "-v", "--json", str(flat_strip)]).stdout)
+    assert other["pulse"]["sensor"] is None and other["pulse"]["full_width_ns"] == pytest.approx(4.71, rel=0.03)

@@ -286,3 +286,16 @@ def test_too_few_iterations_are_reported(rng):
     fit = fit_windows(record(rng, truth), start, box(10), GAUSSIAN, tolerance=1e-8, max_iterations=2)
     assert not fit.converged.any()
     assert np.isfinite(fit.cost).all()
+
+
+def test_no_fit_ends_worse_than_it_says(rng):
+    """Close echoes lie in a curved valley: a last step along it may climb its side, however little it promises."""
+    m = 4000
+    truth = draw(rng, m, 2, apart=2.5)
+    windows, limits = record(rng, truth), box(m)
+    start = truth.copy()
+    start[:, 0] *= rng.uniform(0.4, 1.6, start[:, 0].shape)
+    start[:, 1] += rng.uniform(-1.5, 1.5, start[:, 1].shape)
+    fit = fit_windows(windows, start, limits, GAUSSIAN, tolerance=0.5, max_iterations=40)
+    rows = evaluate_model(windows, fit.parameters, GAUSSIAN)
+    assert (gram_matrix(rows)[:, -1, -1] - fit.cost).max() < 10

@@ -126,10 +126,10 @@ def test_a_tolerance_takes_the_cheapest_chain_that_meets_it(strips, tmp_path):
     assert choice["chain"] == "profile fast" and choice["tolerance_m"] == 0.02
     assert [told["chain"] for told in choice["predictions"]] == ["fast", "balanced", "accurate"]
     assert choice["predictions"][0]["range_error_m"] == pytest.approx(0.005, abs=0.001)
-    assert _run(strips / "forest.las", "-o", tmp_path, "-q", "--tolerance", "3.5 cm").exit_code == 0
+    assert _run(strips / "forest.las", "-o", tmp_path, "-q", "--tolerance", "3.8 cm").exit_code == 0
     forest = _report(tmp_path, "forest")["choice"]
     fast, balanced, accurate = (told["range_error_m"] for told in forest["predictions"])
-    assert fast > balanced > 0.035 > accurate and forest["chain"] == "profile accurate"
+    assert fast > balanced > 0.038 > accurate and forest["chain"] == "profile accurate"
 
 
 def test_no_chain_that_meets_the_tolerance_is_2_and_one_line(strips, tmp_path):

@@ -57,7 +57,10 @@ def test_info_counts_samples_at_the_limit(tmp_path):
     data[33] = data[40] = data[100] = 255
     raw.packets = bytes(data)
     samples = describe_strip(raw.write(tmp_path / "a.las"))["samples"]
-    assert samples == {"waveforms_read": 10, "least": 10, "largest": 255, "waveforms_at_limit": 2, "waveforms_with_gaps": 0, "lengths": [32]}
+    assert samples == {
+        "waveforms_read": 10, "least": 10, "largest": 255, "waveforms_at_limit": 2, "waveforms_with_gaps": 0,
+        "lengths": [32],
+    }  # fmt: skip
 
 
 def test_info_of_a_strip_that_cannot_be_processed_still_tells_what_it_holds(tmp_path):

@@ -28,7 +28,7 @@ def test_every_shipped_chain_has_its_place_among_the_costs():
     [
         (make_scene("flat"), 0.95),
         (make_scene("flat", pulse=find_pulse("leica"), n_samples=100), 0.9),
-        (make_scene("urban"), 0.7),
+        (make_scene("urban"), 0.68),
         (make_scene("mixed"), 0.5),
     ],
     ids=["flat", "flat leica", "urban", "mixed"],

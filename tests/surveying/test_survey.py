@@ -19,7 +19,8 @@ from wavebatch.tools.simulate import PulseModel, find_pulse
 def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
     system = survey_block(make_block(scene, 3000, seed=3)[0]).system
-    assert system.sigma_ref == pytest.approx(sigma, rel=0.03)
+    # Half a sample is less than a width can be measured with (0.85): there it only has to be found.
+    assert system.sigma_ref == pytest.approx(sigma, rel=0.03 if sigma > 0.5 else 0.05)
     assert system.noise_std == pytest.approx(scene.recording.recorded_noise, rel=0.02)
 
 
@@ -60,13 +61,18 @@ def test_signal_dependent_noise_and_clipping_are_found():
     assert needed["censored fit"] and needed["signal-dependent weights"]
 
 
-def test_the_largest_group_of_one_length_decides():
+def test_waveforms_of_several_lengths_are_surveyed_together():
     flat, other = make_block("flat", 1000, seed=6)[0], make_block(make_scene("flat", n_samples=40), 1500, seed=6)[0]
     ends = [(other, 0, 700), (flat, 0, 600), (other, 700, 1500), (flat, 600, 1000)]
     parts = [block.rows(slice(start, stop)) for block, start, stop in ends]
-    joined = join_digitizers(parts)
-    assert len(joined) == 1 and np.array_equal(joined[0].samples, flat.samples)
-    assert survey_blocks(parts) == survey_blocks([flat])
+    (joined,) = join_digitizers(parts)
+    long = np.r_[700:1300, 2100:2500]
+    assert joined.samples.shape == (2500, 80) and np.array_equal(joined.samples[long], flat.samples)
+    assert not joined.missing[long].any() and joined.missing[:700, 40:].all() and not joined.missing[:700, :40].any()
+    both, alone = survey_blocks(parts), survey_blocks([flat])
+    assert both.waveforms == 2500 and both.system.digitizers == {}
+    assert both.system.sigma_ref == pytest.approx(alone.system.sigma_ref, rel=0.01)
+    assert both.system.noise_std == pytest.approx(alone.system.noise_std, rel=0.02)
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
@@ -90,15 +96,18 @@ def _survey_file(path):
 
 
 def test_riegl_is_what_is_known_of_it(riegl):
-    """R1, R3 and R4 of docs/algorithms.md 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns, noise .97 to 1.31 DN."""
+    """R1, R3 and R4 of docs/algorithms.md 8: s_ref 1.86 ns, +4 % after-pulse at +10.5 ns; noise of a pulse 1.7 DN."""
     survey = _survey_file(riegl)
     system = survey.system
     assert len(system.components) >= 3 and system.kappa == 0
     assert system.sigma_ref == pytest.approx(1.86, abs=0.05)
-    assert any(abs(delay - 10.5) < 0.5 and 0.02 < weight < 0.06 for weight, delay, _ in system.components)
+    # The after-pulse, whichever Gaussians make it: a maximum of 2 to 6 % of the peak, 10.5 ns after it.
+    lag = np.arange(6.0, 15.0, 0.1)
+    after = sum(w * np.exp(-0.5 * ((lag - delay) / sigma) ** 2) for w, delay, sigma in system.components)
+    after /= sum(w * np.exp(-0.5 * (delay / sigma) ** 2) for w, delay, sigma in system.components)
+    assert 9.5 < lag[np.argmax(after)] < 11.5 and 0.02 < after.max() < 0.07
     assert system.ringing == pytest.approx(0.044, abs=0.01)
-    assert 0.9 < system.noise_std < 1.6
-    assert system.noise_by_kind["tail_smoothed"] == pytest.approx(1.31, abs=0.1)
+    assert system.noise_std == pytest.approx(1.66, abs=0.15) and 1.7 < system.baseline < 2.8
     misfits = survey.figures
     assert misfits["misfit_5_gaussians"] < 0.5 * misfits["misfit_2_gaussians"] < 0.5 * misfits["misfit_1_gaussians"]
     assert abs(misfits["kappa"]) < 0.19 and misfits["misfit_skewed"] > 0.8 * misfits["misfit_1_gaussians"]
@@ -111,7 +120,9 @@ def test_leica_is_what_is_known_of_it(leica):
     assert len(system.components) >= 2 and 0.2 < misfits["kappa"] < 0.4
     assert system.sigma_ref == pytest.approx(3.15, abs=0.1)
     assert misfits["misfit_3_gaussians"] < 0.5 * misfits["misfit_skewed"] < 0.5 * misfits["misfit_1_gaussians"]
-    assert 0.9 < system.noise_std < 1.6 and misfits["empty_share"] == 0
+    # Coloured noise (.6, .55, .4 ...): what it does to the amplitude of a pulse is twice the noise of a sample.
+    assert system.noise_std == pytest.approx(1.7, abs=0.15) and misfits["empty_share"] == 0
+    assert system.correlation[:3] == pytest.approx((0.6, 0.54, 0.38), abs=0.06)
 
 
 def test_a_survey_depends_on_the_samples_only():

@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import Decision, Survey, survey_block
 from wavebatch.surveying.system_file import (
-    QUANTITIES,
     SYSTEM_SCHEMA,
     SavedSurvey,
     describe_system,
@@ -22,6 +22,7 @@ from wavebatch.surveying.system_file import (
     parse_survey,
     write_survey,
 )
+from wavebatch.surveying.systems.system_table import QUANTITIES
 
 SYSTEM = SystemPulse(
     sigma_ref=1.8581162121217176,
@@ -35,6 +36,9 @@ SYSTEM = SystemPulse(
     ringing=0.04428410627806453,
     saturation=255.0,
     acceptance=18.0,
+    correlation=(0.63, 1 / 7, -0.1),
+    tail_misfit=((-9.3, 0.0021), (5.574348636365153, 0.1 + 0.2)),
+    misfit=0.1 / 3,
 )
 SURVEY = Survey(
     SYSTEM,
@@ -68,11 +72,14 @@ positive = st.floats(1e-3, 1e4)
     rows=st.lists(st.tuples(st.floats(0.01, 10), st.floats(-1e4, 1e4), positive), min_size=2, max_size=5),
     reason=st.text(st.characters(exclude_categories=["Cs"])),
     saturation=st.none() | st.floats(1, 1e10),
+    correlation=st.lists(st.floats(-1, 1), max_size=4),
+    tail=st.lists(st.tuples(st.floats(-1e5, 1e5), st.floats(0, 10)), max_size=4),
 )
-def test_any_system_comes_back_to_the_last_bit(width, numbers, gain, rows, reason, saturation):
+def test_any_system_comes_back_to_the_last_bit(width, numbers, gain, rows, reason, saturation, correlation, tail):
     system = SystemPulse(
-        sigma_ref=width, baseline=numbers[0], noise_gain=gain, components=tuple(rows), saturation=saturation
-    )
+        sigma_ref=width, baseline=numbers[0], noise_gain=gain, components=tuple(rows), saturation=saturation,
+        correlation=tuple(correlation), tail_misfit=tuple(tail),
+    )  # fmt: skip
     survey = Survey(system, 1, {"a figure": numbers[1]}, (Decision("part", False, reason),))
     assert _same(parse_survey(format_survey(SavedSurvey(survey)), "x"), SavedSurvey(survey))
 
@@ -90,6 +97,7 @@ def test_figures_that_are_no_numbers_are_left_out():
 
 def test_every_number_of_the_system_has_a_key():
     fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components", "digitizers"}
+    fields |= {"correlation", "tail_misfit"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error"}
     assert fields | elsewhere == set(SystemPulse.__dataclass_fields__)
@@ -114,6 +122,14 @@ def test_without_saturation_nothing_clips():
     assert parse_survey(re.sub(r"^saturation_dn.*\n", "", TEXT, flags=re.M), "x").survey.system.saturation is None
 
 
+def test_files_of_earlier_versions_are_read():
+    """They have no correlation, no tail and no misfit."""
+    text = re.sub(r"^(correlation|tail_misfit|misfit) = .*\n", "", TEXT, flags=re.M)
+    assert text.count("\n") == TEXT.count("\n") - 3
+    system = parse_survey(text, "x").survey.system
+    assert system == replace(SYSTEM, correlation=(), tail_misfit=(), misfit=0.0)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -131,6 +147,12 @@ def test_without_saturation_nothing_clips():
         ("1.8836713464397783]", "1.0, 2.0]", r"must be a list of \[weight, delay, sigma\]"),
         ("components = [", "components = 3 # [", "must be a list of"),
         (", [-0.03361226544360852, 10.587040699291984, 1.5927024379059929]", "", "must be empty or hold 2 to"),
+        ("correlation = [", "correlation = [2, ", "correlation row 1 must lie between -1 and 1"),
+        ("correlation = [", "correlation = [[0.5], ", "correlation row 1 must be a number"),
+        ("correlation = [", "correlation = 1 # [", "correlation must be a list of numbers"),
+        ("correlation = [", "correlation = [" + 2000 * "0, ", "at most 1024 are read"),
+        ("tail_misfit = [", "tail_misfit = [1.0, ", r"tail_misfit must be a list of \[lag, share\]"),
+        ("tail_misfit = [[-9.3, 0.0021]", "tail_misfit = [[-9.3, -1]", "tail_misfit row 1 must lie between 0 and 10"),
         ("quiet = ", "quiet = '1' # ", r"\[noise_by_kind_dn\]: quiet must be a number"),
         ("quiet = ", "quiet = -1 # ", r"\[noise_by_kind_dn\]: quiet must lie between"),
         ("empty_share = 0.1", "empty_share = inf", r"\[figures\]: empty_share must be a finite number"),

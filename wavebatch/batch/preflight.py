@@ -8,12 +8,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.report_file import cloud_path
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
+from wavebatch.surveying.flight import read_flight
+from wavebatch.surveying.system_file import SavedSurvey, load_survey
 
 LEAST_MEMORY = 300 << 20
 """Bytes that one process needs with the smallest blocks."""
@@ -69,6 +73,47 @@ def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
                 raise ConfigError(f"{target}: the output would replace this input; choose another output folder")
 
 
+def flight_path(folder: Path) -> Path:
+    """Return the path of the survey of a flight in the folder of its clouds."""
+    return folder / "flight.system.toml"
+
+
+def load_flight(jobs: Sequence[StripJob], options: BatchOptions) -> SavedSurvey | None:
+    """Load the survey of a flight that an earlier run has kept.
+
+    Parameters
+    ----------
+    jobs : sequence of StripJob
+    options : BatchOptions
+
+    Returns
+    -------
+    SavedSurvey or None
+        None where the jobs want none, where there is none yet, and where `overwrite` asks for a new one.
+
+    Raises
+    ------
+    ConfigError
+        Where the file cannot be read or holds no survey of a flight.
+    """
+    path = flight_path(options.folder)
+    if options.overwrite or not any(job.request.flight for job in jobs) or not os.path.lexists(path):
+        return None
+    saved = load_survey(path)
+    try:
+        read_flight(saved.survey)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return saved
+
+
+def with_flight(jobs: Sequence[StripJob], saved: SavedSurvey | None) -> list[StripJob]:
+    """Return the jobs with the survey of their flight."""
+    return [
+        replace(job, request=replace(job.request, system=saved)) if job.request.flight else job for job in jobs
+    ]
+
+
 def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
     """Describe what `run_batch` would do with a strip, from its headers alone.
 
@@ -87,6 +132,7 @@ def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
     InputError, ConfigError
         Where the run would refuse the strip before it begins.
     """
+    (job,) = with_flight([job], load_flight([job], options))
     task = StripTask(job, options, alone=False)
     done = task.start() is not None
     facts = task.facts

@@ -55,6 +55,8 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
+    # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
+    flight = {"survey": "flight"} if job.request.flight else {}
     return {
         "version": __version__,
         "input": {"file": job.path.name, **fingerprint},
@@ -64,6 +66,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
+            **flight,
         },
     }
 
@@ -72,6 +75,9 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     """Describe the results of scan and survey as plain values; `described` is from `describe_job`."""
     scan = prepared.scan
     fingerprint = {name: value for name, value in described["input"].items() if name != "file"}
+    seen = describe_survey(prepared.choice, prepared.job.request, fingerprint)
+    if prepared.job.request.flight:
+        seen["survey"]["flight"] = {"fits": not prepared.stranger, "reason": prepared.stranger or None}
     return {
         "direction": {
             "sign": scan.direction,
@@ -79,7 +85,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
             "vector_ratio": without_nan(scan.vector_ratio),
         },
         "sensor": prepared.sensor.describe(),
-        **describe_survey(prepared.choice, prepared.job.request, fingerprint),
+        **seen,
     }
 
 

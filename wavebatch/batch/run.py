@@ -19,13 +19,16 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
-from wavebatch.batch.preflight import check_outputs
+from wavebatch.batch.preflight import check_outputs, flight_path, load_flight, with_flight
 from wavebatch.batch.processes import Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import remove_stale, reporting
+from wavebatch.surveying import Survey
+from wavebatch.surveying.flight import read_samples, survey_flight, surveys_agree
+from wavebatch.surveying.system_file import SavedSurvey, load_survey, write_survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,8 @@ class Outcome:
     """written, skipped (resume found the cloud up to date) or failed."""
     report: RunReport = field(default_factory=RunReport)
     error: BaseException | None = None
+    survey: Survey | None = None
+    """The strip's survey, where it was made for this strip alone in this run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,17 @@ class BatchResult:
         """The sum of the strips' reports."""
         return sum((outcome.report for outcome in self.outcomes), RunReport())
 
+    @property
+    def advice(self) -> str:
+        """One line where the surveys of single strips agree so well that one of all would serve; else empty."""
+        surveys = [outcome.survey for outcome in self.outcomes if outcome.survey is not None]
+        if len(surveys) < len(self.outcomes) or not surveys_agree(surveys):
+            return ""
+        return (
+            f"the surveys of the {len(surveys)} strips agree within their errors: --survey flight would survey them "
+            "once, and give all of them the same pulse"
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the summary of the batch as plain values; all but `timing` is the same for every run."""
         report = self.report
@@ -70,7 +86,8 @@ class BatchResult:
         ]
         timing = {**build_timing(report), "elapsed_seconds": round(self.seconds, 3)}
         head = {"schema": BATCH_SCHEMA, "version": __version__, "strips": strips}
-        return {**head, **report.to_json(), "timing": timing}
+        advice = {"advice": self.advice} if self.advice else {}
+        return {**head, **advice, **report.to_json(), "timing": timing}
 
 
 def run_batch(
@@ -83,8 +100,9 @@ def run_batch(
     jobs : sequence of StripJob
     options : BatchOptions
     on_event : callable, optional
-        Called with a dictionary for each event; its key `event` is start, unit, written, skipped or failed. `again` in
-        a failure means that the same cause was reported for another strip before.
+        Called with a dictionary for each event; its key `event` is flight, start, unit, written, skipped or failed.
+        `again` in a failure means that the same cause was reported for another strip before. `strip` of the event
+        flight is the file of the flight's survey.
 
     Returns
     -------
@@ -100,14 +118,41 @@ def run_batch(
     """
     start = time.perf_counter()
     check_outputs(jobs, options)
+    saved = load_flight(jobs, options)
     with Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs) as workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)
+        if any(job.request.flight for job in jobs):
+            jobs = with_flight(jobs, saved or _survey_flight(jobs, options, on_event))
         with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
             batch.run()
         outcomes = tuple(batch.outcomes[job.path] for job in jobs)
     return BatchResult(outcomes, time.perf_counter() - start)
+
+
+def _survey_flight(
+    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None
+) -> SavedSurvey | None:
+    """Survey all strips together and keep the result; None where no strip can be read: each fails in its turn."""
+    first = jobs[0].options
+    samples = read_samples([job.path for job in jobs], direction=first.direction, headerless=first.headerless)
+    if not samples:
+        return None
+    path = flight_path(options.folder)
+    flight = survey_flight(samples)
+    try:
+        write_survey(path, flight.saved, overwrite=options.overwrite)
+    except InputError:
+        # Another run into this folder was faster: its survey counts, so that all strips have the same one.
+        found = load_flight(jobs, options)
+        if found is None:
+            raise
+        return found
+    if on_event is not None:
+        on_event({"event": "flight", "strip": str(path), "strips": len(flight.strips) - len(flight.misfits)})
+    # As a later run reads it, so that its identity is the same.
+    return load_survey(path)
 
 
 class _Batch:
@@ -183,7 +228,9 @@ class _Batch:
             if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})
             if strip.is_complete:
-                self._end(strip, Outcome(strip.job, "written", strip.finish()))
+                report = strip.finish()
+                survey = strip.prepared.choice.survey if strip.job.request.system is None else None
+                self._end(strip, Outcome(strip.job, "written", report, survey=survey))
 
     @contextlib.contextmanager
     def _failing(self, strip: StripTask) -> Iterator[None]:

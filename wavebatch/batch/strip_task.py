@@ -190,7 +190,7 @@ class StripTask:
             self._fill()
         start = time.perf_counter()
         self._report.check(job.options.points, str(job.path))
-        self._report += RunReport(remarks=find_remarks(self.prepared, self._report))
+        self._report += RunReport(remarks=(*_name_stranger(self.prepared), *find_remarks(self.prepared, self._report)))
         if self._stat() != self._state:
             raise InputError(f"{job.path}: changed while it was read; run it again once it is complete")
         cloud = report_file.cloud_path(job, options.folder)
@@ -223,6 +223,13 @@ class StripTask:
         """Size and time of the input files, to see whether they change during the run."""
         stats = [os.stat(path) for path in self._files]
         return [(stat.st_size, stat.st_mtime_ns) for stat in stats]
+
+
+def _name_stranger(prepared: Prepared) -> tuple[str, ...]:
+    """The line about a strip that does not belong to its flight."""
+    if not prepared.stranger:
+        return ()
+    return (f"does not belong to the flight that was surveyed: {prepared.stranger}; it got a survey of its own",)
 
 
 def _close_scan(future: Future) -> None:

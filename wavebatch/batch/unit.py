@@ -29,6 +29,7 @@ from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 
 BLOCK_SAMPLES = 1 << 22
@@ -104,6 +105,8 @@ class Prepared:
     report: RunReport
     """Timing of the preparation."""
     sensor: SensorSource = UNKNOWN
+    stranger: str = ""
+    """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
 
     @property
     def system(self) -> SystemPulse:
@@ -207,6 +210,9 @@ def prepare_strip(job: StripJob) -> Prepared:
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
+            stranger = _hold(reader, scan, job)
+            if stranger:
+                job = replace(job, request=replace(job.request, system=None))
             choice = make_choice(reader, scan, job.chain, job.request)
             if job.request.describe(job.chain) is not None:
                 choice = replace(choice, chain=job.extend(choice.chain))
@@ -223,13 +229,21 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor)
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger)
+
+
+def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
+    """Why the strip does not belong to the flight whose survey the job has; empty where it does."""
+    if job.request.system is None or not job.request.flight:
+        return ""
+    return hold_strip(reader, scan, job.request.system.survey)
 
 
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
     """The choice with the widths of level ground, where angles are computed and no saved survey has them."""
     parameters = angle_parameters(job.chain)
-    if parameters is None or sensor is UNKNOWN or job.request.system is not None:
+    saved = job.request.system is not None and not job.request.flight
+    if parameters is None or sensor is UNKNOWN or saved:
         return choice
     survey = choice.survey
     used = job.calibrate(survey.system)

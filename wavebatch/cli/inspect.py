@@ -23,8 +23,10 @@ EXIT_PROBLEMS = 1
 @click.command()
 @strip_argument
 @strip_options
+@click.option("-v", "--verbose", is_flag=True,
+              help="Also survey the strip: its pulse, and the known sensor that it looks like.")
 @common_options("json")
-def info(strip: Path, direction: str, headerless: bool, as_json: bool, debug: bool) -> None:
+def info(strip: Path, direction: str, headerless: bool, verbose: bool, as_json: bool, debug: bool) -> None:
     """Show points, wave packets, descriptors and sample values of a strip.
 
     Reads all points and a few thousand waveforms.
@@ -32,7 +34,27 @@ def info(strip: Path, direction: str, headerless: bool, as_json: bool, debug: bo
     Exit code: 0 done, 1 the strip cannot be read, 2 wrong usage.
     """
     facts = describe_strip(strip, direction=direction, headerless=headerless)
+    if verbose and facts["packets"]["count"] and not facts["problems"]:
+        facts["pulse"] = _describe_pulse(strip, direction, headerless)
     print_result(as_json, facts, _list_lines(facts))
+
+
+def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
+    """The pulse of a strip by its survey, and the known sensor that it looks like."""
+    from wavebatch.core.units import FWHM_PER_SIGMA
+    from wavebatch.surveying.systems.known_systems import find_likeness
+    from wavebatch.tools.api.strip import open_strip, survey
+
+    with open_strip(path, direction=direction, headerless=headerless) as strip:
+        found = survey(strip)
+    like = find_likeness(found.system, found.figures["spacing_ns"])
+    return {
+        "full_width_ns": FWHM_PER_SIGMA * found.system.sigma_ref,
+        "noise_dn": found.system.noise_std,
+        "sensor": like and like.known.sensor,
+        "difference": like and like.difference,
+        "sentence": like.describe() if like else "this strip's pulse looks like that of no known sensor",
+    }
 
 
 @click.command()
@@ -98,6 +120,10 @@ def _list_lines(facts: dict[str, Any]) -> list[str]:
     lines.append(f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}")
     if ratio is not None:
         lines.append(f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
+    if "pulse" in facts:
+        pulse = facts["pulse"]
+        width = f"{pulse['full_width_ns']:.3g} ns at half maximum, noise {pulse['noise_dn']:.3g} DN"
+        lines.append(f"pulse          {width}; {pulse['sentence']}")
     if facts["extra_dimensions"]:
         lines.append(f"extra bytes    {', '.join(facts['extra_dimensions'])}")
     lines += [f"note           {line}" for line in facts["notes"]]

@@ -223,6 +223,8 @@ class Progress:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
+        elif kind == "flight" and self._level > 0:
+            self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 
     def _advance(self, strip: str, share: float) -> None:
         done = round(self._sizes.get(strip, 0) * share)

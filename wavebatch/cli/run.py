@@ -53,6 +53,9 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
               help="For each strip, choose the cheapest shipped chain whose predicted range error is at most this, "
               "e.g. 0.02m.")
 @system_option
+@click.option("--survey", type=click.Choice(["each", "flight"]), default="each", show_default=True,
+              help="Survey each strip by itself, or all strips once: kept as DIR/flight.system.toml, used again with "
+              "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.")
 @sensor_options
 @calibration_option
 @strip_options
@@ -146,6 +149,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         chain=options["chain_file"] or options["profile"],
         tolerance=_read_tolerance(options["tolerance"]),
         system=options["system_file"],
+        survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],
         format=options["file_format"],
@@ -175,6 +179,8 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
         talk(f"{timing['elapsed_seconds']:.1f} s elapsed; of the processes' time: {parts}")
+        if result.advice:
+            talk(result.advice)
     if options["report"] == "-":
         print_json(result.to_json())
     elif options["report"]:

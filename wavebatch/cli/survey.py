@@ -1,45 +1,59 @@
-"""`wavebatch survey`: noise, pulse and scene of a strip, and the chain that they need.
+"""`wavebatch survey`: noise, pulse and scene of a strip or of a flight, and the chain that they need.
 
 Calls the survey and prints it; the measurements are in `wavebatch.surveying`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import count, print_result, talk
-from wavebatch.cli.options import common_options, output_option, strip_argument, strip_options
+from wavebatch.cli.messages import count, one_line, print_result, talk
+from wavebatch.cli.options import common_options, output_option, strip_options
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
+    from wavebatch.surveying.flight import Flight
     from wavebatch.surveying.system_file import SavedSurvey
+
+EXIT_PROBLEMS = 1
+"""A strip cannot be surveyed, or does not belong to the others."""
 
 
 @click.command()
-@strip_argument
+@click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
 @output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
 @click.option("--chain", "chain_file", type=click.Path(dir_okay=False, path_type=Path), metavar="CHAIN.toml",
               help="Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.")
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
-              help="Waveforms to look at, spread over the strip.  [default: 8192, fewer if they are long]")
+              help="Waveforms to look at, spread over all strips.  [default: 8192, fewer if they are long]")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]: adds whether echo widths can give "
               "incidence angles; saved in SYSTEM.toml.")
 @strip_options
 @common_options("overwrite", "json")
-def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: bool, **options: Any) -> None:
-    """Measure noise, pulse and scene of a strip, and choose the chain that they need.
+def survey(
+    strips: tuple[str, ...], output: Path | None, chain_file: Path | None, as_json: bool, **options: Any
+) -> None:
+    """Measure noise, pulse and scene of strips, and choose the chain that they need.
+
+    STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Several strips
+    are surveyed together, as the strips of one flight: the result does not depend on their order. Strips whose samples,
+    level, noise or pulse differ from the others are named with the reason and left out.
 
     Prints noise, baseline, system pulse, ringing and saturation, the shares of empty, single and overlapped waveforms,
     and for each optional part of a chain whether the strip needs it and why.
 
-    Exit code: 0 done, 1 the strip cannot be surveyed or a file cannot be written, 2 wrong usage.
+    Exit code: 0 done, 1 a strip cannot be surveyed or does not belong to the others, or a file cannot be written, 2
+    wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
+    from wavebatch.files.inputs import find_files
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import write_survey
@@ -48,7 +62,8 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     for target in (output, chain_file):
         if target is not None and not overwrite:
             refuse_existing(target)
-    saved, facts = _survey(strip, options)
+    paths = find_files(strips)
+    saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
         write_survey(output, saved, overwrite=overwrite)
     if chain_file is not None:
@@ -57,6 +72,8 @@ def survey(strip: Path, output: Path | None, chain_file: Path | None, as_json: b
     for target in (output, chain_file):
         if target is not None:
             talk(f"{target}: written")
+    if facts.get("misfits") or facts.get("failed"):
+        sys.exit(EXIT_PROBLEMS)
 
 
 def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
@@ -79,6 +96,42 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
 
 
+def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
+    """The survey of a flight, and what else is shown of its strips."""
+    from wavebatch.core.errors import InputError
+    from wavebatch.surveying.flight import read_samples, survey_flight
+
+    failed: list[Path] = []
+
+    def report(path: Path, error: InputError) -> None:
+        failed.append(path)
+        talk(f"error: {one_line(error)}")
+
+    reading = {name: options[name] for name in ("waveforms", "direction", "headerless")}
+    samples = read_samples(paths, **reading, on_error=report)
+    if not samples:
+        raise InputError(f"none of {count(len(paths), 'strip')} can be surveyed")
+    flight = survey_flight(samples)
+    saved = flight.saved
+    if options["divergence"] is not None:
+        system = replace(saved.survey.system, divergence=options["divergence"])
+        saved = replace(saved, survey=replace(saved.survey, system=system))
+    return saved, _describe_flight(flight, paths, failed)
+
+
+def _describe_flight(flight: Flight, paths: Sequence[Path], failed: Sequence[Path]) -> dict[str, Any]:
+    """The strips in the order in which they were given."""
+    order = {path: number for number, path in enumerate(paths)}
+    strips = sorted(flight.strips, key=lambda strip: order[strip.path])
+    return {
+        "strips": [strip.to_json() for strip in strips],
+        "points": sum(strip.facts["points"] for strip in strips),
+        "packets": sum(strip.facts["packets"] for strip in strips),
+        "misfits": [str(strip.path) for strip in strips if not strip.fits],
+        "failed": list(map(str, failed)),
+    }
+
+
 def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import SYSTEM_SCHEMA, describe_system
@@ -95,17 +148,35 @@ def _document(saved: SavedSurvey, facts: dict[str, Any]) -> dict[str, Any]:
             {"part": one.part, "needed": bool(one.needed), "reason": one.reason} for one in saved.survey.decisions
         ],
         "chain": chain_text(saved.survey),
+        "looks_like": _find_likeness(saved),
     }
 
 
+def _find_likeness(saved: SavedSurvey) -> dict[str, Any] | None:
+    """The known sensor whose pulse this one looks like."""
+    from wavebatch.surveying.systems.known_systems import find_likeness, find_source
+
+    survey = saved.survey
+    found = find_likeness(survey.system, survey.figures.get("spacing_ns", 0.0))
+    if found is None:
+        return None
+    taken = "known_pulse_misfit" in survey.figures and find_source(survey.system) is not None
+    return {"sensor": found.known.sensor, "name": found.known.name, "difference": found.difference, "taken": taken,
+            "sentence": found.describe()}  # fmt: skip
+
+
 def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
-    figures, direction = saved.survey.figures, facts["direction"]
-    yield _line("strip", f"{facts['strip']}: {count(facts['points'], 'point')}, {count(facts['packets'], 'packet')}")
+    figures, size = saved.survey.figures, f"{count(facts['points'], 'point')}, {count(facts['packets'], 'packet')}"
+    if "strips" in facts:
+        yield from _strip_lines(facts, size)
+    else:
+        yield _line("strip", f"{facts['strip']}: {size}")
     yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
     samples = f"{figures['n_samples']:.0f} of {figures['bits']:.0f} bits, {figures['spacing_ns']:g} ns apart"
     yield _line("samples", samples)
     yield _line("ADC range", f"counts {figures['least_count']:.0f} to {figures['largest_count']:.0f}")
-    yield _line("vectors", f"{direction['sign']} the sensor: {direction['evidence']}")
+    if "direction" in facts:
+        yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")
     yield from _noise_lines(saved)
     yield from _pulse_lines(saved)
     yield from _digitizer_lines(saved)
@@ -113,6 +184,16 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield "decisions"
     for decision in saved.survey.decisions:
         yield f"  {'needed' if decision.needed else 'left out':10}{decision.part:26}{decision.reason}"
+
+
+def _strip_lines(facts: dict[str, Any], size: str) -> Iterator[str]:
+    """How many strips belong together, and a line for each that does not."""
+    strips = facts["strips"]
+    fitting = sum(strip["fits"] for strip in strips)
+    yield _line("strips", f"{fitting} of {len(strips)} belong together: {size}")
+    for strip in strips:
+        if not strip["fits"]:
+            yield f"  {strip['strip']}: does not belong to them: {strip['reason']}"
 
 
 def _line(name: str, text: str) -> str:
@@ -145,9 +226,14 @@ def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
     yield _line("system pulse", f"{_name_model(system)}; {width}")
     for weight, delay, sigma in system.components:
         yield f"  {weight:8.4f} at {delay:8.3f} ns, sigma {sigma:7.3f} ns"
+    like = _find_likeness(saved)
+    if like is not None:
+        taken = f"{like['sensor']}: its shipped pulse is used"
+        yield _line("sensor", taken if like["taken"] else like["sentence"])
     yield _line("pulse models", f"from {figures.get('isolated_echoes', 0):.0f} isolated echoes; misfit per amplitude")
     if "misfit_goal" not in figures:
-        yield "  too few to learn a pulse from: a Gaussian of their width is used"
+        model = "a shipped pulse" if system.components else "a Gaussian of their width"
+        yield f"  too few to learn a pulse from: {model} is used"
     else:
         yield from _misfit_lines(saved)
     yield _line("kappa", f"{figures['kappa']:.4f}" if "kappa" in figures else "not known")

@@ -208,6 +208,8 @@ class SystemPulse:
     """Typical level without signal [count]."""
     baseline_spread: float = 0.0
     """Standard deviation of the true baseline between waveforms [count]."""
+    recovery: float = 0.0
+    """Time after a strong signal until the level is back to what it was before it [ns]."""
     noise_std: float = QUANTISATION_STD
     """Noise of one sample that thresholds and errors use [count]."""
     noise_by_kind: Mapping[str, float] = field(default_factory=dict)

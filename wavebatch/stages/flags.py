@@ -20,6 +20,9 @@ RINGING_REACH = 12.0
 RINGING_FACTOR = 1.2
 """Echoes up to this many times the strip's ringing may be ringing (docs/algorithms.md H7)."""
 
+TAIL_FACTOR = 1.5
+"""An echo must be so many times as high as the measured misfit of a stronger echo's tail at its place."""
+
 LEAST_RATIO = 0.02
 """Share of a stronger neighbour that an echo must exceed: no learned pulse is better known (docs/algorithms.md R3)."""
 
@@ -79,7 +82,33 @@ def drop_unproven(table: EchoTable, system: SystemPulse) -> EchoTable:
     """
     delays = [abs(delay) + 3 * sigma for _, delay, sigma in system.components]
     reach = max([4 * system.sigma_ref, *delays])
-    return table.take(np.flatnonzero(~_faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)))
+    faint = _faint_beside(table, LEAST_RATIO, 0.0, reach, before=True)
+    if system.tail_misfit:
+        faint |= _explained_by_tails(table, np.array(system.tail_misfit))
+    return table.take(np.flatnonzero(~faint))
+
+
+def _explained_by_tails(table: EchoTable, misfit: np.ndarray) -> np.ndarray:
+    """True (m,) for echoes that are no higher than what the pulse leaves unexplained around stronger ones.
+
+    misfit: lag [ns] and share of the strong echo's amplitude, (k, 2), sorted by lag.
+    """
+    faint = np.zeros(len(table), bool)
+    waveform, time, amplitude = table.waveform, table.time, table.amplitude
+    # Between two lags that were measured side by side the share is a line; elsewhere nothing is left.
+    lags, shares = misfit.T
+    width = np.min(np.diff(lags)) if len(lags) > 1 else 0.0
+    for step in range(1, min(NEIGHBOURS, len(table) - 1) + 1):
+        same = waveform[step:] == waveform[:-step]
+        lag = time[step:] - time[:-step]
+        for weak, strong, at, place in (
+            (amplitude[step:], amplitude[:-step], lag, slice(step, None)),
+            (amplitude[:-step], amplitude[step:], -lag, slice(None, -step)),
+        ):
+            near = np.abs(at[:, None] - lags).min(axis=1) <= 0.6 * width
+            limit = np.where(same & near, TAIL_FACTOR * np.interp(at, lags, shares), 0.0)
+            faint[place] |= weak < limit * strong
+    return faint
 
 
 def clear_lone(table: EchoTable) -> EchoTable:

@@ -56,14 +56,15 @@ def pooled(
     signal = transpose_samples(block.samples)
     signal -= np.float32(system.baseline)
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
+    recovery = int(np.ceil(min(system.recovery / block.spacing, signal.shape[0])))
     spread = system.baseline_spread
     if spread > DRIFT * std:
-        mean, quiet, number = find_levels(signal, std, reach, limit)
+        mean, quiet, number = find_levels(signal, std, reach, limit, recovery)
         if block.missing is not None:
             quiet &= ~block.missing.T
             mean, number = quiet_mean(signal, quiet)
     else:
-        quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach)
+        quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach, recovery)
         if block.missing is not None:
             quiet &= ~block.missing.T
         mean, number = quiet_mean(signal, quiet)

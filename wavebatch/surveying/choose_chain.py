@@ -42,6 +42,8 @@ class Request:
     """Take the fastest shipped chain whose predicted range error is not larger [m]."""
     system: SavedSurvey | None = None
     """A saved survey; None: the strip is surveyed."""
+    flight: bool = False
+    """The saved survey is that of the strip's flight, or will be made before the run: the strip is held against it."""
 
     def describe(self, chain: Chain) -> str | None:
         """Return what chooses the chain, for reports; None where the user gave `chain` itself."""
@@ -172,7 +174,9 @@ def describe_survey(choice: Choice, request: Request, fingerprint: Mapping[str, 
     found, saved = choice.survey, request.system
     figures = {name: float(value) for name, value in found.figures.items() if np.isfinite(value)}
     source: dict[str, Any] = {"from": "strip", "waveforms": found.waveforms, "figures": figures}
-    if saved is not None:
+    if saved is not None and request.flight:
+        source |= {"from": "flight", "strips": int(found.figures.get("flight_strips", 0)), "version": saved.version}
+    elif saved is not None:
         same = bool(saved.fingerprint) and dict(saved.fingerprint) == dict(fingerprint)
         source |= {"from": "file", "strip": saved.strip, "version": saved.version, "of_this_strip": same}
     return {"system": describe_system(found.system), "survey": source}

@@ -129,12 +129,12 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
 
 
 def find_strong(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """The strongest two fifths of the isolated echoes that are neither clipped nor widened by their target."""
+    """The strongest fifth of the isolated echoes that are neither clipped nor widened by their target."""
     echoes = _find_clear(block, system, most=1.0)
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
-    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.6)))
+    strong = np.flatnonzero(narrow & (echoes.amplitude >= np.quantile(echoes.amplitude[narrow], 0.8)))
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 

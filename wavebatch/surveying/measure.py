@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD, SQRT_PI
@@ -74,11 +75,17 @@ LEAST_WINDOW = 6
 OUTSIDE_REACH = 3.0
 """Widths of an echo around it that are its own, not noise."""
 
-LEAST_QUIET = 0.02
+SAME_NOISE = 1.1
+"""Ratio of the noise of quiet samples and of residuals up to which they are the same noise."""
+
+LEAST_QUIET = 0.15
 """Share of quiet samples below which noise comes from residuals of good fits."""
 
 MISFIT_QUANTILE = 0.8
 """Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
+
+SCATTERED = 1.4
+"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
 
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
@@ -120,13 +127,14 @@ def _gaussian_system(block: WaveformBlock, width: float, saturation: float | Non
     missing = None if block.missing is None else block.missing.T
     noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
     correlation = tuple(noise.correlation.tolist())
-    seen = noise.std * noise_factors(GAUSSIAN, width, correlation)[0]
+    seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
     known = noise.std if noise.share >= LEAST_QUIET else 0.0
     hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
     return SystemPulse(
         sigma_ref=width * block.spacing,
         baseline=noise.level,
         baseline_spread=noise.spread,
+        recovery=float(noise.recovery * block.spacing),
         noise_std=max(seen, noise.std, hidden),
         noise_by_kind={"quiet": known, "quiet_smoothed": noise.smoothed_std, "quiet_pulse": seen},
         correlation=correlation,
@@ -151,12 +159,12 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     good = keep_lone(good, echoes.amplitude, second)
     free = (echoes.flags[good] & int(EchoFlag.AT_BOUND)) == 0
-    widths = echoes.sigma[good] / block.spacing
+    widths, errors = echoes.sigma[good] / block.spacing, echoes.sigma_err[good] / block.spacing
     if 2 * free.sum() > len(free):
-        widths = widths[free]
+        widths, errors = widths[free], errors[free]
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
-    return float(np.clip(find_edge(widths), 0.5, 50.0))
+    return float(np.clip(find_edge(widths, errors), 0.5, 50.0))
 
 
 def keep_lone(good: np.ndarray, amplitude: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -183,7 +191,7 @@ def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
     return order[first], second[waveform[first]]
 
 
-def find_edge(widths: np.ndarray) -> float:
+def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
     """Width of the system pulse: the narrowest width that echoes repeat.
 
     Slopes and plants only widen echoes, so the pulse is at the lower edge of their widths; the most common width is
@@ -195,18 +203,22 @@ def find_edge(widths: np.ndarray) -> float:
     ----------
     widths : (m,)
         Of clear single echoes, any unit.
+    errors : (m,), optional
+        Their standard deviations. Widths that scatter by more than usual are allowed to lie further apart.
 
     Returns
     -------
     float
         In the unit of the widths.
     """
+    typical = 0.0 if errors is None else float(np.median(errors / widths))
+    allowed, climb = max(REPEAT_SPAN, 3 * typical), max(CLIMB, 5 * typical)
     ordered = np.log(np.sort(widths.astype(np.float64)))
     hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
     span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
-    close = span <= REPEAT_SPAN
+    close = span <= allowed
     first = int(np.argmax(close)) if close.any() else int(np.argmin(span))
-    near = ordered[first : np.searchsorted(ordered, ordered[first] + CLIMB, side="right")]
+    near = ordered[first : np.searchsorted(ordered, ordered[first] + climb, side="right")]
     half = max(len(near) // 2, min(2, len(near)))
     inner = near[half - 1 :] - near[: len(near) - half + 1]
     begin = int(np.argmin(inner))
@@ -329,7 +341,10 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     std, correlation = found[0], tuple(found[1].tolist())
     hidden = DITHERED if std < UNDITHERED else QUANTISATION_STD
     kinds = {**system.noise_by_kind, "outside": std, "outside_pulse": seen}
-    return replace(system, noise_std=max(seen, std, hidden), noise_by_kind=kinds, correlation=correlation)
+    # The residual is a few percent too small, because the baseline comes from the same samples. The estimate from quiet
+    # samples is corrected for that: it is the floor, unless they hold tails of echoes, which the residual does not.
+    floor = kinds["quiet_pulse"] if 0 < kinds["quiet"] < SAME_NOISE * std else 0.0
+    return replace(system, noise_std=float(max(seen, std, hidden, floor)), noise_by_kind=kinds, correlation=correlation)
 
 
 def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
@@ -400,7 +415,9 @@ def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable)
     ratio = fitted.amplitude.astype(np.float64) / system.noise_std
     energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
     share = (promise - NOISE_PROMISE) / energy
-    misfit = float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0))) if len(share) >= FEW else 0.0
+    misfit = 0.0
+    if len(share) >= FEW:
+        misfit = SCATTERED * float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0)))
     return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
 
 
@@ -475,11 +492,22 @@ def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width:
     squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
     if len(signal) < 2000:
         return 0.0
-    edges = np.quantile(signal, np.linspace(0, 1, 11))
-    place = np.clip(np.searchsorted(edges, signal) - 1, 0, 9)
-    level = np.array([np.median(signal[place == i]) for i in range(10) if (place == i).any()])
-    variance = np.array([np.median(squared[place == i]) for i in range(10) if (place == i).any()]) * MAD_TO_STD**2
-    slope, constant = np.polyfit(level, variance, 1)
-    scatter = np.std(variance - (constant + slope * level)) / max(np.std(level) * np.sqrt(len(level)), 1e-9)
-    # Less what chance may add: the weights then come on by degrees, not at a limit that a tile may miss by a hair.
-    return float(max(slope - 3 * scatter, 0.0)) if slope * edges[-2] > 0.3 * std**2 else 0.0
+    edges = np.quantile(signal, np.linspace(0, 1, 13))
+    place = np.clip(np.searchsorted(edges, signal) - 1, 0, 11)
+    filled = [i for i in range(12) if (place == i).any()]
+    level = np.array([np.median(signal[place == i]) for i in filled])
+    variance = np.array([np.median(squared[place == i]) for i in filled]) * MAD_TO_STD**2
+    # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
+    scale = np.hypot(variance, std**2)
+    terms = np.stack([np.ones_like(level), level, level * level], axis=1) / scale[:, None]
+    fits = [scipy.optimize.nnls(terms[:, columns], variance / scale) for columns in ([0], [0, 1], [0, 2], [0, 1, 2])]
+    chance = max(fits[3][1] ** 2 / max(len(level) - 3, 1), 1e-4)
+    chi2 = [min(rest**2 / chance, 1e6) for _, rest in fits]
+    # The linear law alone, or both, as the data are likelier; and by degrees from 3 to 6 sigma: at a limit, tiles of
+    # one strip would fall on either side.
+    share = 1 / (1 + np.exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))
+    gain = share * fits[1][0][1] + (1 - share) * fits[3][0][1]
+    sigma = np.sqrt(max(share * (chi2[0] - chi2[1]) + (1 - share) * (chi2[2] - chi2[3]), 0.0))
+    if gain * edges[-2] <= 0.3 * std**2:
+        return 0.0
+    return float(gain * np.clip((sigma - 3) / 3, 0.0, 1.0))

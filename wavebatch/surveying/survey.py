@@ -30,12 +30,19 @@ from wavebatch.surveying.measure import (
     measure_residuals,
     thin_block,
 )
+from wavebatch.surveying.systems.known_systems import find_source, take_pulse
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
 
 REFINEMENTS = 3
 """Times, at most, that the pulse is learned again from echoes fitted with it; mostly once is enough."""
+
+LEAST_QUIET_SAMPLES = 4
+"""Samples before the strongest echo from which a waveform has a level."""
+
+LEAST_LEVELS = 5
+"""Waveforms of a descriptor from which its level can be told from that of others."""
 
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
@@ -187,19 +194,19 @@ def find_strangers(members: list[WaveformBlock], plain: SystemPulse) -> dict[int
     errors and a factor STRANGE_NOISE, or if it is clipped at another count. STRANGE is 6: among 24 descriptors chance
     does so once in 10^7 strips. Widths are no evidence: long packets see other targets.
     """
-    facts = {block.digitizer.index: _describe_level(block, plain) for block in members}
+    facts = {block.digitizer.index: describe_level(block, plain) for block in members}
     strangers = {}
-    for index, own in facts.items():
+    # The rarest first; the commonest is never a stranger to the few.
+    for index in list(facts)[:0:-1]:
+        own = facts[index]
         rest = [fact for other, fact in facts.items() if other != index and other not in strangers]
-        reason = _compare_levels(own, rest, plain.noise_std)
+        reason = compare_levels(own, rest, plain.noise_std)
         if reason:
             strangers[index] = reason
-    # The commonest is never a stranger to the few.
-    strangers.pop(members[0].digitizer.index, None)
     return strangers
 
 
-class _Level(NamedTuple):
+class Level(NamedTuple):
     """Level and noise of a descriptor's quiet samples, with what is needed for their errors."""
 
     waveforms: int
@@ -210,26 +217,29 @@ class _Level(NamedTuple):
     clip: float | None
 
 
-def _describe_level(block: WaveformBlock, plain: SystemPulse) -> _Level:
+def describe_level(block: WaveformBlock, plain: SystemPulse) -> Level:
     """Level and noise of one descriptor, from each waveform's own quiet samples."""
     signal = transpose_samples(block.samples)
-    level, quiet, number = find_levels(signal, plain.noise_std, int(np.ceil(3 * plain.sigma_ref / block.spacing)))
+    reach = int(np.ceil(3 * plain.sigma_ref / block.spacing))
+    _, quiet, _ = find_levels(signal, plain.noise_std, reach)
     if block.missing is not None:
         quiet &= ~block.missing.T
-        _, number = quiet_mean(signal, quiet)
-    used = number >= 8
+    # Only what comes before the strongest echo: tails are as high as the targets, which long packets see more of.
+    quiet &= np.arange(len(signal))[:, None] < np.argmax(signal, axis=0) - reach
+    level, number = quiet_mean(signal, quiet)
+    used = number >= LEAST_QUIET_SAMPLES
     deviation = np.where(quiet, signal - level, np.float32(0))[:, used]
     freedom = max(int((number[used] - 1).sum()), 1)
     std = float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom))
     mean, spread = (float(np.mean(level[used])), float(np.std(level[used]))) if used.any() else (0.0, 0.0)
     clip = find_saturation(block.samples, block.digitizer.max_count)
-    return _Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
+    return Level(int(used.sum()), mean, spread, max(std, QUANTISATION_STD), freedom, clip)
 
 
-def _compare_levels(own: _Level, rest: list[_Level], noise: float) -> str:
+def compare_levels(own: Level, rest: list[Level], noise: float) -> str:
     """Why a descriptor is a stranger among the rest; empty where it is none."""
     rest = [level for level in rest if level.waveforms]
-    if own.waveforms < FEW or not rest:
+    if own.waveforms < LEAST_LEVELS or not rest:
         return ""
     weights = np.array([level.waveforms for level in rest], np.float64)
     mean = float(np.average([level.mean for level in rest], weights=weights))
@@ -301,7 +311,7 @@ def _survey_other(system: SystemPulse, block: WaveformBlock, *, learn: bool) -> 
     if own.figures.get("isolated_echoes", 0) >= FEW or not learn:
         return own.system
     noise = measure_gaussian(block, system.sigma_ref / block.spacing)
-    kept = ("baseline", "baseline_spread", "noise_std", "noise_by_kind", "correlation", "saturation")
+    kept = ("baseline", "baseline_spread", "recovery", "noise_std", "noise_by_kind", "correlation", "saturation")
     return replace(system, noise_gain=0.0, **{name: getattr(noise, name) for name in kept})
 
 
@@ -320,6 +330,10 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         figures["isolated_echoes"] = len(main)
         if len(main) >= ENOUGH_TO_LEARN:
             system = learn_pulse(block, system, main, figures)
+        else:
+            taken = take_pulse(block, system, guess=len(main) < FEW)
+            system = taken.system
+            figures.update(taken.figures)
         part = thin_block(block, RESIDUAL_LOOK)
         for _ in range(REFINEMENTS):
             last = system.sigma_ref
@@ -418,8 +432,15 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
 
 def _explain_pulse(system: SystemPulse, figures: Mapping[str, float]) -> str:
     """Why the pulse is, or is not, a sum of Gaussians."""
+    source = find_source(system) if "known_pulse_misfit" in figures else None
+    if source is not None:
+        known, gaussian = (figures.get(f"known_pulse_{name}", 0.0) for name in ("misfit", "gaussian_misfit"))
+        misfits = f"it misses strong echoes by {known:.4f} of the amplitude, a Gaussian by {gaussian:.4f}"
+        return f"pulse from the shipped {source.name}: {misfits}"
     if "misfit_1_gaussians" not in figures:
-        return f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
+        few = f"{int(figures.get('isolated_echoes', 0))} isolated echoes are too few to learn from ({ENOUGH_TO_LEARN})"
+        ringing = f"after-pulses of {100 * system.ringing:.1f} % that strong echoes show are flagged"
+        return f"{few}; {ringing}" if system.ringing else few
     one = figures["misfit_1_gaussians"]
     number = len(system.components)
     if number > 1:

@@ -1,7 +1,8 @@
 """Decomposition of waveforms into echoes: clusters fitted in batches, grown where the residual asks for it.
 
-Called by stages/decompose. Round k fits all clusters with k echoes: those given by candidates, and trials from round
-k - 1. What a cluster gets (window length, attempts) depends on the cluster alone, never on its batch.
+Called by stages/decompose. A round fits all clusters with k echoes: those given by candidates, trials with one echo
+more than a fit of an earlier round, and fits in which an echo came to nothing and was left out. What a cluster gets
+(window length, attempts) depends on the cluster alone, never on its batch.
 """
 
 from __future__ import annotations
@@ -39,6 +40,10 @@ class _Step(NamedTuple):
     """Trials with one echo more, each for a row of the solution."""
     parents: np.ndarray
     """These rows of the solution."""
+    fewer: Problem
+    """Fits that are right but for an echo of no amplitude, without that echo."""
+    fewer_rows: np.ndarray
+    """Their rows in the problem."""
     unfinished: Problem
     """Problems that need more iterations, with the parameters reached."""
     unfinished_rows: np.ndarray
@@ -83,27 +88,63 @@ def decompose_clusters(
     docs/algorithms.md 2.3 and 4.2.
     """
     work = _Work(samples, baseline, std, clusters, settings, missing)
-    trials: list[Problem] = []
-    parents: list[Solution] = []
-    k = 0
-    while k < clusters.number.max(initial=0) or trials:
-        k += 1
+    waiting: dict[int, list[_Entry]] = {}
+    for k in np.unique(clusters.number):
         given = np.flatnonzero(clusters.number == k)
         rows = clusters.first[given][:, None] + np.arange(k)
         start = np.stack([candidates.amplitude[rows], candidates.time[rows], candidates.width[rows]], axis=1)
-        problem = _join([Problem(given, start, np.full(len(given), np.inf)), *trials])
-        before = _join(parents) if parents else None
-        trials, parents = [], []
-        for step in _solve(work, problem):
-            if len(step.refused):
-                yield before.take(step.refused - len(given))
-            final = np.ones(len(step.solution.cluster), bool)
-            if step.proposal is not None:
-                trials.append(step.proposal)
-                parents.append(step.solution.take(step.parents))
-                final[step.parents] = False
-            if final.any():
-                yield step.solution.take(np.flatnonzero(final))
+        _wait(waiting, Problem(given, start, np.full(len(given), np.inf)), None)
+    while waiting:
+        yield from _solve_round(work, waiting.pop(min(waiting)), waiting)
+
+
+class _Entry(NamedTuple):
+    """Problems that wait for a round."""
+
+    problem: Problem
+    parents: Solution | None
+    """What is right if they fail, a solution per problem; None where nothing came before."""
+
+
+def _wait(waiting: dict[int, list[_Entry]], problem: Problem, parents: Solution | None) -> None:
+    """Puts problems into the round of their number of echoes."""
+    if len(problem.cluster):
+        waiting.setdefault(problem.start.shape[2], []).append(_Entry(problem, parents))
+
+
+def _solve_round(work: _Work, entries: list[_Entry], waiting: dict[int, list[_Entry]]) -> Iterator[Solution]:
+    """Solves all problems with one number of echoes; yields what is final, and lets what follows from them wait."""
+    groups = _group_entries(entries)
+    problem = _join([entry.problem for entry in groups])
+    ends = np.cumsum([len(entry.problem.cluster) for entry in groups])
+    for step in _solve(work, problem):
+        for number, (entry, end) in enumerate(zip(groups, ends, strict=True)):
+            begin = end - len(entry.problem.cluster)
+            if entry.parents is not None:
+                refused = step.refused[(step.refused >= begin) & (step.refused < end)]
+                if len(refused):
+                    yield entry.parents.take(refused - begin)
+            if len(step.fewer_rows):
+                at = np.flatnonzero(np.searchsorted(ends, step.fewer_rows, side="right") == number)
+                parents = None if entry.parents is None else entry.parents.take(step.fewer_rows[at] - begin)
+                _wait(waiting, step.fewer.take(at), parents)
+        final = np.ones(len(step.solution.cluster), bool)
+        if step.proposal is not None:
+            _wait(waiting, step.proposal, step.solution.take(step.parents))
+            final[step.parents] = False
+        if final.any():
+            yield step.solution.take(np.flatnonzero(final))
+
+
+def _group_entries(entries: list[_Entry]) -> list[_Entry]:
+    """The entries joined to one per number of echoes of their parents, those without parents first."""
+    kinds: dict[int, list[_Entry]] = {}
+    for entry in entries:
+        kinds.setdefault(0 if entry.parents is None else entry.parents.parameters.shape[2], []).append(entry)
+    return [
+        _Entry(_join([part.problem for part in kinds[k]]), _join([part.parents for part in kinds[k]]) if k else None)
+        for k in sorted(kinds)
+    ]
 
 
 def _join(parts: list) -> tuple:
@@ -130,6 +171,11 @@ of the pairs 1.5 widths apart with an amplitude ratio of 0.5.
 PATIENCE = 5
 """Iterations of the first attempt: most problems converge in it, the others then go on together."""
 
+
+FAINT = 1.0
+"""Height in the window, in noise, up to which a fit has found that there is no echo: of any width, it is never
+significant.
+"""
 
 CENSORED = 40
 """Iterations of problems with clipped samples where others have only PATIENCE: their starts are far off
@@ -194,7 +240,14 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
     elif settings.max_iterations <= PATIENCE:
         finished |= ~windows.clipped.any(axis=1)
     solution = _solution(cluster, windows, fit, begin)
-    accepted = finished & ~fit.hopeless & (~new | ((solution.cost < problem.target) & _is_resolved(solution)))
+    good = finished & ~fit.hopeless & (~new | (solution.cost < problem.target))
+    height = _heights(solution, low, high)
+    faint = good & (height.min(axis=1) <= FAINT * windows.std) & (height.shape[1] > 1)
+    accepted = good & ~faint
+    if new.any():
+        accepted &= ~new | _is_resolved(solution)
+    fewer = np.flatnonzero(faint)
+    lesser = _leave_out(solution, problem.target, height, fewer)
     # A fit that has not converged may still explain what its residual shows.
     proposal = propose_trials(settings, windows, fit, accepted & fit.converged, begin, limits)
     parents = np.empty(0, np.int64)
@@ -203,8 +256,27 @@ def _solve_batch(work: _Work, problem: Problem, rows: np.ndarray, length: int, i
         proposal = proposal._replace(cluster=cluster[proposal.cluster])
     left = np.flatnonzero(~finished)
     unfinished = Problem(cluster[left], solution.parameters[left], problem.target[left])
-    refused = rows[finished & ~accepted]
-    return _Step(solution.take(np.flatnonzero(accepted)), refused, proposal, parents, unfinished, rows[left])
+    refused = rows[finished & ~accepted & ~faint]
+    return _Step(
+        solution.take(np.flatnonzero(accepted)), refused, proposal, parents,
+        lesser, rows[fewer], unfinished, rows[left],
+    )  # fmt: skip
+
+
+def _heights(solution: Solution, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Height of each echo (m, k) in its window [low, high): less than its amplitude where it lies outside."""
+    amplitude, time, width = solution.parameters.transpose(1, 0, 2)
+    outside = np.maximum(low[:, None] - time, time - (high - 1)[:, None])
+    return amplitude * np.exp(-0.5 * (np.maximum(outside, 0) / width) ** 2)
+
+
+def _leave_out(solution: Solution, target: np.ndarray, height: np.ndarray, rows: np.ndarray) -> Problem:
+    """The fits at `rows` as problems without their lowest echo. It would block growth: no trial with it is resolved."""
+    parameters = solution.parameters[rows]
+    kept = np.ones((len(rows), parameters.shape[2]), bool)
+    kept[np.arange(len(rows)), np.argmin(height[rows], axis=1)] = False
+    start = parameters.transpose(0, 2, 1)[kept].reshape(len(rows), parameters.shape[2] - 1, 3).transpose(0, 2, 1)
+    return Problem(solution.cluster[rows], start, target[rows])
 
 
 def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, begin: np.ndarray) -> Solution:
@@ -230,8 +302,9 @@ def _limits(settings: Settings, first: np.ndarray, end: np.ndarray) -> Limits:
 
 def _is_resolved(solution: Solution) -> np.ndarray:
     """True (m,) where no two neighbouring echoes are closer than their errors allow (docs/algorithms.md H1)."""
-    order = np.argsort(solution.parameters[:, 1], axis=1)
-    time = np.take_along_axis(solution.parameters[:, 1], order, axis=1)
-    error = np.take_along_axis(solution.errors[:, 1], order, axis=1)
+    time, error = solution.parameters[:, 1], solution.errors[:, 1]
+    if (time[:, 1:] < time[:, :-1]).any():
+        order = np.argsort(time, axis=1)
+        time, error = np.take_along_axis(time, order, axis=1), np.take_along_axis(error, order, axis=1)
     apart = np.diff(time, axis=1) > UNRESOLVED * np.hypot(error[:, 1:], error[:, :-1])
     return apart.all(axis=1) & (solution.parameters[:, 0] > 0).all(axis=1)

@@ -28,6 +28,13 @@ EARLIEST = 2.0
 """Widths of the pulse before its peak where a component may still lie: what comes earlier is a layer of constant height
 above the ground (canopy, crop), which looks like a pulse before the pulse."""
 
+LOBE = 3.0
+"""Widths of the pulse around its peak that a skewed pulse is fitted to."""
+
+ONSET = 4.0
+"""Widths of the pulse before its peak before which no component may begin, two of its sigmas before its centre: a broad
+one describes a tail, and would lift what comes before the pulse (by 1.7 DN on a strip of RIEGL)."""
+
 LEAST_BIN = 5
 """Samples that a bin of the stack needs."""
 
@@ -102,8 +109,10 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> li
 def fit_skewed(stack: Stack, width: float) -> PulseFit:
     """The skewed pulse of section 0 fitted to the stack."""
     weight = _weights(stack)
+    # A tail is no skew: the main lobe decides, all of the stack says how well it fits.
+    lobe = np.where(np.abs(stack.lag) < LOBE * width, weight, 0.0)
 
-    def misfit(p: np.ndarray) -> np.ndarray:
+    def misfit(p: np.ndarray, weight: np.ndarray = lobe) -> np.ndarray:
         t, s = np.array([p[1]]), np.array([p[2]])
         pulse = evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s)[0][:, 0]
         return (p[0] * pulse - stack.value) * weight
@@ -111,7 +120,7 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
     low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
     result = scipy.optimize.least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
     amplitude, delay, sigma, kappa = result.x
-    rms = float(np.sqrt(np.mean((misfit(result.x) / weight) ** 2)))
+    rms = float(np.sqrt(np.mean(misfit(result.x, np.ones_like(weight)) ** 2)))
     return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
 
 
@@ -136,18 +145,37 @@ def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
 
 
 def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200) -> np.ndarray:
-    """The sum of Gaussians fitted from a start, in at most `most` evaluations."""
+    """The sum of Gaussians fitted from a start, in at most `most` evaluations.
+
+    The parameters are weight, the delay's distance from the earliest that is allowed to its sigma, and sigma.
+    """
     width = abs(start[2])
-    low = np.tile([-DEEPEST, -EARLIEST * width, 0.35 * width], len(start) // 3)
-    high = np.tile([2.0, stack.lag[-1], 12.0 * width], len(start) // 3)
+    low = np.tile([-DEEPEST, 0.0, 0.35 * width], len(start) // 3)
+    high = np.tile([2.0, stack.lag[-1] + EARLIEST * width, 12.0 * width], len(start) // 3)
+
+    def earliest(sigma: np.ndarray) -> np.ndarray:
+        return np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width)
+
+    def plain(p: np.ndarray) -> np.ndarray:
+        q = p.copy()
+        q[1::3] += earliest(p[2::3])
+        return q
+
+    def slopes(p: np.ndarray) -> np.ndarray:
+        jacobian = _slopes(plain(p), stack.lag)
+        jacobian[:, 2::3] += 2 * (2 * p[2::3] > (ONSET - EARLIEST) * width) * jacobian[:, 1::3]
+        return jacobian * weight[:, None]
+
+    first = start.copy()
+    first[1::3] -= earliest(start[2::3])
     result = scipy.optimize.least_squares(
-        lambda p: (_sum(p, stack.lag) - stack.value) * weight,
-        np.clip(start, low, high),
-        jac=lambda p: _slopes(p, stack.lag) * weight[:, None],
+        lambda p: (_sum(plain(p), stack.lag) - stack.value) * weight,
+        np.clip(first, low, high),
+        jac=slopes,
         bounds=(low, high),
         max_nfev=most,
     )
-    return result.x
+    return plain(result.x)
 
 
 def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, residual: np.ndarray) -> np.ndarray:

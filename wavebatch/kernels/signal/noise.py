@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, smooth_121
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, STRONG, find_quiet, quiet_mean, smooth_121
 
 ROUNDS = 4
 """Times that level and quiet samples are found from each other."""
@@ -39,6 +39,8 @@ class PooledNoise(NamedTuple):
     """Share of quiet samples."""
     correlation: np.ndarray = np.empty(0)
     """Correlation of quiet samples 1, 2, ... apart (k,)."""
+    recovery: int = 0
+    """Samples after a strong signal until the level is back to what it was before it."""
 
 
 def first_level(signal: np.ndarray) -> tuple[float, float]:
@@ -98,26 +100,125 @@ def estimate_noise(
     if not signal.size:
         return PooledNoise(0.0, QUANTISATION_STD, QUANTISATION_STD, 0.0, 0.0)
     signal = signal.astype(np.float32)
-    level, std = first_level(signal)
-    spread = 0.0
-    mean, number, quiet = np.zeros(signal.shape[1]), np.zeros(signal.shape[1]), np.zeros(signal.shape, bool)
+    first, std = first_level(signal)
+    found = _estimate_from(signal, first, std, 0.0, reach, limit, missing, 0)
+    recovery = measure_recovery(signal, found, reach, limit, missing)
+    if not recovery:
+        return found
+    again = _estimate_from(signal, found.level, found.std, found.spread, reach, limit, missing, recovery)
+    return again if again.share > 0 else found
+
+
+def _estimate_from(
+    signal: np.ndarray,
+    level: float,
+    std: float,
+    spread: float,
+    reach: int,
+    limit: float,
+    missing: np.ndarray | None,
+    recovery: int,
+) -> PooledNoise:
+    """The noise of quiet samples, found from each other from a first level, noise and spread of baselines on."""
     for _ in range(ROUNDS):
         width = limit * np.hypot(SMOOTH_GAIN * std, spread) + 0.25
-        quiet = find_quiet(signal - np.float32(level), width, reach)
+        quiet = find_quiet(signal - np.float32(level), width, reach, recovery)
         if missing is not None:
             quiet &= ~missing
         mean, number = quiet_mean(signal - np.float32(level), quiet)
         if not number.any():
-            return PooledNoise(level, std, std, 0.0, 0.0)
+            return PooledNoise(level, std, std, 0.0, 0.0, recovery=recovery)
         level += float(np.sum(mean * number, dtype=np.float64) / np.sum(number))
         deviation = np.where(quiet, signal - np.float32(level), np.float32(0))
-        std, spread = _split_variance(deviation, number)
+        std, spread = _split_variance(deviation, quiet, number, reach)
     if spread > DRIFT * std:
-        return _estimate_drifting(signal, reach, limit, missing) or PooledNoise(
-            level, std, std, spread, float(quiet.mean())
-        )
+        drifting = _estimate_drifting(signal, reach, limit, missing, recovery)
+        return drifting or PooledNoise(level, std, std, spread, float(quiet.mean()), recovery=recovery)
     correlation = correlate_quiet(signal, quiet, std)
-    return PooledNoise(level, std, _smoothed_std(signal, quiet, std), spread, float(quiet.mean()), correlation)
+    # About means of few samples both are too small.
+    smoothed = _smoothed_std(signal, quiet, std) * std / _within_waveforms(deviation, number)
+    return PooledNoise(level, std, smoothed, spread, float(quiet.mean()), correlation, recovery)
+
+
+RECOVERED = 0.1
+"""Difference of a baseline from the level before the signal that does not matter [count, or noise of a sample]."""
+
+LEAST_BEFORE = 4
+"""Quiet samples before its first signal from which a waveform shows the level without a tail ..."""
+
+LEAST_WAVEFORMS = 50
+"""... and waveforms that must show it."""
+
+
+def measure_recovery(
+    signal: np.ndarray, noise: PooledNoise, reach: int, limit: float, missing: np.ndarray | None = None
+) -> int:
+    """Samples after strong signal that would draw the baseline away from the level before the first signal.
+
+    Parameters
+    ----------
+    signal : float32 (s, n), count
+        Waveforms.
+    noise : PooledNoise
+        Their noise, with such samples in it.
+    reach : int, samples
+        As for `estimate_noise`; differences are taken in steps of it.
+    limit : float
+        As for `estimate_noise`.
+    missing : bool (s, n), optional
+        Samples that were not recorded.
+
+    Returns
+    -------
+    int
+        0 where baselines agree with the samples before the signal to RECOVERED, or to chance, or where too few
+        waveforms begin without signal.
+
+    Notes
+    -----
+    A tail of a hundredth of an echo lies below any limit of single samples, but the mean over thousands of waveforms
+    shows it; those with the stronger half of the echoes decide. Weak echoes after the first one have the same effect,
+    and the same remedy. Fewer samples make a noisier baseline: a slight tail of many samples is the lesser evil.
+    """
+    s = len(signal)
+    above = signal - np.float32(noise.level)
+    if noise.spread > DRIFT * noise.std:
+        above = signal - find_levels(signal, noise.std, reach, limit)[0]
+    width = limit * np.hypot(SMOOTH_GAIN * noise.std, min(noise.spread, noise.std)) + 0.25
+    quiet = find_quiet(above, width, reach)
+    early = np.logical_and.accumulate(quiet, axis=0)
+    if missing is not None:
+        quiet &= ~missing
+        early &= ~missing
+    before, number = quiet_mean(above, early)
+    strong = np.abs(smooth_121(above)) > STRONG * width
+    rows = np.flatnonzero((number >= LEAST_BEFORE) & strong.any(axis=0))
+    if len(rows) < 2 * LEAST_WAVEFORMS:
+        return 0
+    peak = above[:, rows].max(axis=0)
+    rows = rows[peak >= np.median(peak)]
+    strong, quiet, above = strong[:, rows], quiet[:, rows], above[:, rows] - before[rows]
+    place = np.arange(s)[:, None]
+    last = np.maximum.accumulate(np.where(strong, place, -1), axis=0)
+    step = max(reach, 1)
+    bins = (place - last) // step
+    bins[(last < 0) | ~quiet] = -1
+    most = s // step + 1
+    # One value per waveform and bin: the error of the bin is then that of the waveforms' scatter, whatever its colour.
+    flat = np.where(bins >= 0, bins * len(rows) + np.arange(len(rows)), most * len(rows))
+    size = (most + 1) * len(rows)
+    count = np.bincount(flat.ravel(), minlength=size)[: most * len(rows)].reshape(most, -1)
+    total = np.bincount(flat.ravel(), above.ravel(), minlength=size)[: most * len(rows)].reshape(most, -1)
+    # Baselines from the samples before the signal and those at least 0, 1, 2 ... steps after it, less the former alone.
+    kept = np.cumsum(count[::-1], axis=0)[::-1]
+    difference = np.cumsum(total[::-1], axis=0)[::-1] / (kept + number[rows])
+    bias = np.abs(difference.mean(axis=1))
+    error = difference.std(axis=1) / np.sqrt(len(rows))
+    # Without those samples a baseline is that of a few before the signal, or the strip's: no worse than its spread.
+    alone = min(noise.spread, noise.std / np.sqrt(np.median(number[rows])))
+    least = np.clip(alone, RECOVERED, 2 * RECOVERED) * max(noise.std, 1.0)
+    right = bias <= np.maximum(least, 4 * error)
+    return int(np.argmax(np.r_[right, True])) * step
 
 
 def correlate_quiet(signal: np.ndarray, quiet: np.ndarray, std: float, lags: int = LAGS) -> np.ndarray:
@@ -166,12 +267,13 @@ def correlate_quiet(signal: np.ndarray, quiet: np.ndarray, std: float, lags: int
 
 
 def find_levels(
-    signal: np.ndarray, std: float, reach: int, limit: float = 4.0
+    signal: np.ndarray, std: float, reach: int, limit: float = 4.0, recovery: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Level of each waveform of signal (s, n) from itself alone, (n,), its quiet samples (s, n) and their number (n,).
 
     For baselines that scatter by more than the noise: a common level with so much room would take echoes for quiet.
     Begins with the lower quartile, which echoes on up to half of the samples hardly move. std: noise of a sample.
+    recovery: as for `find_quiet`, where it leaves enough samples.
     """
     level = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
     width = np.float32(limit * SMOOTH_GAIN * std + 0.25)
@@ -179,45 +281,82 @@ def find_levels(
         quiet = find_quiet(signal - level, width + np.float32(extra), reach)
         mean, number = quiet_mean(signal - level, quiet)
         level = level + mean
+    if recovery > reach:
+        clear = find_quiet(signal - level, width, reach, recovery)
+        mean, clear_number = quiet_mean(signal - level, clear)
+        enough = clear_number >= LEAST_BEFORE
+        level = level + np.where(enough, mean, np.float32(0))
+        quiet, number = np.where(enough, clear, quiet), np.where(enough, clear_number, number)
     return level, quiet, number
 
 
 def _estimate_drifting(
-    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None = None
+    signal: np.ndarray, reach: int, limit: float, missing: np.ndarray | None = None, recovery: int = 0
 ) -> PooledNoise | None:
     """As `estimate_noise` for baselines that scatter by more than the noise; None without quiet samples."""
     quartile = np.partition(signal, len(signal) // 4, axis=0)[len(signal) // 4]
     below = signal[signal < quartile] - np.broadcast_to(quartile, signal.shape)[signal < quartile]
     std = max(float(np.sqrt(np.mean(below * below))) / BELOW_QUARTILE, QUANTISATION_STD) if len(below) else 1.0
     for _ in range(ROUNDS):
-        levels, quiet, number = find_levels(signal, std, reach, limit)
+        levels, quiet, number = find_levels(signal, std, reach, limit, recovery)
         if missing is not None:
             quiet &= ~missing
             number = quiet.sum(axis=0, dtype=np.int32)
         several = number >= 8
         if not several.any():
             return None
-        std, _ = _split_variance(np.where(quiet, signal - levels, np.float32(0)), number)
+        std = _within_waveforms(np.where(quiet, signal - levels, np.float32(0)), number)
     known = levels[several].astype(np.float64)
     scatter = np.mean((known - known.mean()) ** 2) - std**2 * np.mean(1 / number[several])
     spread = float(np.sqrt(max(scatter, 0.0)))
     smoothed, correlation = _smoothed_std(signal, quiet, std), correlate_quiet(signal, quiet, std)
-    return PooledNoise(float(known.mean()), std, smoothed, spread, float(quiet.mean()), correlation)
+    return PooledNoise(float(known.mean()), std, smoothed, spread, float(quiet.mean()), correlation, recovery)
 
 
-def _split_variance(deviation: np.ndarray, number: np.ndarray) -> tuple[float, float]:
-    """Standard deviation within waveforms and between their means, from deviations (0 where not quiet)."""
+def _split_variance(
+    deviation: np.ndarray, quiet: np.ndarray, number: np.ndarray, apart: int
+) -> tuple[float, float]:
+    """Standard deviation within waveforms and between their levels, from deviations (0 where not quiet).
+
+    What two samples more than `apart` from each other have in common is their waveform's level: neighbours also share
+    coloured noise, and so do the means of few samples.
+    """
+    several = np.flatnonzero(number > 1)
+    part, used = deviation[:, several].astype(np.float64), quiet[:, several].astype(np.float64)
+    gap = min(apart + 1, len(part))
+    earlier, partners = np.cumsum(part[: len(part) - gap], axis=0), np.cumsum(used[: len(used) - gap], axis=0)
+    products = np.einsum("sn,sn->n", part[gap:], earlier)
+    pairs = np.einsum("sn,sn->n", used[gap:], partners)
+    if np.count_nonzero(pairs) < LEAST_WAVEFORMS:
+        return _within_waveforms(deviation, number), _between_waveforms(deviation, number)
+    weight = 1 / number[several]
+    between = max(float(products @ weight / (pairs @ weight)), 0.0)
+    total = float(np.sum(part * part) / np.sum(number[several]))
+    return max(float(np.sqrt(max(total - between, 0.0))), QUANTISATION_STD), float(np.sqrt(between))
+
+
+def _within_waveforms(deviation: np.ndarray, number: np.ndarray) -> float:
+    """Standard deviation of quiet samples about the mean of their waveform; about 0 where all have too few."""
     several = number >= 8
     if not several.any():
         total = np.sum(deviation.astype(np.float64) ** 2) / max(number.sum(), 1)
-        return max(float(np.sqrt(total)), QUANTISATION_STD), 0.0
-    part = deviation[:, several].astype(np.float64)
-    count = number[several].astype(np.float64)
+        return max(float(np.sqrt(total)), QUANTISATION_STD)
+    part, count = deviation[:, several].astype(np.float64), number[several].astype(np.float64)
     total, squares = part.sum(axis=0), (part * part).sum(axis=0)
     within = np.sum(squares - total * total / count) / np.sum(count - 1)
-    means = total / count
+    return max(float(np.sqrt(max(within, 0.0))), QUANTISATION_STD)
+
+
+def _between_waveforms(deviation: np.ndarray, number: np.ndarray) -> float:
+    """Standard deviation of the levels of waveforms with at least 8 quiet samples, from their means."""
+    several = number >= 8
+    if not several.any():
+        return 0.0
+    count = number[several].astype(np.float64)
+    means = deviation[:, several].sum(axis=0, dtype=np.float64) / count
+    within = _within_waveforms(deviation, number) ** 2
     between = np.average(means * means, weights=count) - within * len(count) / np.sum(count)
-    return max(float(np.sqrt(max(within, 0.0))), QUANTISATION_STD), float(np.sqrt(max(between, 0.0)))
+    return float(np.sqrt(max(between, 0.0)))
 
 
 def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:

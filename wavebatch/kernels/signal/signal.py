@@ -277,7 +277,24 @@ def widen(mask: np.ndarray, reach: int) -> np.ndarray:
     return wide
 
 
-def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int) -> np.ndarray:
+STRONG = 3.0
+"""Signal this many times as far from the level as the least signal is strong: its tail may be seen."""
+
+
+def widen_after(mask: np.ndarray, reach: int) -> np.ndarray:
+    """Mask, bool (s, n), in which each true sample also marks the `reach` samples after it."""
+    if reach >= len(mask):
+        return np.logical_or.accumulate(mask, axis=0)
+    wide = mask.copy()
+    done = 0
+    while done < reach:
+        step = min(reach - done, done + 1)
+        wide[step:] |= wide[:-step].copy()
+        done += step
+    return wide
+
+
+def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int, recovery: int = 0) -> np.ndarray:
     """Samples far from any signal.
 
     Parameters
@@ -288,13 +305,18 @@ def find_quiet(signal: np.ndarray, limit: np.ndarray | float, reach: int) -> np.
         A smoothed sample beyond +-limit is signal.
     reach : int, samples
         Samples this near to signal are not quiet.
+    recovery : int, samples
+        Nor are samples within this of an earlier strong signal: its tail lies below the limit, but it is no baseline.
 
     Returns
     -------
     bool (s, n)
     """
-    smoothed = smooth_121(signal)
-    return ~widen(np.abs(smoothed) > limit, reach)
+    smoothed = np.abs(smooth_121(signal))
+    busy = widen(smoothed > limit, reach)
+    if recovery > reach:
+        busy |= widen_after(smoothed > np.multiply(limit, np.float32(STRONG), dtype=np.float32), recovery)
+    return ~busy
 
 
 def quiet_mean(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

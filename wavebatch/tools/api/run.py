@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +36,7 @@ def run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     columns: str | None = None,
@@ -70,6 +72,9 @@ def run(
         Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
     system : Survey, path or str, optional
         A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip.
+    survey : {"each", "flight"}
+        Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
+        again by later runs into it. A strip that does not fit it gets one of its own.
     sensor : SensorRequest, optional
         Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
     calibration : path or str, optional
@@ -116,8 +121,8 @@ def run(
         For wrong options, before anything starts.
     """
     plan = plan_run(
-        strips, out, chain=chain, tolerance=tolerance, system=system, sensor=sensor, calibration=calibration,
-        columns=columns, points=points, format=format, point_format=point_format, names=names,
+        strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
+        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
         memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
     )  # fmt: skip
@@ -131,6 +136,7 @@ def plan_run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     columns: str | None = None,
@@ -146,7 +152,7 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, sensor, calibration, columns, jobs, scheduler, memory
+    strips, out, chain, tolerance, system, survey, sensor, calibration, columns, jobs, scheduler, memory
         As for `run`.
     block_size, overwrite, resume
         As for `run`.
@@ -166,6 +172,10 @@ def plan_run(
         For whatever is wrong with the options.
     """
     found, request = find_request(chain, tolerance=tolerance, system=system)
+    if survey == "flight":
+        if system is not None:
+            raise ConfigError("--system and --survey flight exclude each other; give one of them")
+        request = replace(request, flight=True)
     sensor = sensor or SensorRequest()
     known = None if calibration is None else load_calibration(Path(calibration))
     template = StripJob(Path(), found, RunOptions(), request, sensor, known)

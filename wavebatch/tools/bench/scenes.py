@@ -123,12 +123,18 @@ def describe_recording(system: SystemPulse, block: WaveformBlock) -> Recording:
         bits=block.digitizer.bits,
         baseline=system.baseline,
         baseline_spread=system.baseline_spread,
-        noise_std=float(np.sqrt(max(system.noise_std**2 - QUANTISATION_STD**2, 0.0))) / float(gain),
+        noise_std=float(np.sqrt(max(_sample_noise(system) ** 2 - QUANTISATION_STD**2, 0.0))) / float(gain),
         rho=color / (color + 1),
         noise_gain=system.noise_gain,
         saturation=clip,
         pulse=pulse,
     )
+
+
+def _sample_noise(system: SystemPulse) -> float:
+    """Noise of one sample [count]; `noise_std` is what coloured noise does to the amplitude of a pulse."""
+    kinds = system.noise_by_kind
+    return kinds.get("outside") or kinds.get("quiet") or system.noise_std
 
 
 def _find_color(system: SystemPulse) -> int:

@@ -1,0 +1,124 @@
+"""One survey of all strips of a flight: the same for any order, and strips of other sensors are found."""
+
+import itertools
+
+import pytest
+from helpers_scenes import make_scene
+from strips import cut_strip
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.flight import hold_strip, read_flight, read_samples, survey_flight, surveys_agree
+from wavebatch.surveying.system_file import format_survey, parse_survey
+from wavebatch.tools.simulate import PulseModel, find_pulse, simulate_strip
+
+PULSE = find_pulse("riegl")
+STRIPS = {
+    "flat": ("flat", {}), "urban": ("urban", {}), "forest": ("forest", {}),
+    "level": ("flat", {"baseline": 13.5}), "noise": ("flat", {"noise_std": 1.6}),
+    "wide": ("flat", {"pulse": PulseModel(2.6)}), "narrow": ("urban", {"pulse": PulseModel(1.6)}),
+    "gaussian": ("flat", {"pulse": PulseModel(2.0)}), "spacing": ("flat", {"spacing": 0.5}),
+    "clipped": ("urban", {"saturation": 120}),
+}  # fmt: skip
+"""Scene and what its recording has otherwise; the first three are of one flight."""
+FLIGHT = ("flat", "urban", "forest")
+
+
+@pytest.fixture(scope="module")
+def strips(tmp_path_factory):
+    """Paths by name; names and content are in different orders."""
+    folder, paths = tmp_path_factory.mktemp("flight"), {}
+    for number, (name, (scene, recording)) in enumerate(STRIPS.items()):
+        paths[name] = folder / f"{name}.las"
+        scene = make_scene(scene, **{"pulse": PULSE, "n_samples": 100, **recording})
+        simulate_strip(scene, paths[name], pulses=900, seed=number)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def flight(strips):
+    return survey_flight(read_samples([strips[name] for name in FLIGHT], waveforms=2400))
+
+
+def test_strips_of_one_sensor_belong_together_whatever_their_scene(flight):
+    assert [strip.reason for strip in flight.strips] == ["", "", ""] and flight.misfits == []
+    system = flight.saved.survey.system
+    assert system.components and system.ringing == pytest.approx(0.04, abs=0.01)
+    assert flight.saved.survey.waveforms == 2400 and flight.saved.strip == "3 strips"
+    assert all(strip.waveforms == 800 for strip in flight.strips)
+
+
+def test_the_order_of_the_strips_does_not_matter(strips, flight):
+    for names in itertools.islice(itertools.permutations(FLIGHT), 1, 6, 2):
+        again = survey_flight(read_samples([strips[name] for name in names], waveforms=2400))
+        assert format_survey(again.saved) == format_survey(flight.saved) and again.strips == flight.strips
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("level", "its level is 13."),
+        ("noise", "its noise is 1."),
+        ("wide", "ns wide (Gaussian sigma), those of the flight"),
+        ("narrow", "ns wide (Gaussian sigma), those of the flight"),
+        ("gaussian", "the flight's pulse misses its strong echoes by"),
+        ("spacing", "samples 0.5 ns apart; that of the flight has samples 1 ns apart"),
+        ("clipped", "it is clipped at 120 DN"),
+    ],
+)
+def test_a_strip_of_another_sensor_does_not_belong_to_them(strips, flight, name, words):
+    """Held against the flight as it is kept in a file, as a strip that comes later is."""
+    kept = parse_survey(format_survey(flight.saved), "x").survey
+    with StripReader(strips[name]) as reader, reader.scan() as scan:
+        assert words in hold_strip(reader, scan, kept)
+
+
+@pytest.mark.parametrize("name", FLIGHT)
+def test_a_later_strip_of_the_sensor_belongs_to_them(strips, flight, name):
+    kept = parse_survey(format_survey(flight.saved), "x").survey
+    assert read_flight(kept) == read_flight(flight.saved.survey)
+    with StripReader(strips[name]) as reader, reader.scan() as scan:
+        assert hold_strip(reader, scan, kept) == ""
+
+
+def test_strangers_do_not_change_the_survey_of_the_others(strips, flight):
+    names = ("wide", "flat", "level", "urban", "spacing", "forest")
+    found = survey_flight(read_samples([strips[name] for name in names], waveforms=4800))
+    assert {strip.path.stem for strip in found.misfits} == {"wide", "level", "spacing"}
+    assert found.saved.survey.system == flight.saved.survey.system
+    told = {strip["strip"]: strip for strip in (one.to_json() for one in found.strips)}
+    assert told[str(strips["wide"])]["fits"] is False and told[str(strips["wide"])]["reason"]
+    assert told[str(strips["flat"])]["fits"] is True and told[str(strips["flat"])]["points"] >= 900
+
+
+def test_a_strip_that_cannot_be_read_is_left_out(strips, tmp_path):
+    errors = []
+    paths = [strips["flat"], tmp_path / "none.las"]
+    samples = read_samples(paths, waveforms=200, on_error=lambda path, error: errors.append(path))
+    assert [sample.path for sample in samples] == paths[:1] and errors == paths[1:]
+
+
+def test_a_survey_of_one_strip_is_none_of_a_flight(strips):
+    with StripReader(strips["flat"]) as reader, reader.scan() as scan:
+        survey = survey_blocks(reader.sample_blocks(scan, 300))
+        with pytest.raises(ConfigError, match="holds no survey of a flight"):
+            hold_strip(reader, scan, survey)
+
+
+def test_surveys_that_agree(strips):
+    surveys = {}
+    for name in ("flat", "urban", "wide", "level"):
+        with StripReader(strips[name]) as reader, reader.scan() as scan:
+            surveys[name] = survey_blocks(reader.sample_blocks(scan, 900))
+    assert surveys_agree([surveys["flat"], surveys["urban"]])
+    for name in ("wide", "level"):
+        assert not surveys_agree([surveys["flat"], surveys["urban"], surveys[name]])
+    assert not surveys_agree([surveys["flat"]])
+
+
+def test_parts_of_real_strips_belong_to_them(riegl, leica, tmp_path):
+    for path, other in ((riegl, leica), (leica, riegl)):
+        part = cut_strip(path, tmp_path / path.name, 400)
+        found = survey_flight(read_samples([path, part, other]))
+        assert [strip.path for strip in found.misfits] == [other]

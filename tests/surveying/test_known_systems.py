@@ -1,0 +1,128 @@
+"""Shipped pulses: where they come from, when a small strip gets one, and that no other sensor does."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers_scenes import make_block, make_scene
+from strips import cut_strip
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying import survey_block
+from wavebatch.surveying.auto_chain import choose_chain
+from wavebatch.surveying.choose_chain import read_sample, survey_sample
+from wavebatch.surveying.measure import decompose_sample
+from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems import known_systems as module
+from wavebatch.surveying.systems.known_systems import compare_pulses, find_likeness, find_source, known_systems
+from wavebatch.tools.simulate import PulseModel, find_pulse
+
+KNOWN = {one.name: one for one in known_systems()}
+
+
+def _survey(path):
+    with StripReader(path) as reader, reader.scan() as scan:
+        return survey_sample(read_sample(reader, scan))
+
+
+def _count_echoes(path, survey) -> int:
+    chain, number = choose_chain(survey), 0
+    with StripReader(path) as reader, reader.scan() as scan:
+        for unit in range(reader.unit_count()):
+            for block, _ in reader.read_blocks(reader.read_unit(unit, scan), 8192, owned_only=True):
+                number += len(chain.run(block, survey.system))
+    return number
+
+
+def test_what_is_shipped():
+    assert {name: one.sensor for name, one in KNOWN.items()} == {
+        "riegl-q680i": "RIEGL LMS-Q680i", "leica-als": "Leica ALS"
+    }  # fmt: skip
+    folder = Path(module.__file__).parent
+    for one in KNOWN.values():
+        text = (folder / f"{one.name}.toml").read_text("utf-8")
+        assert "wavebatch survey " in text and "licence" in text, "how it was made and what it may be used for"
+        assert load_survey(folder / f"{one.name}.toml").survey.system == one.system, "--system takes it"
+        assert one.spacing == 1.0 and len(one.system.components) > 1 and find_source(one.system) is one
+    # The outgoing pulse of the flight that it was measured on has 4.55 ns.
+    assert FWHM_PER_SIGMA * KNOWN["riegl-q680i"].system.sigma_ref == pytest.approx(4.55, rel=0.05)
+
+
+@pytest.mark.parametrize(("strip", "name"), [("riegl", "riegl-q680i"), ("leica", "leica-als")])
+def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
+    system = _survey(request.getfixturevalue(strip)).system
+    likeness = find_likeness(system, 1.0)
+    remedy = "the survey has changed: make the file again, as its comment says"
+    assert likeness and likeness.known.name == name and likeness.difference < 0.02, remedy
+    assert KNOWN[name].sensor in likeness.describe()
+
+
+@pytest.mark.parametrize(("points", "error"), [(11, 0.03), (54, 0.03), (100, 0.05)])
+def test_a_small_strip_of_a_known_sensor_gets_its_pulse(riegl, tmp_path, points, error):
+    """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one.
+
+    100 points have 102 and 106 echoes: what is left outside of the echoes of so few says 3.5 DN of noise, not 1.7.
+    """
+    path = cut_strip(riegl, tmp_path / "cut.las", points)
+    small, whole = _survey(path), _survey(riegl)
+    assert find_source(small.system).name == "riegl-q680i"
+    reason = next(one.reason for one in small.decisions if one.part == "learned pulse")
+    assert reason.startswith("pulse from the shipped riegl-q680i")
+    assert small.figures["known_pulse_misfit"] < 0.5 * small.figures["known_pulse_gaussian_misfit"]
+    assert _count_echoes(path, small) == pytest.approx(_count_echoes(path, whole), rel=error)
+
+
+def test_a_small_strip_of_the_other_known_sensor_gets_the_other_pulse(leica, tmp_path):
+    small = _survey(cut_strip(leica, tmp_path / "cut.las", 100))
+    assert find_source(small.system).name == "leica-als"
+
+
+OTHERS = {
+    "narrow": PulseModel(1.85), "wide": PulseModel(3.4), "skewed": PulseModel(1.9, kappa=-0.1),
+    "very skewed": PulseModel(3.4, kappa=0.2), "simulated riegl": find_pulse("riegl"),
+    "simulated leica": find_pulse("leica"), "ringing": PulseModel(1.85).with_ringing(0.04),
+    "early after-pulse": PulseModel(1.85, 0.0, ((0.04, 8.0, 1.8),)), "tail": PulseModel(1.85, 0.0, ((0.05, 4.0, 4.0),)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("scene", ["flat", "urban"])
+def test_a_small_strip_of_another_sensor_gets_no_known_pulse(name, scene):
+    for number, seed in ((20, 1), (20, 2), (40, 3)):
+        block = make_block(make_scene(scene, pulse=OTHERS[name], n_samples=100), number, seed=seed)[0]
+        survey = survey_block(block)
+        assert find_source(survey.system) is None
+        assert find_likeness(survey.system, 1.0) is None
+
+
+@pytest.mark.parametrize(("share", "delay"), [(0.04, 8.0), (0.06, 13.0)])
+def test_after_pulses_of_an_unknown_sensor_are_flagged(share, delay):
+    pulse = PulseModel(1.85, 0.0, ((share, delay, 1.8),))
+    block = make_block(make_scene("flat", pulse=pulse, n_samples=100), 40, seed=5)[0]
+    system = survey_block(block).system
+    assert not system.components and 0.8 * share < system.ringing < 1.6 * share
+    echoes = decompose_sample(block, system)
+    first = np.r_[0, np.flatnonzero(np.diff(echoes.waveform)) + 1]
+    strongest = np.maximum.reduceat(echoes.amplitude, first)
+    after = echoes.amplitude < 0.1 * np.repeat(strongest, np.diff(np.r_[first, len(echoes)]))
+    assert after.sum() >= 8 and ((echoes.flags[after] & int(EchoFlag.RINGING_SUSPECT)) != 0).mean() > 0.8
+
+
+def test_a_gaussian_of_a_small_strip_has_the_width_of_its_echoes():
+    """It was 2 samples, a guess, with fewer than 20 isolated echoes."""
+    survey = survey_block(make_block(make_scene("flat", pulse=PulseModel(3.4), n_samples=100), 12, seed=1)[0])
+    assert survey.figures["isolated_echoes"] < 20
+    assert survey.system.sigma_ref == pytest.approx(3.4, rel=0.05) and survey.system.ringing == 0
+
+
+def test_pulses_are_compared_by_shape_alone():
+    pulse = KNOWN["riegl-q680i"].system
+    assert compare_pulses(pulse, pulse) < 1e-6
+    a, b = SystemPulse(sigma_ref=2.0), SystemPulse(sigma_ref=2.04)
+    assert compare_pulses(a, b) == pytest.approx(0.014, abs=0.001)
+    assert compare_pulses(b, a) == pytest.approx(compare_pulses(a, b))
+    assert find_likeness(SystemPulse(sigma_ref=pulse.sigma_ref), 1.0) is None, "any Gaussian of its width"
+    assert find_likeness(pulse, 0.5) is None and find_likeness(pulse, 1.0).difference < 1e-6

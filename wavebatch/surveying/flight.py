@@ -1,0 +1,429 @@
+"""One survey for all strips of a flight, and whether a strip belongs to it.
+
+`wavebatch survey STRIPS...` and `run --survey flight` call `survey_flight`; `batch.unit` holds every strip against the
+result with `hold_strip`. Before you change it: nothing may depend on the order in which the strips are given.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.surveying.auto_chain import decide
+from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.measure import FEW, FIRST_WIDTH, find_edge, measure_gaussian
+from wavebatch.surveying.survey import Level, Survey, compare_levels, describe_level, pool_blocks, survey_blocks
+from wavebatch.surveying.system_file import SavedSurvey
+from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, with_pulse
+
+LEAST_SHARE = 64
+"""Waveforms that each strip gives to the survey, however many strips there are."""
+
+HELD = 1024
+"""Waveforms of a strip from which it is decided whether it belongs to a flight."""
+
+CANDIDATES = 32
+"""Strips that are tried as the one that most others agree with."""
+
+ROUNDS = 3
+"""Times, at most, that strips are pooled and held against the result."""
+
+NARROWER = 0.06
+"""How much narrower than those of the flight the echoes of a strip may be, as a share of the width: find_edge gives it
+to 1 to 3 %."""
+
+WIDER, STEADY = 0.10, 0.5
+"""How much wider they may be, where more than this share of them have nearly one width. Slopes and forest widen echoes
+by any amount, but never most of them by the same."""
+
+SAME_WIDTH = 0.06
+"""How far from the edge a width may be to count as the same, as a share of it."""
+
+SHAPE = 0.008
+"""How much worse than in the flight the common pulse may fit the better half of a strip's strong echoes, as a share of
+the amplitude. A Gaussian misses the echoes of the shipped sensors by 0.02 to 0.06."""
+
+ALIKE_PULSES, PULSE_ERROR = 0.02, 0.3
+"""Difference of two pulses (`compare_pulses`) up to which surveys of single strips agree, and what is added to it, over
+the root of the number of isolated echoes: pulses of two simulated strips with 200 of them differ by 0.03."""
+
+ALIKE_NOISE, ALIKE_LEVEL = 1.15, 0.5
+"""The same for the ratio of the noise, and for the difference of the level over the noise."""
+
+Kind = tuple[float, float, float, float]
+"""Bits, spacing [ns], gain and offset [V] of a descriptor."""
+
+_FORMS = ("{:g} bits", "samples {:g} ns apart", "gain {:g}", "offset {:g}")
+_KIND = ("bits", "spacing_ns", "gain", "offset")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StripSample:
+    """A strip and waveforms that are spread over it."""
+
+    path: Path
+    fingerprint: Mapping[str, Any]
+    blocks: tuple[WaveformBlock, ...]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    """For display: points, packets."""
+
+    @property
+    def waveforms(self) -> int:
+        """Return how many were sampled."""
+        return sum(map(len, self.blocks))
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a strip, or all strips of a flight, record; of the main digitizer."""
+
+    level: Level
+    width: float
+    """Gaussian width of the narrowest echoes that repeat [ns]; 0 where there are too few."""
+    steady: float
+    """Share of the clear echoes that have nearly this width."""
+    misfit: float
+    """What the flight's pulse leaves of the better half of strong echoes, beyond noise, as a share of the amplitude."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A strip held against a flight."""
+
+    path: Path
+    fingerprint: Mapping[str, Any]
+    waveforms: int
+    look: Look | None
+    """None where its descriptors already differ."""
+    reason: str = ""
+    """Why it does not belong to the flight; empty where it does."""
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def fits(self) -> bool:
+        """Return whether it belongs to the flight."""
+        return not self.reason
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        seen = {}
+        if self.look is not None:
+            level = self.look.level
+            seen = {"level_dn": level.mean, "noise_dn": level.std, "gaussian_width_ns": self.look.width or None}
+            seen["pulse_misfit"] = self.look.misfit
+        return {
+            "strip": str(self.path), **self.facts, "fingerprint": dict(self.fingerprint), "waveforms": self.waveforms,
+            "fits": self.fits, "reason": self.reason, **seen,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """The survey of a flight and its strips, by content."""
+
+    saved: SavedSurvey
+    strips: tuple[Held, ...]
+
+    @property
+    def misfits(self) -> list[Held]:
+        """Return the strips that do not belong to it."""
+        return [strip for strip in self.strips if not strip.fits]
+
+
+def read_samples(
+    paths: Sequence[Path],
+    *,
+    waveforms: int | None = None,
+    direction: str = "auto",
+    headerless: bool = False,
+    on_error: Callable[[Path, InputError], None] | None = None,
+) -> list[StripSample]:
+    """Read a share of the sample of a survey from each strip.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    waveforms : int, optional
+        Of all strips together; by default as many as a survey of one strip reads, but LEAST_SHARE of each.
+    direction, headerless
+        As for `StripReader`.
+    on_error : callable, optional
+        Called with a strip that cannot be read and the reason; the strip is left out.
+
+    Returns
+    -------
+    list of StripSample
+        Strips with waveforms, sorted by content.
+    """
+    samples = []
+    for path in paths:
+        try:
+            with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+                share = waveforms or sample_size(reader, scan)
+                share = max(-(-share // len(paths)), 1 if waveforms else LEAST_SHARE)
+                blocks = tuple(reader.sample_blocks(scan, share))
+                facts = {"points": scan.points, "packets": scan.packets}
+                fingerprint = take_fingerprint(path, reader.facts.packet_file)
+            if not blocks:
+                raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
+        except InputError as error:
+            if on_error is not None:
+                on_error(path, error)
+        else:
+            samples.append(StripSample(path, fingerprint, blocks, facts))
+    return sorted(samples, key=lambda sample: json.dumps(sample.fingerprint, sort_keys=True))
+
+
+def survey_flight(samples: Sequence[StripSample]) -> Flight:
+    """Survey strips together, and find those that do not belong to the others.
+
+    Parameters
+    ----------
+    samples : sequence of StripSample
+        At least one, as `read_samples` returns them.
+
+    Returns
+    -------
+    Flight
+
+    Notes
+    -----
+    A descriptor index must mean the same bits, spacing, gain and offset in all strips: those that contradict the
+    majority are left out. The strip whose level, noise and width most others share chooses the first group. Its
+    waveforms are surveyed together and all strips are held against the result; those that fit are surveyed again, until
+    the group stays.
+    """
+    kinds = _agree_on_kinds(samples)
+    group = _find_group([sample for sample in samples if not _compare_kinds(sample.blocks, kinds)])
+    for _ in range(ROUNDS):
+        blocks = [block for sample in group for block in sample.blocks]
+        survey = survey_blocks(blocks)
+        survey = replace(survey, decisions=decide(survey))
+        whole = look_at(blocks, survey.system)
+        held = [_hold(sample, survey.system, whole, kinds) for sample in samples]
+        fitting = [sample for sample, strip in zip(samples, held, strict=True) if strip.fits]
+        if not fitting or fitting == group:
+            break
+        group = fitting
+    used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
+    figures = {**survey.figures, **_describe_look(whole), **_describe_kinds(used), "flight_strips": float(len(group))}
+    identity = {"strips": [dict(sample.fingerprint) for sample in group]}
+    name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
+    return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
+
+
+def hold_strip(reader: StripReader, scan: StripScan, flight: Survey) -> str:
+    """Return why a strip does not belong to a surveyed flight; empty where it does, or where it has no waveforms.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    flight : Survey
+        Of a file that `survey_flight` made.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    ConfigError
+        Where the survey is none of a flight.
+    """
+    whole, kinds = read_flight(flight)
+    number = min(HELD, sample_size(reader, scan))
+    sample = StripSample(reader.facts.path, {}, tuple(reader.sample_blocks(scan, number)))
+    return _hold(sample, flight.system, whole, kinds).reason if sample.blocks else ""
+
+
+def _hold(sample: StripSample, system: SystemPulse, whole: Look, kinds: Mapping[int, Kind]) -> Held:
+    """A strip held against what the flight records."""
+    about = (sample.path, sample.fingerprint, sample.waveforms)
+    reason = _compare_kinds(sample.blocks, kinds)
+    if reason:
+        return Held(*about, None, reason, sample.facts)
+    look = look_at(sample.blocks, system)
+    return Held(*about, look, "" if look is None else compare_looks(look, whole, system), sample.facts)
+
+
+def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None:
+    """Measure what waveforms record, without learning a pulse.
+
+    Parameters
+    ----------
+    blocks : iterable of WaveformBlock
+        Of any descriptors; only those of the main digitizer are used.
+    system : SystemPulse
+        Of the flight: its pulse is tried on the strong echoes.
+
+    Returns
+    -------
+    Look or None
+        None without waveforms of the main digitizer.
+    """
+    kinds: dict[Kind, list[WaveformBlock]] = {}
+    for block in blocks:
+        if block.digitizer.index not in system.digitizers:
+            kinds.setdefault(_kind(block), []).append(block)
+    if not kinds:
+        return None
+    block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
+    plain = measure_gaussian(block, system.sigma_ref / block.spacing)
+    level = describe_level(block, plain)
+    quiet = plain.noise_by_kind.get("quiet", 0.0)
+    if quiet:
+        # The mean square of all quiet samples holds weak echoes too: 2.2 DN in a RIEGL strip, 1.6 in a part of it.
+        level = level._replace(std=max(quiet, QUANTISATION_STD))
+    lone = find_lone(block, plain, most=len(block))
+    if len(lone) < FEW:
+        return Look(level, 0.0, 0.0, 0.0)
+    width = find_edge(lone.sigma)
+    steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
+    strong = find_lone(block, plain)
+    noise = level.std / strong.amplitude.astype(np.float64)
+    left = np.quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
+    return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
+
+
+def compare_looks(own: Look, whole: Look, system: SystemPulse) -> str:
+    """Return why a strip does not belong to the flight; empty where it does."""
+    reason = compare_levels(own.level, [whole.level], system.noise_std)
+    if reason:
+        return reason.strip().replace("the others", "the flight")
+    if own.width and whole.width:
+        ratio = own.width / whole.width
+        if ratio < 1 - NARROWER or (ratio > 1 + WIDER and own.steady > STEADY):
+            return f"its echoes are {own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns"
+        if own.misfit > whole.misfit + SHAPE:
+            misfits = f"by {100 * own.misfit:.1f} % of the amplitude, those of the flight by {100 * whole.misfit:.1f} %"
+            return f"the flight's pulse misses its strong echoes {misfits}"
+    return ""
+
+
+def _kind(block: WaveformBlock) -> Kind:
+    digitizer = block.digitizer
+    return (float(digitizer.bits), digitizer.spacing, digitizer.gain, digitizer.offset)
+
+
+def _agree_on_kinds(samples: Sequence[StripSample]) -> dict[int, Kind]:
+    """What each descriptor index means in most strips; of two meanings with as many, that of more waveforms."""
+    votes: dict[int, dict[Kind, list[int]]] = {}
+    for sample in samples:
+        counts: Counter[tuple[int, Kind]] = Counter()
+        for block in sample.blocks:
+            counts[block.digitizer.index, _kind(block)] += len(block)
+        for (index, kind), number in counts.items():
+            votes.setdefault(index, {}).setdefault(kind, []).append(number)
+    return {
+        index: max(kinds, key=lambda kind, kinds=kinds: (len(kinds[kind]), sum(kinds[kind]), kind))
+        for index, kinds in sorted(votes.items())
+    }
+
+
+def _compare_kinds(blocks: Iterable[WaveformBlock], kinds: Mapping[int, Kind]) -> str:
+    """Why a strip's descriptors do not fit those of the flight; empty where they do."""
+    for block in blocks:
+        index, kind = block.digitizer.index, _kind(block)
+        if index not in kinds and kind in kinds.values():
+            continue
+        other = kinds.get(index) or next(iter(kinds.values()))
+        if kind != other:
+            apart = [place for place in range(len(kind)) if kind[place] != other[place]]
+            own, theirs = (", ".join(_FORMS[i].format(values[i]) for i in apart) for values in (kind, other))
+            return f"its descriptor {index} has {own}; that of the flight has {theirs}"
+    return ""
+
+
+def _find_group(samples: list[StripSample]) -> list[StripSample]:
+    """The strips that agree with the one that the most waveforms agree with, in level, noise and width."""
+    if len(samples) < 2:
+        return samples
+    # Pulses are not known yet: every Gaussian misses strong echoes alike.
+    first = SystemPulse(sigma_ref=FIRST_WIDTH * samples[0].blocks[0].spacing)
+    looks = [look_at(sample.blocks, first) for sample in samples]
+    best: list[StripSample] = []
+    for candidate in looks[:: max(len(looks) // CANDIDATES, 1)]:
+        if candidate is None:
+            continue
+        whole, noise = replace(candidate, misfit=np.inf), SystemPulse(sigma_ref=1.0, noise_std=candidate.level.std)
+        group = [
+            sample
+            for sample, look in zip(samples, looks, strict=True)
+            if look is not None and not compare_looks(look, whole, noise)
+        ]
+        if sum(sample.waveforms for sample in group) > sum(sample.waveforms for sample in best):
+            best = group
+    return best or samples
+
+
+def _describe_look(look: Look) -> dict[str, float]:
+    """As figures of a survey; `read_flight` reads them."""
+    level = {f"flight_level_{name}": float(value) for name, value in look.level._asdict().items() if value is not None}
+    return {**level, "flight_width": look.width, "flight_steady": look.steady, "flight_misfit": look.misfit}
+
+
+def _describe_kinds(kinds: Mapping[int, Kind]) -> dict[str, float]:
+    return {
+        f"flight_descriptor_{index}_{name}": float(value)
+        for index, kind in kinds.items()
+        for name, value in zip(_KIND, kind, strict=True)
+    }
+
+
+def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
+    """Return what a surveyed flight records, and its descriptors; raises ConfigError for a survey of no flight."""
+    figures = survey.figures
+    try:
+        level = {name: figures[f"flight_level_{name}"] for name in Level._fields if name != "clip"}
+        level |= {"waveforms": int(level["waveforms"]), "samples": int(level["samples"])}
+        numbers = (figures[f"flight_{name}"] for name in ("width", "steady", "misfit"))
+        look = Look(Level(**level, clip=figures.get("flight_level_clip")), *numbers)
+        indices = sorted({int(key.split("_")[2]) for key in figures if key.startswith("flight_descriptor_")})
+        kinds = {index: tuple(figures[f"flight_descriptor_{index}_{name}"] for name in _KIND) for index in indices}
+    except (KeyError, ValueError, IndexError) as error:
+        remedy = "`wavebatch run --survey flight --overwrite` makes one"
+        raise ConfigError(f"holds no survey of a flight; {remedy}") from error
+    return look, kinds
+
+
+def surveys_agree(surveys: Sequence[Survey]) -> bool:
+    """Return whether surveys of single strips agree so well that one survey of all of them would serve.
+
+    Parameters
+    ----------
+    surveys : sequence of Survey
+
+    Returns
+    -------
+    bool
+        False for fewer than two, and where one has too few echoes for a pulse.
+    """
+    if len(surveys) < 2 or any(survey.figures.get("isolated_echoes", 0) < FEW for survey in surveys):
+        return False
+    first, *others = surveys
+    return all(_agree(first, other) for other in others)
+
+
+def _agree(a: Survey, b: Survey) -> bool:
+    if any(a.figures.get(name) != b.figures.get(name) for name in ("spacing_ns", "bits")):
+        return False
+    noise = min(a.system.noise_std, b.system.noise_std)
+    echoes = min(a.figures["isolated_echoes"], b.figures["isolated_echoes"])
+    return (
+        max(a.system.noise_std, b.system.noise_std) < ALIKE_NOISE * noise
+        and abs(a.system.baseline - b.system.baseline) < ALIKE_LEVEL * noise
+        and a.system.digitizers.keys() == b.system.digitizers.keys()
+        and compare_pulses(a.system, b.system) < ALIKE_PULSES + PULSE_ERROR / np.sqrt(echoes)
+    )

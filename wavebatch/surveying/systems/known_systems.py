@@ -1,0 +1,329 @@
+"""Pulses of known sensors, measured on real strips and shipped as SYSTEM.toml files in this folder.
+
+`survey` takes one where a strip has too few echoes to learn a pulse from; `wavebatch survey` names the one that a
+strip's pulse looks like. Before you change it: a wrong pulse is worse than none, so the margins must keep simulated
+strips of other sensors from getting one (tests/surveying/test_known_systems.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # parts of it load when they are first asked for
+
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.toml_file import parse_toml, read_toml_text
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
+from wavebatch.stages.decompose.fit import adaptive, closed_form
+from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.flags import RINGING_REACH
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.surveying.measure import find_strongest, keep_lone, measure_gaussian, subtract_echoes
+from wavebatch.surveying.systems.system_table import read_system
+
+LEAST_ECHOES = 8
+"""Strong single echoes below which no pulse is taken: eight that all agree are chance once in 256 times."""
+
+LEAST_SNR = 10.0
+"""Least amplitude of these echoes, over the noise: below it noise hides the misfit of any pulse."""
+
+MOST_ECHOES = 200
+"""Echoes, the strongest ones, in which pulses are compared; more do not change the answer."""
+
+CLEARLY_BETTER = 0.5
+"""Misfit of a known pulse, over that of a Gaussian, up to which it is taken; the median over the echoes. It is 0.3 on
+10 to 200 packets of the shipped sensors, and 0.7 to 1.9 for the RIEGL's pulse on simulated sensors with other ones."""
+
+MOSTLY = 0.9
+"""Share of the echoes that the known pulse must fit better than a Gaussian does."""
+
+NOISE_LEFT = 1.3
+"""Most that the known pulse may leave of these echoes, over the noise (median); 1 is a perfect fit in white noise."""
+
+BEFORE, AFTER = 4.0, 9.0
+"""Widths of the pulse before and after an echo in which the misfit is measured: both shipped pulses with their
+after-pulses lie within."""
+
+SAME_SPACING = 0.01
+"""How far the spacing of a strip may be from that of a known sensor, as a share of it."""
+
+NEAR_WIDTH = 0.15
+"""The same for the width of the Gaussian that fits the pulse best: few echoes give it to some 5 %, slopes widen it."""
+
+ALIKE = 0.05
+"""Difference of two pulses, as `compare_pulses` measures it, up to which one looks like the other ..."""
+
+NOT_A_GAUSSIAN = 0.5
+"""... and over that of the known pulse to its best Gaussian: else every Gaussian of this width would look like it."""
+
+LEAST_RINGING, RINGING_ERRORS = 0.01, 4.0
+"""Least share of an echo, and least number of standard errors, of an after-pulse that echoes show together."""
+
+NO_FIT = 1e6
+"""Misfit of an echo to which the pulse cannot be fitted."""
+
+LARGEST_RINGING = 0.12
+"""Largest share of an echo that is taken for an after-pulse where no pulse is known: what is higher is a target."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownSystem:
+    """A shipped pulse."""
+
+    name: str
+    """Of the file, for example riegl-q680i."""
+    sensor: str
+    """For people, for example RIEGL LMS-Q680i."""
+    spacing: float
+    """Of the samples that it was measured with [ns]."""
+    system: SystemPulse
+
+
+@cache
+def known_systems() -> tuple[KnownSystem, ...]:
+    """Return the shipped pulses by name."""
+    return tuple(_load(path) for path in sorted(Path(__file__).parent.glob("*.toml")))
+
+
+def _load(path: Path) -> KnownSystem:
+    table = parse_toml(read_toml_text(path, "system file"), str(path))
+    spacing = table.table("figures").number("spacing_ns", 1e-3, 1e3)
+    return KnownSystem(path.stem, table.get("sensor", str), spacing, read_system(table.table("system")))
+
+
+def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES) -> EchoTable:
+    """Return the strongest single echoes of a block by Gaussian fits: at most `most`, one per waveform, not clipped."""
+    noise = pooled_noise(block, system)
+    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
+    rows, second = find_strongest(echoes, len(block))
+    echoes = echoes.take(rows)
+    good = echoes.amplitude > LEAST_SNR * system.noise_std
+    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
+    rows = np.flatnonzero(keep_lone(good, echoes.amplitude, second))
+    return echoes.take(np.sort(rows[np.argsort(-echoes.amplitude[rows], kind="stable")[:most]]))
+
+
+def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit the pulse of a system to single echoes.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    lone : EchoTable
+        m echoes, one per waveform.
+
+    Returns
+    -------
+    misfit : float64 (m,)
+        Root mean square of what is left from BEFORE to AFTER the echo, as a share of the amplitude; or NO_FIT.
+    left : float64 (m, s)
+        What is left of the waveform, as a share of the amplitude.
+    lag : float64 (m, s)
+        Of the samples after the echo [ns].
+    """
+    part, m = block.rows(lone.waveform), len(lone)
+    start = replace(lone, waveform=np.arange(m, dtype=np.int32))
+    fitted = adaptive(part, pooled_noise(part, system), system, start, max_echoes=1, significance=0.0)
+    fitted = fitted.take(find_strongest(fitted, m)[0])
+    fitted = fitted.take(np.flatnonzero(fitted.amplitude > 0))
+    left = np.full(part.samples.shape, np.nan)
+    lag = np.full(part.samples.shape, np.inf)
+    rows = fitted.waveform
+    left[rows] = subtract_echoes(part, system, fitted)[rows] / fitted.amplitude[:, None]
+    lag[rows] = np.arange(part.samples.shape[1]) * part.spacing - fitted.time[:, None].astype(np.float64)
+    near = (lag > -BEFORE * system.sigma_ref) & (lag < AFTER * system.sigma_ref) & np.isfinite(left)
+    number = near.sum(axis=1)
+    power = np.where(near, left, 0.0) ** 2
+    return np.where(number > 0, np.sqrt(power.sum(axis=1) / np.maximum(number, 1)), NO_FIT), left, lag
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What `take_pulse` gives a strip whose echoes are too few to learn a pulse from."""
+
+    system: SystemPulse
+    known: KnownSystem | None
+    """Where its pulse comes from; None: it stays a Gaussian."""
+    figures: dict[str, float]
+    """Misfits of the pulse that was taken, for the survey."""
+
+
+def take_pulse(block: WaveformBlock, system: SystemPulse, *, guess: bool) -> Taken:
+    """Take the pulse of a known sensor, or a careful Gaussian, where echoes are too few to learn a pulse from.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+        Noise and the Gaussian of the isolated echoes' width.
+    guess : bool
+        Whether this width is a guess, because even for it there were too few echoes.
+
+    Returns
+    -------
+    Taken
+
+    Notes
+    -----
+    Known sensors of the strip's spacing (SAME_SPACING) are tried. The strongest single echoes, LEAST_ECHOES or more,
+    are fitted with a Gaussian and with the known pulse; their Gaussian width must be near that of the known pulse
+    (NEAR_WIDTH). It is taken if the median of misfit over misfit of the Gaussian is at most CLEARLY_BETTER, MOSTLY of
+    the echoes agree, and at most NOISE_LEFT times the noise remains; the one with the least misfit wins. Else the
+    pulse stays a Gaussian, with the width of these echoes if it was a guess. What they all show at one lag after them
+    is then ringing, so that echoes there get the flag RINGING_SUSPECT (docs/algorithms.md R2).
+    """
+    best: tuple[float, Taken] | None = None
+    for known in known_systems():
+        taken = _try_pulse(block, known) if abs(block.spacing / known.spacing - 1) < SAME_SPACING else None
+        if taken is not None and (best is None or taken[0] < best[0]):
+            best = taken
+    if best is not None:
+        return best[1]
+    lone = find_lone(block, system)
+    if len(lone) < LEAST_ECHOES:
+        return Taken(system, None, {})
+    if guess:
+        # Not below half a sample, as for isolated echoes: spikes are no pulses.
+        # The lower quartile, without what noise takes off it: widths of one surface then give their median. Of all
+        # echoes: noise makes the strongest of many weak ones both high and narrow.
+        every = find_lone(block, system, len(block))
+        low, middle = np.quantile(every.sigma, (0.25, 0.5))
+        width = min(low + 0.674 * float(np.median(every.sigma_err)), middle)
+        system = replace(system, sigma_ref=max(float(width), 0.5 * block.spacing))
+        lone = find_lone(block, system)
+    return Taken(replace(system, ringing=_find_ringing(block, system, lone)), None, {})
+
+
+def _try_pulse(block: WaveformBlock, known: KnownSystem) -> tuple[float, Taken] | None:
+    """The misfit of a known pulse over that of a Gaussian, and the system with it; None where it does not fit."""
+    width = gaussian_width(known.system)
+    plain = measure_gaussian(block, width / block.spacing)
+    lone = find_lone(block, replace(plain, sigma_ref=width))
+    if len(lone) < LEAST_ECHOES or abs(np.quantile(lone.sigma, 0.25) / width - 1) > NEAR_WIDTH:
+        return None
+    system = with_pulse(plain, known.system)
+    misfit, gaussian = fit_alone(block, system, lone)[0], fit_alone(block, plain, lone)[0]
+    ratio = float(np.median(misfit / np.maximum(gaussian, 1 / NO_FIT)))
+    left = float(np.median(misfit * lone.amplitude)) / plain.noise_std
+    if ratio > CLEARLY_BETTER or np.mean(misfit < gaussian) < MOSTLY or left > NOISE_LEFT:
+        return None
+    figures = {
+        "known_pulse_echoes": float(len(lone)),
+        "known_pulse_misfit": float(np.median(misfit)),
+        "known_pulse_gaussian_misfit": float(np.median(gaussian)),
+    }
+    return ratio, Taken(system, known, figures)
+
+
+def with_pulse(system: SystemPulse, known: SystemPulse) -> SystemPulse:
+    """Return a strip's system with the pulse of another one, and with how far strong echoes deviate from it."""
+    names = ("sigma_ref", "kappa", "components", "ringing", "acceptance", "misfit", "tail_misfit", "width_scatter")
+    return replace(system, **{name: getattr(known, name) for name in names})
+
+
+def find_source(system: SystemPulse) -> KnownSystem | None:
+    """Return the known sensor whose pulse a system has, bit for bit; None for a pulse of its own."""
+    pulse = (system.components, system.kappa, system.sigma_ref)
+    same = (one for one in known_systems() if (one.system.components, one.system.kappa, one.system.sigma_ref) == pulse)
+    return next(same, None) if system.components or system.kappa else None
+
+
+def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> float:
+    """Largest after-pulse that echoes show together at one lag, as a share of them; 0 where there is none.
+
+    Second targets are at another distance in every waveform, an after-pulse is not: the median shows it alone. Its
+    height is that which a tenth of the echoes exceed, so that noise does not lift most after-pulses over the limit.
+    """
+    if len(lone) < LEAST_ECHOES:
+        return 0.0
+    _, left, lag = fit_alone(block, system, lone)
+    largest = 0.0
+    for place in np.arange(2.5, RINGING_REACH, 0.5):
+        near = np.abs(lag / system.sigma_ref - place) < 0.5
+        here = np.where(near & np.isfinite(left), left, np.nan)
+        rows = np.isfinite(here).any(axis=1)
+        if rows.sum() < LEAST_ECHOES:
+            continue
+        value = np.nanmean(here[rows], axis=1)
+        middle = float(np.median(value))
+        error = 1.2533 * MAD_TO_STD * float(np.median(np.abs(value - middle))) / np.sqrt(len(value))
+        if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
+            largest = max(largest, float(np.quantile(value, 0.9)))
+    return min(largest, LARGEST_RINGING)
+
+
+class Likeness(NamedTuple):
+    """The known sensor whose pulse is nearest to that of a strip."""
+
+    known: KnownSystem
+    difference: float
+    """As `compare_pulses` measures it."""
+
+    def describe(self) -> str:
+        """Return the sentence for people."""
+        return f"this strip's pulse looks like {self.known.sensor}; it differs by {100 * self.difference:.1f} %"
+
+
+def find_likeness(system: SystemPulse, spacing: float) -> Likeness | None:
+    """Find the known sensor whose pulse a system's pulse looks like.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        With its pulse.
+    spacing : float
+        Of its samples [ns].
+
+    Returns
+    -------
+    Likeness or None
+        None where no pulse was learned, or no known one of this spacing is within ALIKE of it.
+    """
+    if not (system.components or system.kappa):
+        return None
+    near = (known for known in known_systems() if abs(spacing / known.spacing - 1) < SAME_SPACING)
+    found = [Likeness(known, compare_pulses(system, known.system)) for known in near]
+    best = min(found, key=lambda one: one.difference, default=None)
+    if best is None:
+        return None
+    gaussian = SystemPulse(sigma_ref=gaussian_width(best.known.system))
+    limit = min(ALIKE, NOT_A_GAUSSIAN * compare_pulses(best.known.system, gaussian))
+    return best if best.difference < limit else None
+
+
+def compare_pulses(a: SystemPulse, b: SystemPulse) -> float:
+    """Return how far two pulses differ, once they are shifted and scaled onto each other.
+
+    Returns
+    -------
+    float
+        Root of the energy that is left over the energy of the pulse; 0 for equal pulses. Two Gaussians whose widths
+        differ by 2 % differ by 0.014.
+    """
+    step = 0.02 * min(a.sigma_ref, b.sigma_ref)
+    reach = 30.0 * max(a.sigma_ref, b.sigma_ref)
+    lag = np.arange(-reach, reach, step)
+    first, second = draw_pulse(a, lag), draw_pulse(b, lag)
+    together = float(scipy.signal.correlate(first, second, mode="full", method="fft").max())
+    share = together**2 / float((first @ first) * (second @ second))
+    return float(np.sqrt(max(1.0 - share, 0.0)))
+
+
+def draw_pulse(system: SystemPulse, lag: np.ndarray) -> np.ndarray:
+    """Return the height of a system's pulse at times after the centre of its main component [ns], f8 of that shape."""
+    width = shape_limits(system, 1.0).ref
+    return evaluate_pulse(pulse_shape(system, 1.0), lag[:, None], np.zeros(1), np.full(1, width))[0][:, 0]
+
+
+def gaussian_width(system: SystemPulse) -> float:
+    """Return the width [ns] of the Gaussian that is nearest to a system's pulse."""
+    widths = system.sigma_ref * np.linspace(0.7, 1.5, 41)
+    return float(min(widths, key=lambda width: compare_pulses(system, SystemPulse(sigma_ref=float(width)))))

@@ -1,0 +1,156 @@
+"""The table [system] of a SYSTEM.toml: a system pulse as plain numbers, and back.
+
+`system_file` writes and reads whole files with it, `known_systems` the pulses that are shipped.
+Before you change it: every number must come back to the last bit, and old files must stay readable.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.toml_file import TomlTable, check_number, shorten
+
+MOST_COMPONENTS = 16
+"""Gaussians that a pulse in a file may have."""
+
+
+class Quantity(NamedTuple):
+    """One number of a system pulse: its field in SystemPulse and the values that it may have."""
+
+    field: str
+    low: float
+    high: float
+    meaning: str
+    optional: bool = False
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "sigma_ref_ns": Quantity("sigma_ref", 1e-3, 1e4, "Gaussian standard deviation of the echo of a flat target"),
+    "baseline_dn": Quantity("baseline", -1e10, 1e10, "level without signal"),
+    "baseline_spread_dn": Quantity("baseline_spread", 0.0, 1e10, "its standard deviation between waveforms"),
+    "recovery_ns": Quantity("recovery", 0.0, 1e9, "after strong signal, until the level is back", optional=True),
+    "noise_std_dn": Quantity("noise_std", 1e-3, 1e10, "noise of one sample, for thresholds and errors"),
+    "noise_gain": Quantity("noise_gain", 0.0, 1e6, "growth of the noise's variance per count of signal"),
+    "kappa": Quantity("kappa", -0.9, 0.9, "skew of the pulse; 0 is a Gaussian"),
+    "ringing": Quantity("ringing", 0.0, 1.0, "largest after-pulse, as a share of the amplitude"),
+    "saturation_dn": Quantity("saturation", 1.0, 1e10, "count at which the digitizer clips", optional=True),
+    "acceptance": Quantity("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
+    "misfit": Quantity("misfit", 0.0, 1.0, "of strong echoes to the pulse, as a share of them", optional=True),
+    "level_variance_ns2": Quantity("level_variance", -1e8, 0.0, "of level ground's echoes less the pulse's", True),
+    "width_scatter_ns": Quantity("width_scatter", 0.0, 1e4, "of echo widths beyond the errors of their fits", True),
+    "divergence_mrad": Quantity("divergence", 1e-3, 100.0, "full angle of the beam, 1/e^2, from its data sheet", True),
+}
+"""Keys of the table [system] that are plain numbers."""
+
+COMPONENT_LIMITS = ((-10.0, 10.0), (-1e4, 1e4), (1e-3, 1e4))
+"""Allowed weight, delay [ns] and sigma [ns] of a component."""
+
+CORRELATION_LIMITS = ((-1.0, 1.0),)
+"""Allowed correlation of the noise at a lag."""
+
+TAIL_LIMITS = ((-1e5, 1e5), (0.0, 10.0))
+"""Allowed lag [ns] and share of the misfit of a tail."""
+
+MOST_LAGS = 1024
+"""Lags that the correlation and the tail of a pulse in a file may have; a survey finds fewer than 64."""
+
+_NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
+_CORRELATION, _TAIL = "correlation", "tail_misfit"
+_ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
+_ABOUT_CORRELATION = "of the noise of two samples 1, 2, ... spacings apart; empty: white noise"
+_ABOUT_TAIL = "(lag [ns], share of the amplitude) that the pulse leaves before and after strong echoes"
+REMEDY = "`wavebatch survey STRIP -o FILE` writes all"
+"""What to do where a key is missing."""
+
+
+def describe_system(system: SystemPulse) -> dict[str, Any]:
+    """Return the system pulse as plain numbers, lists and dictionaries under the keys of the file; exact."""
+    own = [{_INDEX: index, **_describe_pulse(other)} for index, other in sorted(system.digitizers.items())]
+    return {**_describe_pulse(system), **({_DIGITIZERS: own} if own else {})}
+
+
+def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
+    values = {key: getattr(system, quantity.field) for key, quantity in QUANTITIES.items()}
+    return {
+        **{key: None if value is None else float(value) for key, value in values.items()},
+        _NOISE: {kind: float(value) for kind, value in system.noise_by_kind.items()},
+        _CORRELATION: [float(value) for value in system.correlation],
+        _COMPONENTS: [[float(value) for value in component] for component in system.components],
+        _TAIL: [[float(value) for value in row] for row in system.tail_misfit],
+    }
+
+
+def comment_system() -> dict[str, str]:
+    """Return the comments of a file by dotted key."""
+    meanings = {key: quantity.meaning for key, quantity in QUANTITIES.items()}
+    meanings |= {_COMPONENTS: _ABOUT_COMPONENTS, _CORRELATION: _ABOUT_CORRELATION, _TAIL: _ABOUT_TAIL}
+    places = ("system", f"system.{_DIGITIZERS}")
+    comments = {f"{place}.{key}": meaning for place in places for key, meaning in meanings.items()}
+    comments[places[1]] = "a digitizer that records otherwise"
+    return comments
+
+
+def read_system(table: TomlTable) -> SystemPulse:
+    """Read the table [system] with those of the digitizers that record otherwise; raises ConfigError."""
+    own: dict[int, SystemPulse] = {}
+    for row in table.tables(_DIGITIZERS, f"system.{_DIGITIZERS}"):
+        index = row.integer(_INDEX, 1, 255)
+        if index in own:
+            raise ConfigError(f"{row.where}: {_INDEX} {index} is there already; give each digitizer one table")
+        own[index] = _read_pulse(row, _INDEX)
+    return replace(_read_pulse(table, _DIGITIZERS), digitizers=own)
+
+
+def _read_pulse(table: TomlTable, extra: str) -> SystemPulse:
+    """A pulse from a table that may hold one extra key."""
+    needed = (*(key for key, quantity in QUANTITIES.items() if not quantity.optional), _COMPONENTS, _NOISE)
+    table.check_keys((*QUANTITIES, _COMPONENTS, _NOISE, _CORRELATION, _TAIL, extra), needed, REMEDY)
+    values = {
+        quantity.field: table.number(key, quantity.low, quantity.high)
+        for key, quantity in QUANTITIES.items()
+        if key in table.values
+    }
+    correlation = _read_rows(table, _CORRELATION, CORRELATION_LIMITS, "numbers")
+    return SystemPulse(
+        **values,
+        noise_by_kind=read_numbers(table.table(_NOISE), low=0.0),
+        correlation=tuple(row[0] for row in correlation),
+        components=_read_components(table),
+        tail_misfit=_read_rows(table, _TAIL, TAIL_LIMITS, "[lag, share]"),
+    )
+
+
+def _read_components(table: TomlTable) -> tuple[tuple[float, ...], ...]:
+    components = _read_rows(table, _COMPONENTS, COMPONENT_LIMITS, "[weight, delay, sigma]")
+    where = f"{table.where}: {_COMPONENTS}"
+    if len(components) == 1 or len(components) > MOST_COMPONENTS:
+        raise ConfigError(f"{where} must be empty or hold 2 to {MOST_COMPONENTS} Gaussians, it holds {len(components)}")
+    if components and components[0][0] < 0.01:
+        raise ConfigError(f"{where} row 1 is the main Gaussian, its weight must be positive, it is {components[0][0]}")
+    return components
+
+
+def _read_rows(
+    table: TomlTable, key: str, limits: tuple[tuple[float, float], ...], form: str
+) -> tuple[tuple[float, ...], ...]:
+    """The rows of a list, empty where it is missing; a row has a number within each of the limits."""
+    where, rows = f"{table.where}: {key}", table.values.get(key, [])
+    if isinstance(rows, list) and len(limits) == 1:
+        rows = [[value] for value in rows]
+    if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) == len(limits) for row in rows):
+        raise ConfigError(f"{where} must be a list of {form}, it is {shorten(rows)}")
+    if len(rows) > MOST_LAGS:
+        raise ConfigError(f"{where} holds {len(rows)} rows, at most {MOST_LAGS} are read")
+    return tuple(
+        tuple(check_number(value, *pair, f"{where} row {number}") for value, pair in zip(row, limits, strict=True))
+        for number, row in enumerate(rows, 1)
+    )
+
+
+def read_numbers(table: TomlTable, low: float = -math.inf) -> dict[str, float]:
+    """Read a table of finite numbers, none of them below `low`."""
+    return {key: table.number(key, low) for key in table.values}
