@@ -8,7 +8,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.tools.bench.real.pool import Solver, find_fill
+from wavebatch.tools.bench.real.pool import Solver, fill_of
 
 QUIET = 4.0
 """An injected echo this far from every echo of its waveform lies in a quiet stretch [FWHM of the system pulse]."""
@@ -99,7 +99,7 @@ def _is_clear(
 
 def _touches_fill(block: WaveformBlock, row: np.ndarray, time: np.ndarray, fwhm: float) -> np.ndarray:
     """Whether a gap between two recordings lies under the echo or next to it."""
-    fill = find_fill(block.samples)
+    fill = fill_of(block)
     if not fill.any():
         return np.zeros(len(row), bool)
     before = np.concatenate([np.zeros((len(fill), 1), np.int64), np.cumsum(fill, axis=1)], axis=1)

@@ -132,7 +132,10 @@ def join_blocks(blocks: Sequence[WaveformBlock]) -> WaveformBlock:
     names = ("samples", "point", "gps_time", "origin", "direction")
     arrays = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
     arrays["samples"].flags.writeable = False
-    return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None)
+    missing = None
+    if any(block.missing is not None for block in blocks):
+        missing = np.concatenate([fill_of(block) for block in blocks])
+    return replace(blocks[0], **arrays, returns=_join_returns(blocks), sensor=None, scanner=None, missing=missing)
 
 
 def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
@@ -142,6 +145,11 @@ def _join_returns(blocks: Sequence[WaveformBlock]) -> ReturnTable | None:
     waveform = [block.returns.waveform + start for block, start in zip(blocks, starts, strict=True)]
     others = [np.concatenate([getattr(b.returns, name) for b in blocks]) for name in ("time", "point", "xyz")]
     return ReturnTable(np.concatenate(waveform).astype(np.int32), *others)
+
+
+def fill_of(block: WaveformBlock) -> np.ndarray:
+    """Samples of a block that only fill its packets, bool (n, s): as its reader has found them, or else from counts."""
+    return find_fill(block.samples) if block.missing is None else block.missing
 
 
 def find_fill(samples: np.ndarray, shortest: int = 12, gap: int = 3) -> np.ndarray:

@@ -17,7 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.tools.bench.real.pool import Pool, Solver, find_fill
+from wavebatch.tools.bench.real.pool import Pool, Solver, fill_of
 
 BEFORE, AFTER = 4.5, 12.5
 """What a template covers before and after its peak, in sigmas of the system pulse: after-pulses are part of it."""
@@ -146,7 +146,7 @@ def learn_templates(
 def _collect(donors: _Donors, block: WaveformBlock, table: EchoTable, solver: Solver, noise: float) -> int:
     """Adds the clear echoes of a block; how many there are."""
     sigma, spacing, s = solver.system.sigma_ref, block.spacing, block.samples.shape[1]
-    fill = find_fill(block.samples)
+    fill = fill_of(block)
     limit = clip_level(block, solver.system.of(block))
     time = np.arange(s) * spacing
     rows = find_clear(table, solver, noise)
@@ -262,7 +262,8 @@ def summarize(templates: Sequence[Template]) -> TemplateSummary:
 def bare_block(block: WaveformBlock, samples: np.ndarray) -> WaveformBlock:
     """A block of other samples without geometry, of the same digitizer."""
     bare = WaveformBlock.from_samples(samples, spacing=block.spacing, bits=block.digitizer.bits)
-    return replace(bare, digitizer=block.digitizer)
+    missing = block.missing if samples.shape == block.samples.shape else None
+    return replace(bare, digitizer=block.digitizer, missing=missing)
 
 
 def _fit_spline(lag: np.ndarray, value: np.ndarray, weight: np.ndarray, step: float) -> BSpline:
