@@ -25,6 +25,7 @@ from wavebatch.tools.slices.lines import _shape
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 
 DETECTORS = sorted(name for name, stage in STAGES.items() if name.startswith("detect."))
+DECOMPOSERS = sorted(name for name in STAGES if name.startswith("decompose.") and name != "decompose.none")
 GAP = slice(30, 54)
 
 
@@ -209,7 +210,7 @@ def test_detectors_find_nothing_in_gaps_and_at_their_edges(whole, tmp_path, name
     assert abs(len(first) - len(second)) <= 0.03 * len(first)
 
 
-@pytest.mark.parametrize("name", sorted({one for one in STAGES if one.startswith("decompose.")} - {"decompose.none"}))
+@pytest.mark.parametrize("name", DECOMPOSERS)
 @pytest.mark.parametrize("shift", [0, 7])
 def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name, shift):
     plain, block, system, _ = two_levels(whole, tmp_path, shift)
@@ -233,7 +234,9 @@ def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name
     one, other = (table.take(np.flatnonzero(alike[table.waveform])) for table in far)
     for name in ("time", "amplitude", "sigma"):
         change = np.abs(getattr(one, name) - getattr(other, name)) / getattr(one, f"{name}_err")
-        assert np.nanquantile(change, 0.5) < 0.3 and np.nanquantile(change, 0.9) < (0.5 if shift == 0 else 1.0)
+        # With a level of its own a short recording has the error of a few quiet samples.
+        usual, large = (0.25, 0.5) if shift == 0 else (0.4, 1.5)
+        assert np.nanquantile(change, 0.5) < usual and np.nanquantile(change, 0.9) < large
 
 
 def test_recordings_of_different_level_have_their_own_baseline(whole, tmp_path):

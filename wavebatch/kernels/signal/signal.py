@@ -78,21 +78,34 @@ def find_fill(samples: np.ndarray, *tops: int) -> np.ndarray | None:
     n, s = samples.shape
     if s < LEAST_RECORDED + LEAST_PADDING or not n:
         return None
-    # Every long run has a sample in these columns: an ordinary block costs an eighth of a pass.
-    seen = samples[:, LEAST_PADDING - 1 :: LEAST_PADDING]
-    least, largest = seen.min(), seen.max()
+    least, largest = samples.min(), samples.max()
     fill = None
     for value in {0, *tops}:
         if least > 0 if value == 0 else largest < value:
             continue
-        rows = np.flatnonzero((seen == value).any(axis=1))
-        if value == 0 and len(rows):
-            rows = rows[(seen[rows] - 1 >= LEAST_LEVEL - 1).all(axis=1)]
+        rows = _rows_with_runs(samples, value)
         found = _find_fill_rows(samples[rows], value) if len(rows) else None
         if found is not None and found.any():
             fill = np.zeros(samples.shape, bool) if fill is None else fill
             fill[rows] |= found
     return fill
+
+
+def _rows_with_runs(samples: np.ndarray, value: int) -> np.ndarray:
+    """Rows of samples (n, s) that may hold a long run of one count: all that do, and few others."""
+    flat, s = samples.reshape(-1), samples.shape[1]
+    # Every long run holds every eighth sample of the block at least once, and the four before or after it.
+    first, half = LEAST_PADDING - 1, LEAST_PADDING // 2
+    seen = flat[first::LEAST_PADDING]
+    at = np.flatnonzero(seen == value) * LEAST_PADDING + first
+    after = np.minimum(at + half, len(flat) - 1)
+    at = at[(flat[at - half] == value) | (flat[after] == value)]
+    rows = np.zeros(len(samples), bool)
+    rows[at // s] = True
+    if value == 0 and len(at):
+        low = np.flatnonzero(seen - 1 < LEAST_LEVEL - 1) * LEAST_PADDING + first
+        rows[low // s] = False
+    return np.flatnonzero(rows)
 
 
 def _find_fill_rows(samples: np.ndarray, value: int) -> np.ndarray:

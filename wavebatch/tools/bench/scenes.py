@@ -18,6 +18,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import SAMPLE, survey_blocks
+from wavebatch.surveying.survey import pool_blocks
 from wavebatch.tools.bench.truth import smoothed_power
 from wavebatch.tools.simulate import PulseModel, Recording, Scene, find_scene
 from wavebatch.tools.simulate.draws import Drawn
@@ -96,8 +97,7 @@ def shape_scene(strip: Path, chain: Chain) -> StripScene:
             f"{strip}: {number} waveforms of one length are too few to shape a benchmark like it ({LEAST_WAVEFORMS} "
             "are needed); name a scene with --scene"
         )
-    samples = np.concatenate([block.samples for block in chosen])
-    block = WaveformBlock.from_samples(samples, spacing=chosen[0].spacing, bits=chosen[0].digitizer.bits)
+    block = pool_blocks(chosen)
     system = survey_blocks([block]).system
     recording = describe_recording(system, block)
     sample = _take_sample(chain.run(block, system), len(block), system, recording)

@@ -6,7 +6,7 @@ They lie at random places: in quiet stretches, or near the strongest echo of a w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -208,7 +208,8 @@ def _inject(
     clipped = ((added >= limit) & (np.abs(lag) < solver.fwhm)).any(axis=1)
     gain, delay, sigma = np.array([(t.gain, t.delay, t.sigma) for t in templates])[which].T
     true = np.stack([places.time + delay, gain * height, sigma], axis=1)
-    return _compare(solver.run(bare_block(block, added)), table, places, true, clipped, solver.fwhm)
+    bare = replace(bare_block(block, added), missing=None if block.missing is None else block.missing[places.row])
+    return _compare(solver.run(bare), table, places, true, clipped, solver.fwhm)
 
 
 def _compare(
