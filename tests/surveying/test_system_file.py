@@ -37,6 +37,11 @@ SYSTEM = SystemPulse(
     saturation=255.0,
     acceptance=18.0,
     correlation=(0.63, 1 / 7, -0.1),
+    pattern=(0.1, -0.1 / 3),
+    slope_spread=1 / 7,
+    spikes=0.08,
+    transient=2.0,
+    recovery=42.0,
     tail_misfit=((-9.3, 0.0021), (5.574348636365153, 0.1 + 0.2)),
     misfit=0.1 / 3,
 )
@@ -97,7 +102,7 @@ def test_figures_that_are_no_numbers_are_left_out():
 
 def test_every_number_of_the_system_has_a_key():
     fields = {quantity.field for quantity in QUANTITIES.values()} | {"noise_by_kind", "components", "digitizers"}
-    fields |= {"correlation", "tail_misfit"}
+    fields |= {"correlation", "tail_misfit", "pattern"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error"}
     assert fields | elsewhere == set(SystemPulse.__dataclass_fields__)

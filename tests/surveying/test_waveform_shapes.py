@@ -160,3 +160,21 @@ def test_strips_without_defects_keep_their_counts():
         block = digitize(render(pulse, seed, second=0.3)[0], seed)
         system = survey_block(block).system
         assert not system.has_defects and clean_block(block, system) is block
+
+
+@pytest.mark.parametrize(("rho", "gain"), [(0.5, 0.05), (0.5, 0.1), (0.0, 0.1)])
+def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
+    signal, rows, time, height = render(bell, 11, n=4000, amplitude=(15, 220))
+    steps = np.random.default_rng(11).standard_normal((4000, 120))
+    noise = steps.copy()
+    for i in range(1, 120):
+        noise[:, i] = rho * noise[:, i - 1] + np.sqrt(1 - rho * rho) * steps[:, i]
+    exact = BASE + signal + noise[:, 40:] * np.sqrt(1 + gain * np.maximum(signal, 0))
+    system, echoes = decompose(WaveformBlock.from_samples(np.clip(np.rint(exact), 0, 999).astype(np.uint16)))
+    _, true, match = compare(echoes, rows, time)
+    echoes, truth = echoes.take(match.found), np.lexsort((time, rows))[match.truth]
+    strong = height[truth] > 30
+    error = (echoes.time - time[truth])[strong]
+    ratio = (error - np.median(error)) / echoes.time_err[strong]
+    assert 0.9 < np.sqrt(np.mean(ratio**2)) < 1.15
+    assert true > 0.995

@@ -1,7 +1,8 @@
-"""Takes off what the receiver adds to the waveforms of a strip, where its survey found such defects.
+"""Spikes, patterns of the converter, transients and sloping baselines: which a strip has, and how they are taken off.
 
-`Chain.run` and the survey call it before anything else. Waveforms of other strips pass through untouched. Cleaned
-samples are float32, so that a block that was cleaned is known by its samples.
+The survey measures them after its first look at noise and width; `Chain.run` and the survey clean every block before
+anything else. Each defect must stand clear of chance: waveforms of other strips pass through untouched. Cleaned samples
+are float32, so that a block that was cleaned is known by its samples.
 """
 
 from __future__ import annotations
@@ -11,12 +12,35 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.signal.defects import fill_spikes, find_spikes, fit_slopes
-from wavebatch.kernels.signal.signal import transpose_samples
+from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
+from wavebatch.kernels.signal.noise import DRIFT, find_levels
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, transpose_samples
 from wavebatch.stages.pulse_tables import clip_level
 
 GUARD = 3.0
 """Samples this close to a signal do not show the slope of the baseline [widths of the system pulse]."""
+
+
+LEAST_SPIKES = 0.003
+"""Spikes per waveform from which they are taken off."""
+
+NARROWEST = 1.5
+"""Width of the system pulse [samples] from which a spike cannot be an echo."""
+
+PATTERN, CERTAIN = 0.05, 6.0
+"""Offset of a pattern that matters [count, or noise of a sample], and its standard errors."""
+
+SLOPES, STEEP = 0.02, 5.0
+"""Share of the waveforms whose slope must exceed this many of its errors for slopes to be taken off ..."""
+
+LEAST_RISE = 0.5
+"""... and standard deviation of the baseline's rise over half of a waveform [noise of a sample]."""
+
+LEAST_WAVEFORMS, MOST_WAVEFORMS = 50, 2048
+"""Waveforms from which defects are looked for, and how many are looked at."""
+
+SHORTEST = 24
+"""Samples of a waveform from which defects are looked for."""
 
 
 def clean_block(block: WaveformBlock, system: SystemPulse) -> WaveformBlock:
@@ -76,3 +100,69 @@ def _slopes(signal: np.ndarray, system: SystemPulse, spacing: float, missing: np
     slope = np.where(np.isfinite(error), slope * spread**2 / (spread**2 + np.minimum(error, 1e6) ** 2), 0.0)
     x = np.arange(len(signal), dtype=np.float32) - np.float32(0.5 * (len(signal) - 1))
     return x[:, None] * slope.astype(np.float32)
+
+
+def measure_defects(block: WaveformBlock, system: SystemPulse) -> SystemPulse:
+    """Return the system with the defects of its waveforms.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+        Raw waveforms of one digitizer.
+    system : SystemPulse
+        Noise and width at first sight.
+
+    References
+    ----------
+    docs/algorithms.md H17.
+    """
+    if len(block) < LEAST_WAVEFORMS or block.samples.shape[1] < SHORTEST:
+        return system
+    block = block.rows(slice(None, None, max(len(block) // MOST_WAVEFORMS, 1)))
+    signal = transpose_samples(block.samples)
+    missing = None if block.missing is None else block.missing.T
+    std, width = sample_noise(system), system.sigma_ref / block.spacing
+    reach = int(np.ceil(3 * width))
+    spread = _slope_spread(signal, system, std, reach, missing)
+    if spread:
+        # Everything else is measured about level baselines.
+        system = replace(system, slope_spread=spread / block.spacing)
+        signal = clean_block(block, system).samples.T
+        level = np.median(signal, axis=0)
+    elif system.baseline_spread > DRIFT * std:
+        level = find_levels(signal, std, reach)[0]
+    else:
+        level = np.float32(system.baseline)
+    above = signal - level
+    if missing is not None:
+        above[missing] = 0
+    quiet = find_quiet(above, np.float32(3.5 * np.hypot(SMOOTH_GAIN * std, system.baseline_spread) + 0.25), reach)
+    if missing is not None:
+        quiet &= ~missing
+    offsets, error = find_pattern(signal, quiet)
+    if np.abs(offsets).max() > max(PATTERN * max(std, 1.0), CERTAIN * error.max()):
+        system = replace(system, pattern=tuple(offsets.tolist()))
+    if width >= NARROWEST:
+        spikes = np.count_nonzero(find_spikes(above, std, width)) / len(block)
+        system = replace(system, spikes=spikes if spikes > LEAST_SPIKES else 0.0)
+    return replace(system, transient=find_transient(above, std) * block.spacing)
+
+
+def _slope_spread(signal: np.ndarray, system: SystemPulse, std: float, reach: int, missing: np.ndarray | None) -> float:
+    """Standard deviation of the slopes of baselines [count per sample]; 0 where chance and tails explain them.
+
+    A tail looks like a slope: where tails were found (`recovery`), slopes are not looked for.
+    """
+    if system.recovery > 0:
+        return 0.0
+    slope, error = fit_slopes(signal, std, reach, missing=missing)
+    known = np.isfinite(error)
+    if np.count_nonzero(known) < LEAST_WAVEFORMS:
+        return 0.0
+    slope, error = slope[known], error[known]
+    share = np.mean(np.abs(slope) > STEEP * error)
+    low, high = np.quantile(slope, [0.1587, 0.8413])
+    excess = max(0.25 * (high - low) ** 2 + np.median(slope) ** 2 - np.median(error) ** 2, 0.0)
+    few = np.mean(slope**2) if share < 0.3 else 0.0
+    spread = float(np.sqrt(max(excess, few - np.median(error) ** 2)))
+    return spread if share > SLOPES and spread * 0.5 * len(signal) > LEAST_RISE * std else 0.0

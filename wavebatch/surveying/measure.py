@@ -94,6 +94,10 @@ NOISE_PROMISE = 8.0
 CORE_REACH = 4.0
 """Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
 
+COLOURED, MOST_COLOURED = 1.2, 10.0
+"""Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
+fits leave at no signal."""
+
 TAIL_BEFORE, TAIL_AFTER = 6, 40
 """Widths of the pulse before and after an echo in which its tail is measured."""
 
@@ -318,7 +322,7 @@ def measure_residuals(block: WaveformBlock, system: SystemPulse, echoes: EchoTab
     if kinds.get("outside", kinds["quiet"]) < UNDITHERED and np.count_nonzero(weak) >= ENOUGH_TO_LEARN:
         kinds["weak_echoes"] = _robust_std(residual[weak][np.abs(lag[weak]) < 2.5])
         std = max(std, kinds["weak_echoes"])
-    gain = _noise_gain(residual, model, lag, width, std)
+    gain = _noise_gain(residual, model, lag, width, std, std > COLOURED * kinds.get("outside", std))
     return replace(system, noise_std=std, noise_by_kind=kinds, noise_gain=gain)
 
 
@@ -487,7 +491,9 @@ def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
     return np.minimum(leverage, 0.9)
 
 
-def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float) -> float:
+def _noise_gain(
+    residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
+) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
     core = np.abs(lag) < 1.5
     signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
@@ -510,6 +516,11 @@ def _noise_gain(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width:
     share = 1 / (1 + np.exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))
     gain = share * fits[1][0][1] + (1 - share) * fits[3][0][1]
     sigma = np.sqrt(max(share * (chi2[0] - chi2[1]) + (1 - share) * (chi2[2] - chi2[3]), 0.0))
+    # Of coloured noise the fit takes away more, at all levels alike, and `std` is what it does to a pulse: the growth
+    # relative to the noise without signal holds for both.
+    rest = share * fits[1][0][0] + (1 - share) * fits[3][0][0]
+    if coloured and gain > 0:
+        gain *= std**2 / np.clip(rest, std**2 / MOST_COLOURED, std**2)
     if gain * edges[-2] <= 0.3 * std**2:
         return 0.0
     return float(gain * np.clip((sigma - 3) / 3, 0.0, 1.0))

@@ -14,7 +14,7 @@ from wavebatch.core.units import LEAST_PULSE_WIDTH, QUANTISATION_STD, SQUARED_NO
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
-from wavebatch.stages.clean import clean_block
+from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse, refine_pulse
 from wavebatch.surveying.measure import (
@@ -31,7 +31,6 @@ from wavebatch.surveying.measure import (
     measure_residuals,
     thin_block,
 )
-from wavebatch.surveying.measure_defects import measure_defects
 from wavebatch.surveying.systems.known_systems import find_source, take_pulse
 
 SAMPLE = 8192
