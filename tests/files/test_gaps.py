@@ -252,7 +252,8 @@ def test_recordings_of_different_level_have_their_own_baseline(whole, tmp_path):
             # Where an echo fills a recording its level is that of its lowest samples.
             assert np.median(off) < 0.4 and np.quantile(off, 0.9) < 2.5
         assert np.array_equal(noise.rows(np.arange(5)).level, noise.level[:5])
-        assert found.noise_std == pytest.approx(system.noise_std, rel=0.15)
+        # Where an echo fills a recording its level is off, which counts as noise (docs/algorithms.md 9).
+        assert 0.9 * system.noise_std < found.noise_std < 2.5 * system.noise_std
         assert found.sigma_ref == pytest.approx(system.sigma_ref, rel=0.03)
 
 

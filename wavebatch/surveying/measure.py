@@ -16,7 +16,7 @@ from wavebatch.kernels.fit.next_echo import propose_echo
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.noise import estimate_noise, residual_noise
+from wavebatch.kernels.signal.noise import estimate_noise, keep_longest, residual_noise
 from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive, closed_form
@@ -129,7 +129,7 @@ def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
 
 def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
     """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
-    missing = None if block.missing is None else block.missing.T
+    missing = None if block.missing is None else keep_longest(block.missing.T)
     noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
     correlation = tuple(noise.correlation.tolist())
     seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])

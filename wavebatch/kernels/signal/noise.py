@@ -369,6 +369,26 @@ def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
     return float(np.sqrt(np.sum(deviation * deviation) / freedom) / SMOOTH_GAIN) if freedom else std
 
 
+def keep_longest(missing: np.ndarray) -> np.ndarray:
+    """Mark all recordings of a packet but its longest as missing: others may have a level of their own.
+
+    Parameters
+    ----------
+    missing : bool (s, n)
+        Samples that were not recorded.
+
+    Returns
+    -------
+    bool (s, n)
+    """
+    recorded = ~missing
+    begins = recorded.copy()
+    begins[1:] &= missing[:-1]
+    number = np.cumsum(begins, axis=0) * recorded
+    sizes = np.stack([np.count_nonzero(number == k, axis=0) for k in range(1, int(number.max(initial=1)) + 1)])
+    return number != np.argmax(sizes, axis=0) + 1
+
+
 def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> tuple[float, np.ndarray] | None:
     """Standard deviation and correlation of what fits leave outside of their echoes.
 
