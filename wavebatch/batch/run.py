@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
 from wavebatch.batch.preflight import check_outputs
-from wavebatch.batch.processes import Workers
+from wavebatch.batch.processes import WorkerDied, Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
@@ -163,6 +162,8 @@ class _Batch:
             queue = self._again or self._waiting
             if not queue:
                 return None
+            if alone:
+                self._workers.restart()  # nothing else shall need memory
             strip = StripTask(queue.popleft(), self._options, alone)
             self._active.append(strip)
             with self._failing(strip):
@@ -190,28 +191,26 @@ class _Batch:
         """An error inside ends this strip only."""
         try:
             yield
-        except BrokenProcessPool:
-            self._restart()
+        except WorkerDied:
+            self._try_again(strip)
         except BrokenExecutor as error:
             self._give_up(error)
         except Exception as error:
             strip.drop()
             self._end(strip, Outcome(strip.job, "failed", error=error))
 
-    def _restart(self) -> None:
-        """A process has died: a strip that was alone fails; several are tried again one by one, to find the cause."""
-        self._workers.restart()
-        strips, self._active = self._active, []
-        for strip in strips:
-            strip.drop()
-        if len(strips) > 1:
-            self._again.extend(strip.job for strip in strips)
+    def _try_again(self, strip: StripTask) -> None:
+        """A process died at this strip: it is tried once more, alone, because several strips may need too much memory."""
+        strip.drop()
+        if not strip.alone:
+            self._active.remove(strip)
+            self._again.append(strip.job)
             return
         error = InputError(
-            f"{strips[0].job.path}: a worker process died while it worked on this strip (killed, or out of memory); "
-            "run again with --resume and fewer --jobs or less --memory"
+            f"{strip.job.path}: a worker process died while it worked on this strip (killed, or out of memory), also "
+            "when it was tried again alone; run again with --resume and fewer --jobs or less --memory"
         )
-        self._end(strips[0], Outcome(strips[0].job, "failed", error=error))
+        self._end(strip, Outcome(strip.job, "failed", error=error))
 
     def _give_up(self, reason: BrokenExecutor) -> None:
         """No worker is left: all strips that are not written fail, for one reason that is reported once."""
