@@ -23,6 +23,7 @@ from wavebatch.batch.processes import WorkerDied, Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
+from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import remove_stale, reporting
 
@@ -130,6 +131,7 @@ class _Batch:
     def run(self) -> None:
         """Work until every strip has an outcome."""
         while self._submit() or self._active:
+            interrupts.check()
             heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
             try:
                 done = self._workers.wait(heads)
@@ -196,11 +198,12 @@ class _Batch:
         except BrokenExecutor as error:
             self._give_up(error)
         except Exception as error:
+            interrupts.check()  # it may come from an interrupt that compiled code has turned into an error
             strip.drop()
             self._end(strip, Outcome(strip.job, "failed", error=error))
 
     def _try_again(self, strip: StripTask) -> None:
-        """A process died at this strip: it is tried once more, alone, because several strips may need too much memory."""
+        """A process died at this strip: it is tried once more, alone, because several may need too much memory."""
         strip.drop()
         if not strip.alone:
             self._active.remove(strip)

@@ -20,12 +20,11 @@ from typing import IO, Any
 
 import click
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError
 
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
-EXIT_INTERRUPTED = 130
-"""Ctrl-C or SIGTERM."""
 
 
 class WrongUsage(click.ClickException):
@@ -46,10 +45,22 @@ class WrongUsage(click.ClickException):
         click.echo(f"error: {self.message}", file=file, err=file is None)
 
 
+class Interrupted(click.ClickException):
+    """Ctrl-C or SIGTERM as one line and an exit code; click would say `Aborted!` and give 1."""
+
+    exit_code = interrupts.EXIT_INTERRUPTED
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(self.message, file=file, err=file is None)
+
+
 @contextlib.contextmanager
-def _usage_in_one_line() -> Iterator[None]:
+def _errors_in_one_line() -> Iterator[None]:
     try:
         yield
+    except KeyboardInterrupt:
+        raise Interrupted("interrupted") from None
     except click.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
             raise
@@ -61,12 +72,12 @@ class NearestGroup(click.Group):
 
     def make_context(self, *args: Any, **options: Any) -> click.Context:
         """Parses the options of the group."""
-        with _usage_in_one_line():
+        with _errors_in_one_line():
             return super().make_context(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Parses and runs the command."""
-        with _usage_in_one_line():
+        with _errors_in_one_line():
             return super().invoke(ctx)
 
     def resolve_command(
@@ -140,8 +151,8 @@ def one_line(error: BaseException) -> str:
 def report_errors(failure: int = 1) -> Callable:
     """Decorator of a command function: wavebatch's errors become one line on stderr and an exit code.
 
-    failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE, an
-    interrupt EXIT_INTERRUPTED. The command's option `debug` prints the traceback too.
+    failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE. The
+    command's option `debug` prints the traceback too.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -151,10 +162,9 @@ def report_errors(failure: int = 1) -> Callable:
                 return function(*args, **options)
             except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
                 raise
-            except KeyboardInterrupt:
-                talk("interrupted")
-                sys.exit(EXIT_INTERRUPTED)
             except Exception as error:
+                if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this
+                    raise Interrupted("interrupted") from None
                 if options.get("debug"):
                     traceback.print_exc()
                 talk(f"error: {one_line(error)}")

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_INTERRUPTED, EXIT_USAGE, Progress, count, one_line, print_json, talk
+from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, one_line, print_json, talk
 from wavebatch.cli.options import (
     calibration_option,
     chain_options,
@@ -102,16 +101,11 @@ def run(**options: Any) -> None:
     jobs, batch_options = _plan(options)
     if options["dry_run"]:
         sys.exit(_dry_run(jobs, batch_options))
-    signal.signal(signal.SIGTERM, _interrupt)
     try:
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
-        talk("interrupted: finished clouds are complete, no partial file remains; --resume continues")
-        sys.exit(EXIT_INTERRUPTED)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+        text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
+        raise Interrupted(text) from None
 
 
 def _check_options(options: dict[str, Any]) -> None:

@@ -6,6 +6,7 @@ removes; a lock shows which of them are still in use.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import filecmp
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.interrupts import uninterrupted
 
 try:
     import fcntl
@@ -60,17 +62,18 @@ class Draft:
         self.overwrite = overwrite
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
-        with reporting(self.target):
+        with uninterrupted(), reporting(self.target):
             self.path, descriptor = _create(self.target.parent)
-        self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
-        self.published = False
+            self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
+            self.published = False
+            _open.add(self)
 
     def publish(self, *, same_is_fine: bool = False) -> None:
         """Give the finished file its final name in one step; without overwrite an existing file is never replaced.
 
         same_is_fine: an existing file with the same bytes counts as published, because a killed run may have left it.
         """
-        with reporting(self.target):
+        with uninterrupted(), reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
             if fcntl is None:  # Windows cannot rename an open file
@@ -94,12 +97,24 @@ class Draft:
             self.file.close()
         with contextlib.suppress(OSError):
             os.unlink(self.path)
+        _open.discard(self)
 
     def withdraw(self) -> None:
         """Remove the published file again, because a file that belongs to it could not be published."""
         if self.published and not self.overwrite:
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
+
+
+_open: set[Draft] = set()
+"""Drafts that are neither published nor discarded."""
+
+
+@atexit.register
+def _discard_all() -> None:
+    """At the end of the process: what an interrupt in the middle of cleaning up has left."""
+    for draft in list(_open):
+        draft.discard()
 
 
 def is_stream(target: Path) -> bool:
@@ -134,16 +149,17 @@ def publish_together(drafts: Sequence[Draft]) -> None:
     On an error the earlier ones are removed again, except those that replaced an older file.
     """
     done: list[Draft] = []
-    try:
-        for draft in drafts:
-            draft.publish(same_is_fine=draft is not drafts[-1])
-            done.append(draft)
-    except BaseException:
-        for draft in done:
-            draft.withdraw()
-        for draft in drafts:
-            draft.discard()
-        raise
+    with uninterrupted():
+        try:
+            for draft in drafts:
+                draft.publish(same_is_fine=draft is not drafts[-1])
+                done.append(draft)
+        except BaseException:
+            for draft in done:
+                draft.withdraw()
+            for draft in drafts:
+                draft.discard()
+            raise
 
 
 def remove_stale(folder: Path) -> list[Path]:

@@ -15,6 +15,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 
 
@@ -67,6 +68,7 @@ def widen(values: np.ndarray) -> np.ndarray:
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
     try:
+        interrupts.check()
         yield
     except InputError as error:
         if str(error).startswith(str(path)):
@@ -75,6 +77,7 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{path}: points {start} to {stop} cannot be read: {error.strerror or error}") from error
     except Exception as error:
+        interrupts.check()  # it may come from an interrupt inside the decoder
         raise _undecodable(path, start, stop, error) from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # lazrs raises this when its Rust code panics

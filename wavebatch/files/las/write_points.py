@@ -13,6 +13,7 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
@@ -66,6 +67,7 @@ class PointFile:
         """Append records (m,) of `dtype`."""
         if rows.dtype != self.dtype:
             raise InputError(f"{self.target}: rows of another layout than the file's; this is a bug, please report it")
+        interrupts.check()
         if not len(rows):
             return
         rows = np.ascontiguousarray(rows)
