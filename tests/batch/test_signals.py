@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any instant of any command: exit code 130, one line, no temporary file, nothing half written."""
+"""Ctrl-C and SIGTERM at any instant of any command: exit code 130, one line, no temporary file, nothing half done."""
 
 import os
 import random

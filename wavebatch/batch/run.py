@@ -18,13 +18,14 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
-from wavebatch.batch.preflight import check_outputs
+from wavebatch.batch.preflight import check_outputs, find_inputs
 from wavebatch.batch.processes import WorkerDied, Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import remove_stale, reporting
 
 
@@ -100,7 +101,8 @@ def run_batch(
     """
     start = time.perf_counter()
     check_outputs(jobs, options)
-    with Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs) as workers:
+    workers = Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs)
+    with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)

@@ -16,15 +16,18 @@ import click
 
 from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, one_line, print_json, talk
 from wavebatch.cli.options import (
+    OutputPath,
     calibration_option,
     chain_options,
     common_options,
+    output_option,
     read_sensor,
     sensor_options,
     strip_options,
     system_option,
 )
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import refuse_input
 
 EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
 """Some strips failed; all strips failed."""
@@ -45,8 +48,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
-@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path),
-              metavar="DIR", help="Folder for clouds and reports; created if it does not exist.")
+@output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
 @chain_options
 @click.option("--tolerance", metavar="LENGTH",
               help="For each strip, choose the cheapest shipped chain whose predicted range error is at most this, "
@@ -75,7 +77,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
               help="Waveforms processed at once. The result does not depend on it.  [default: by their length]")
 @click.option("--resume", is_flag=True, help="Skip strips whose output is complete and up to date; redo the others.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done with each strip; write nothing.")
-@click.option("--report", type=click.Path(dir_okay=False, allow_dash=True), metavar="FILE",
+@click.option("--report", type=OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
               help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
@@ -99,6 +101,8 @@ def run(**options: Any) -> None:
         os.environ.setdefault(name, "1")
     _check_options(options)
     jobs, batch_options = _plan(options)
+    if options["report"] not in (None, "-"):
+        _check_report(Path(options["report"]), jobs, batch_options)
     if options["dry_run"]:
         sys.exit(_dry_run(jobs, batch_options))
     try:
@@ -121,6 +125,16 @@ def _check_options(options: dict[str, Any]) -> None:
         raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
     if report == "-" and options["progress"] == "json":
         raise ConfigError("--report - and --progress json would both write to stdout; give the report a file")
+
+
+def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
+    """Raises ConfigError if the summary would replace a file that is read or written by this run."""
+    from wavebatch.batch.preflight import find_outputs
+
+    refuse_input(report)
+    outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
+    if os.path.realpath(report) in outputs:
+        raise ConfigError(f"--report: {report} is an output of a strip; choose another name")
 
 
 _PASSED_ON = (

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 @click.command()
 @strip_argument
 @output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
-@click.option("--chain", "chain_file", type=click.Path(dir_okay=False, path_type=Path), metavar="CHAIN.toml",
-              help="Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.")
+@output_option("Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.",
+               "CHAIN.toml", "--chain", "chain_file", required=False)
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
               help="Waveforms to look at, spread over the strip.  [default: 8192, fewer if they are long]")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",

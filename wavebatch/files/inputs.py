@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protect
 
 SUFFIXES = (".las", ".laz")
 
@@ -27,6 +28,7 @@ def find_files(arguments: Iterable[str]) -> list[Path]:
     for argument in arguments:
         for path in _expand(argument, Path()):
             files.setdefault(path.resolve(), path)
+    protect(files.values())
     return list(files.values())
 
 
@@ -71,6 +73,7 @@ def _is_strip(path: Path) -> bool:
 
 
 def _read_list(path: Path) -> Iterator[Path]:
+    protect([path])
     try:
         lines = path.read_text("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

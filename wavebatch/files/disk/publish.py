@@ -19,6 +19,7 @@ from typing import BinaryIO
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
+from wavebatch.files.disk.protect import refuse_input
 
 try:
     import fcntl
@@ -54,7 +55,8 @@ class Draft:
     """A file that is being written: `file` is open under a temporary name, also for reading, and locked.
 
     target: its final name. overwrite: whether publishing replaces an existing file.
-    Raises InputError if the folder cannot be written, or the name is that of a device or a pipe.
+    Raises InputError if the folder cannot be written, or the name is that of a device or a pipe, and ConfigError if the
+    target is an input (see `protect`).
     """
 
     def __init__(self, target: Path, *, overwrite: bool) -> None:
@@ -62,6 +64,7 @@ class Draft:
         self.overwrite = overwrite
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
+        refuse_input(self.target)
         with uninterrupted(), reporting(self.target):
             self.path, descriptor = _create(self.target.parent)
             self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
@@ -135,6 +138,13 @@ def open_stream(target: Path) -> BinaryIO:
     if hasattr(os, "set_blocking"):
         os.set_blocking(descriptor, True)
     return os.fdopen(descriptor, "wb")
+
+
+def check_target(target: Path, *, overwrite: bool) -> None:
+    """Raise, before long work, what `Draft` and `publish` would raise after it: the target is an input, or exists."""
+    refuse_input(target)
+    if not overwrite:
+        refuse_existing(target)
 
 
 def refuse_existing(target: Path) -> None:

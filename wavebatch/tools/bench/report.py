@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
+from wavebatch.files.text_file import write_text
 from wavebatch.tools.bench.plot import can_plot, plot_scene
 
 Column = tuple[str, str, float, int]
@@ -210,8 +211,8 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
     """
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "bench.json").write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", "utf-8")
-        (folder / "bench.txt").write_text(text + "\n", "utf-8")
+        write_text(folder / "bench.json", json.dumps(document, indent=1, sort_keys=True) + "\n", overwrite=True)
+        write_text(folder / "bench.txt", text + "\n", overwrite=True)
         written = ["bench.json", "bench.txt"]
         if can_plot():
             for section in document["scenes"]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.publish import reporting
 from wavebatch.files.figure_file import open_picture, plain_text
+from wavebatch.files.text_file import write_text
 from wavebatch.tools.bench.plot import can_plot
 from wavebatch.tools.bench.real.agreement import Agreement
 from wavebatch.tools.bench.real.measure import RealReport
@@ -168,8 +169,8 @@ def write_report(report: RealReport, folder: Path) -> str:
     stem = f"real-{Path(report.strip).stem}"
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{stem}.json").write_text(to_text(report.to_json()) + "\n", "utf-8")
-        (folder / f"{stem}.txt").write_text(format_report(report) + "\n", "utf-8")
+        write_text(folder / f"{stem}.json", to_text(report.to_json()) + "\n", overwrite=True)
+        write_text(folder / f"{stem}.txt", format_report(report) + "\n", overwrite=True)
     names = [f"{stem}.json", f"{stem}.txt"]
     if not can_plot():
         return f"{folder}: {', '.join(names)}; no plot without matplotlib: pip install 'wavebatch[plot]'"
