@@ -171,6 +171,7 @@ class _Batch:
             strip = StripTask(queue.popleft(), self._options, alone)
             self._active.append(strip)
             with self._failing(strip):
+                strip.claim()
                 report = strip.start()
                 self._tell({"event": "start", "strip": str(strip.job.path)})
                 if report is None:
@@ -228,6 +229,7 @@ class _Batch:
             self._end(strip, Outcome(strip.job, "failed", error=error), again=strip is not unfinished[0])
 
     def _end(self, strip: StripTask, outcome: Outcome, *, again: bool = False) -> None:
+        strip.release()
         if strip in self._active:
             self._active.remove(strip)
         self.outcomes[outcome.job.path] = outcome

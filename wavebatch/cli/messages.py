@@ -104,10 +104,30 @@ def printable(text: str) -> str:
 
 def print_json(value: Any) -> None:
     """Prints `value` as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
+    click.echo(format_json(value))
+
+
+def format_json(value: Any) -> str:
+    """The value as JSON text with sorted keys; NaN becomes null."""
     from wavebatch.core.no_data import without_nan
 
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
-    click.echo(text.encode(errors="backslashreplace").decode())
+    return text.encode(errors="backslashreplace").decode()
+
+
+def print_safely(text: str) -> bool:
+    """Prints the text on stdout; if that fails, says so once, drops all later output and returns False.
+
+    For a batch: a reader that has gone or a full disk must not stop it.
+    """
+    try:
+        click.echo(text.encode(errors="backslashreplace").decode())
+        return True
+    except (OSError, ValueError) as error:
+        talk(f"error: stdout: cannot be written: {getattr(error, 'strerror', None) or error}")
+        with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
+            os.dup2(nothing.fileno(), sys.stdout.fileno())  # else Python would fail with what is left at its end
+        return False
 
 
 def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
@@ -143,6 +163,9 @@ def row(name: str, values: Iterable[Any], form: str = "", *, width: int = 10) ->
 def one_line(error: BaseException) -> str:
     """The error's message on one line; a bug also shows its type."""
     text = printable(" ".join(str(error).split()))
+    if isinstance(error, OSError) and error.strerror:  # of a disk or a network, wherever it comes
+        place = "" if error.filename is None else f"{printable(os.fsdecode(error.filename))}: "
+        return f"{place}{error.strerror}; check disk and permissions"
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
@@ -193,6 +216,8 @@ class Progress:
         if kind == "auto":
             kind = "bar" if sys.stderr.isatty() and level >= 0 else "none"
         self._json = kind == "json"
+        self.is_written = True
+        """Whether all events could be written to stdout."""
         self._level = level
         self._debug = debug
         self._sizes = {str(path): _size(path) for path in strips}
@@ -216,7 +241,7 @@ class Progress:
         error = event.get("error")
         if self._json:
             plain = event if error is None else {**event, "error": one_line(error)}
-            click.echo(json.dumps(plain, sort_keys=True, ensure_ascii=False))
+            self._json = self.is_written = print_safely(json.dumps(plain, sort_keys=True, ensure_ascii=False))
         kind, strip = event["event"], event["strip"]
         if self._bar is not None:
             share = event["done"] / event["of"] if kind == "unit" else float(kind != "start")
@@ -251,7 +276,7 @@ class Progress:
 def _size(path: Path) -> int:
     try:
         return os.path.getsize(path)
-    except OSError:
+    except (OSError, ValueError):
         return 0
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, one_line, print_json, talk
+from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, format_json, one_line, print_safely, talk
 from wavebatch.cli.options import (
     OutputPath,
     calibration_option,
@@ -26,11 +26,11 @@ from wavebatch.cli.options import (
     strip_options,
     system_option,
 )
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
-EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
-"""Some strips failed; all strips failed."""
+EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
+"""All strips are written, but --report or stdout could not be; some strips failed; all strips failed."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
@@ -92,6 +92,7 @@ def run(**options: Any) -> None:
     \b
     Exit codes:
       0    all strips are written
+      1    all strips are written, but --report or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
       3    some strips failed, the others are written
       4    all strips failed
@@ -173,7 +174,6 @@ def _read_tolerance(text: str | None) -> float | None:
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch.report_file import write_json
     from wavebatch.batch.run import run_batch
 
     level = -1 if options["quiet"] else int(options["verbose"])
@@ -183,14 +183,26 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
         talk(f"{timing['elapsed_seconds']:.1f} s elapsed; of the processes' time: {parts}")
-    if options["report"] == "-":
-        print_json(result.to_json())
-    elif options["report"]:
-        write_json(Path(options["report"]), result.to_json(), overwrite=True)
+    is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     errors = [outcome.error for outcome in result.outcomes]
     if errors and all(isinstance(error, ConfigError) for error in errors):
         return EXIT_USAGE
-    return exit_code(result.failed, len(jobs))
+    return exit_code(result.failed, len(jobs)) or (0 if is_reported else EXIT_UNREPORTED)
+
+
+def _report(document: dict[str, Any], target: str | None) -> bool:
+    """Writes the summary; returns whether that worked. The clouds are written, whatever becomes of it."""
+    from wavebatch.batch.report_file import write_json
+
+    if target == "-":
+        return print_safely(format_json(document))
+    try:
+        if target is not None:
+            write_json(Path(target), document, overwrite=True)
+    except InputError as error:
+        talk(f"error: --report: {one_line(error)}")
+        return False
+    return True
 
 
 def exit_code(failed: int, strips: int) -> int:

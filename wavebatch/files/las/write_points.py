@@ -107,14 +107,24 @@ class PointFile:
 
     def commit(self) -> None:
         """Complete and publish the file with all that belongs to it; on an error nothing of it remains."""
+        self.complete()
+        self.publish()
+
+    def complete(self) -> int:
+        """Complete the file under its temporary name, and return its size; on an error nothing of it remains."""
         try:
             self.finish_points()
             self._append_records()
             self.finish()
-            publish_together(self.drafts)
+            with self._guarded():
+                return self.draft.file.seek(0, 2)
         except BaseException:
             self.abort()
             raise
+
+    def publish(self, *more: Draft) -> None:
+        """Publish the complete file, and the drafts that belong to it after it; on an error nothing of them remains."""
+        publish_together([*self.drafts, *more])
 
     def _append_records(self) -> None:
         """Place for subclasses to append extended records and further drafts."""
