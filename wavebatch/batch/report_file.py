@@ -96,9 +96,14 @@ def describe_chain(prepared: Prepared) -> dict[str, Any]:
 
 
 def build_document(
-    prepared: Prepared, described: Mapping[str, Any], report: RunReport, cloud: Path, dropped: Mapping[str, str]
+    prepared: Prepared,
+    described: Mapping[str, Any],
+    report: RunReport,
+    cloud: Path,
+    size: int,
+    dropped: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Build the report of a strip whose cloud is published.
+    """Build the report of a strip whose cloud is complete.
 
     Parameters
     ----------
@@ -107,6 +112,8 @@ def build_document(
         From `describe_job`.
     report : RunReport
     cloud : Path
+    size : int
+        Of the cloud [bytes].
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
 
@@ -134,7 +141,7 @@ def build_document(
         },
         "output": {
             "file": cloud.name,
-            "size": cloud.stat().st_size,
+            "size": size,
             "point_format": layout.point_format,
             "columns": {written.column: written.record.name for written in layout.written},
             "not_computed": explain_absence(prepared),
@@ -155,9 +162,14 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
     """Write a JSON file, whole or not at all; raises InputError where it exists or cannot be written."""
+    write_text(path, format_json(document), overwrite=overwrite)
+
+
+def format_json(document: Mapping[str, Any]) -> str:
+    """Return the text of a JSON file."""
     text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False)
     # Bytes of file names that are not UTF-8 are lone surrogates in Python; JSON can escape them.
-    write_text(path, text.encode(errors="backslashreplace").decode() + "\n", overwrite=overwrite)
+    return text.encode(errors="backslashreplace").decode() + "\n"
 
 
 def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:

@@ -15,14 +15,33 @@ from typing import BinaryIO
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a file for reading; raises InputError for a folder, a device or a pipe, which could block for ever."""
-    if not stat.S_ISREG(os.stat(path).st_mode):
+    try:
+        mode = os.stat(path).st_mode
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read: no file can have this name ({error})") from error
+    if stat.S_ISDIR(mode):
+        os.scandir(path).close()  # a folder that cannot be read was meant as one: its error says more
+    if not stat.S_ISREG(mode):
         raise InputError(f"{path}: cannot be read: it is a folder, a pipe or a device; give a file")
     return open(path, "rb")
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn an error of the operating system while a file is opened into one InputError line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except OSError as error:
+        name = error.filename or path
+        raise InputError(f"{name}: cannot be read: {error.strerror or error}; check disk and permissions") from error
 
 
 def damaged(path: Path, what: str) -> InputError:
@@ -67,6 +86,7 @@ def widen(values: np.ndarray) -> np.ndarray:
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
     try:
+        interrupts.check()
         yield
     except InputError as error:
         if str(error).startswith(str(path)):
@@ -75,6 +95,7 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"{path}: points {start} to {stop} cannot be read: {error.strerror or error}") from error
     except Exception as error:
+        interrupts.check()  # it may come from an interrupt inside the decoder
         raise _undecodable(path, start, stop, error) from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # lazrs raises this when its Rust code panics

@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.disk.raw_bytes import reading, take_records, widen
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
 from wavebatch.files.strip.packet_check import INDEX_BITS, Judge
@@ -108,7 +108,8 @@ class StripReader(Closing):
 
     def __init__(self, path: Path | str, *, direction: str = "auto", headerless: bool = False) -> None:
         check_option(direction)
-        self._open(find_facts(Path(path), direction, headerless))
+        with reading(Path(path)):
+            self._open(find_facts(Path(path), direction, headerless))
 
     @classmethod
     def reopen(cls, facts: StripFacts) -> StripReader:
