@@ -169,7 +169,8 @@ def test_a_report_that_cannot_be_published_takes_its_cloud_back_or_says_what_is_
     real = getattr(os, name)
     monkeypatch.setattr(publish.os, name, refuse)
     outcome = run_one("good.las", "out", batch={"overwrite": overwrite})
-    assert outcome.status == "failed" and "good.report.json: cannot be written: Input/output error" in str(outcome.error)
+    assert outcome.status == "failed"
+    assert "good.report.json: cannot be written: Input/output error" in str(outcome.error)
     if overwrite:
         assert "good.laz: replaced before that, and complete" in str(outcome.error)
         assert [path.name for path in Path("out").iterdir()] == ["good.laz"]
