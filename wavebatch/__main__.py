@@ -1,6 +1,21 @@
-"""`python -m wavebatch`."""
+"""`python -m wavebatch`, and the program `wavebatch`.
 
-from wavebatch.cli import main
+Before you change it: it must import almost nothing before `guard`, so that Ctrl-C during the imports ends as usual.
+"""
+
+from wavebatch.core.interrupts import guard
+
+
+def main() -> None:
+    """Run the command line."""
+    guard(_run)
+
+
+def _run() -> None:
+    from wavebatch.cli import main
+
+    main.main()
+
 
 if __name__ == "__main__":
     main()

@@ -526,7 +526,7 @@ def test_an_output_is_refused_or_replaced_and_never_the_strip(forest, tmp_path):
         voxelize(strip, tmp_path / "v.npz", 1.0)
     voxelize(strip, tmp_path / "v.npz", 1.0, overwrite=True)
     before = strip.read_bytes()
-    with pytest.raises(InputError, match="is the strip itself"):
+    with pytest.raises(ConfigError, match="would replace this input"):
         voxelize(strip, strip, 1.0, overwrite=True)
     with pytest.raises(ConfigError, match=r"\.npz, \.las or \.laz"):
         voxelize(strip, tmp_path / "v.tif", 1.0)

@@ -12,10 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.report_file import cloud_path
+from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 
@@ -62,15 +63,24 @@ def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]
 
 def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
     """Raise ConfigError where an output would replace an input."""
-    inputs = {os.path.realpath(job.path): job.path for job in jobs}
-    for job in jobs:
-        targets = [cloud_path(job, options.folder)]
-        if job.options.keep_packets:
-            targets.append(targets[0].with_suffix(".wdp"))
-            inputs.setdefault(os.path.realpath(job.path.with_suffix(".wdp")), job.path.with_suffix(".wdp"))
-        for target in targets:
-            if os.path.realpath(target) in inputs:
-                raise ConfigError(f"{target}: the output would replace this input; choose another output folder")
+    with protecting(find_inputs(jobs)):
+        for job in jobs:
+            for target in find_outputs(job, options.folder):
+                refuse_input(target)
+
+
+def find_inputs(jobs: Sequence[StripJob]) -> list[Path]:
+    """Return the files that the jobs read."""
+    files = {path for job in jobs for path in (job.path, job.sensor.trajectory) if path is not None}
+    return sorted(map(Path, files))
+
+
+def find_outputs(job: StripJob, folder: Path) -> list[Path]:
+    """Return the files that the job may write."""
+    cloud = cloud_path(job, folder)
+    packets = [cloud.with_suffix(".wdp")] if job.options.keep_packets else []
+    flight = [flight_path(folder)] if job.request.flight else []
+    return [cloud, report_path(job, folder), *packets, *flight]
 
 
 def flight_path(folder: Path) -> Path:

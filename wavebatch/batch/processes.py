@@ -1,7 +1,9 @@
 """Worker processes on this machine; with one job, the same calls run in this process.
 
 `run` submits all work through it, or through `dask_cluster.Cluster`, which has the same methods.
-Before you change it: workers must end with this process, however it ends, or they would go on writing.
+Before you change it: workers must end with this process, however it ends, or they would go on writing. Any worker may
+be killed or stopped at any instant, also while it sends a result: nothing here may wait for a worker without a limit,
+except for the result of a call of a process that is alive.
 """
 
 from __future__ import annotations
@@ -9,10 +11,16 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import pickle
+import queue
 import signal
 import threading
+import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, wait
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +29,21 @@ from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 """Each process works on one thread: more threads than cores only wait for each other."""
+_POLL = 1.0
+"""Seconds between two looks at the processes, for a death that their pipes do not show."""
+_PATIENCE = 3.0
+"""Seconds that processes have to end by themselves."""
+
+
+class WorkerDied(Exception):
+    """A worker process ended while it made a call: killed, or out of memory."""
 
 
 class Workers:
     """Runs functions in worker processes, or at once in this process for one job; a context manager.
 
     The processes are spawned, so that they inherit no state, use one thread each, and end when this process ends.
+    A future whose process dies gets WorkerDied; the other processes go on, and the next `submit` starts a new one.
 
     Parameters
     ----------
@@ -41,8 +58,8 @@ class Workers:
         self.limit = 1 if jobs == 1 else 2 * jobs
         """Most calls that may be under way; two per process keep it busy while results are written."""
         keep_freed_memory()
-        self._before = set(multiprocessing.active_children())
-        self._pool: ProcessPoolExecutor | None = None
+        self._calls: queue.SimpleQueue[_Call | None] = queue.SimpleQueue()
+        self._workers: list[_Worker] = []
         self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
 
@@ -50,40 +67,125 @@ class Workers:
         self._scratch = self._stack.enter_context(owning_scratch())
         return self
 
-    def __exit__(self, kind: type | None, *error: object) -> None:
+    def __exit__(self, *error: object) -> None:
         with self._stack:
-            if kind is None:
-                self._shut(cancel=False)
-            else:
-                self.restart()
+            self._end()
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         if self.jobs == 1:
             return settle(Future(), function, *arguments)
-        if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(
-                self.jobs, mp_context=context, initializer=_start_worker, initargs=(self._scratch,)
-            )
-        with _single_threaded():
-            return self._pool.submit(function, *arguments)
+        self._workers = [worker for worker in self._workers if worker.serves]
+        with _single_threaded(), _ctrl_c_held():
+            while len(self._workers) < self.jobs:
+                self._workers.append(_Worker(self._calls, self._scratch))
+        call = _Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
+        self._calls.put(call)
+        return call.future
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those that are done."""
-        return wait(futures, return_when=FIRST_COMPLETED).done
+        futures = list(futures)
+        while not (done := wait(futures, timeout=_POLL, return_when=FIRST_COMPLETED).done):
+            for worker in self._workers:
+                worker.look()
+            if not any(worker.serves for worker in self._workers):  # calls that no process has taken
+                for future in futures:
+                    _settle(future, error=WorkerDied())
+        return done
 
     def restart(self) -> None:
-        """End all processes at once, for example after one has died; the next `submit` starts new ones."""
-        if self._pool is not None:
-            for child in set(multiprocessing.active_children()) - self._before:
-                child.kill()
-        self._shut(cancel=True)
+        """End all processes, with the calls that they make; the next `submit` starts new ones."""
+        for worker in self._workers:
+            worker.process.kill()
+        self._end()
 
-    def _shut(self, cancel: bool) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=cancel)
-            self._pool = None
+    def _end(self) -> None:
+        """End all processes: those that wait for a call by themselves, all others at once."""
+        for worker in self._workers:
+            if worker.call is not None:
+                worker.process.kill()
+            self._calls.put(None)
+        deadline = time.monotonic() + _PATIENCE
+        for worker in self._workers:
+            worker.process.join(max(deadline - time.monotonic(), 0))
+        for worker in self._workers:
+            worker.process.kill()  # also one that is stopped
+            worker.process.join(_PATIENCE)
+        self._workers, self._calls = [], queue.SimpleQueue()
+
+
+class _Call:
+    def __init__(self, pickled: bytes) -> None:
+        self.pickled = pickled
+        self.future: Future = Future()
+
+
+class _Worker:
+    """A process, and the thread that hands it calls and takes its results through a pipe of its own.
+
+    One pipe per process: a process that dies in the middle of a result cannot block the results of the others.
+    """
+
+    def __init__(self, calls: queue.SimpleQueue[_Call | None], scratch: Path | None) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, there = context.Pipe()
+        self._calls = calls
+        self.call: _Call | None = None
+        """The call under way."""
+        self.serves = True
+        """Whether it takes calls."""
+        self._seen_dead = False
+        self.process = context.Process(target=_work, args=(there, scratch), daemon=True)
+        try:
+            self.process.start()
+        finally:
+            there.close()  # else a dead process would leave the pipe open
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        try:
+            while (call := self._calls.get()) is not None:
+                if not call.future.set_running_or_notify_cancel():
+                    continue
+                self.call = call
+                self._pipe.send_bytes(call.pickled)
+                result, error = _unpack(self._pipe.recv_bytes())
+                self.call = None
+                _settle(call.future, result, error)
+        except (EOFError, OSError):  # the process is dead
+            self.serves = False
+            _settle(call.future, error=WorkerDied())
+        finally:
+            self.serves = False
+            self._pipe.close()
+
+    def look(self) -> None:
+        """Give the call of a dead process up, where another process still holds its end of the pipe open."""
+        if self.process.is_alive():
+            return
+        call = self.call
+        if self._seen_dead:  # a second look: its thread had time to take the last result
+            self.serves = False
+            if call is not None:
+                _settle(call.future, error=WorkerDied())
+        self._seen_dead = True
+
+
+def _unpack(answer: bytes) -> tuple[Any, BaseException | None]:
+    try:
+        return pickle.loads(answer)
+    except Exception as error:
+        return None, error
+
+
+def _settle(future: Future, result: Any = None, error: BaseException | None = None) -> None:
+    """Give the future its end, unless it has one."""
+    with contextlib.suppress(InvalidStateError):
+        if error is None:
+            future.set_result(result)
+        else:
+            future.set_exception(error)
 
 
 def settle(future: Future, function: Callable, *arguments: Any) -> Future:
@@ -108,14 +210,46 @@ def _single_threaded() -> Iterator[None]:
         os.environ.update(before)
 
 
-def _start_worker(scratch: Path | None) -> None:
-    """In a new process: leave Ctrl-C to the parent process, and end when the parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+@contextlib.contextmanager
+def _ctrl_c_held() -> Iterator[None]:
+    """Processes that are started inside do not see Ctrl-C, which a terminal sends to them too."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # the start of the first process would do it, and let the signals through
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _work(pipe: Connection, scratch: Path | None) -> None:
+    """In a new process: make calls until the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     use_scratch(scratch)
     keep_freed_memory()
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _answer(pickled: bytes) -> bytes:
+    """The pickled result and error of a call."""
+    try:
+        function, arguments = pickle.loads(pickled)
+        return pickle.dumps((function(*arguments), None), pickle.HIGHEST_PROTOCOL)
+    except Exception as error:
+        error.add_note(traceback.format_exc())
+        return _pickle_error(error)
+
+
+def _pickle_error(error: Exception) -> bytes:
+    try:
+        return pickle.dumps((None, error))
+    except Exception:
+        return pickle.dumps((None, RuntimeError(repr(error))))
 
 
 def _end_with(parent: Any) -> None:

@@ -93,9 +93,14 @@ def describe_chain(prepared: Prepared) -> dict[str, Any]:
 
 
 def build_document(
-    prepared: Prepared, described: Mapping[str, Any], report: RunReport, cloud: Path, dropped: Mapping[str, str]
+    prepared: Prepared,
+    described: Mapping[str, Any],
+    report: RunReport,
+    cloud: Path,
+    size: int,
+    dropped: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Build the report of a strip whose cloud is published.
+    """Build the report of a strip whose cloud is complete.
 
     Parameters
     ----------
@@ -104,6 +109,8 @@ def build_document(
         From `describe_job`.
     report : RunReport
     cloud : Path
+    size : int
+        Of the cloud [bytes].
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
 
@@ -113,7 +120,7 @@ def build_document(
         Plain values for JSON; all but `timing` is the same for every run.
     """
     facts, layout = prepared.facts, prepared.layout
-    packets, file, size = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
+    packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     lost = {**layout.dropped, **dropped}
     return {
         "schema": STRIP_SCHEMA,
@@ -123,12 +130,12 @@ def build_document(
             "las_version": facts.version,
             "point_format": facts.header.point_format,
             "points": facts.header.point_count,
-            "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": size},
+            "packets": {"file": file.name if file else None, "internal": packets.internal, "bytes": stored},
             **describe_strip(prepared, described),
         },
         "output": {
             "file": cloud.name,
-            "size": cloud.stat().st_size,
+            "size": size,
             "point_format": layout.point_format,
             "columns": {written.column: written.record.name for written in layout.written},
             "not_computed": explain_absence(prepared),
@@ -149,9 +156,14 @@ def build_timing(report: RunReport) -> dict[str, Any]:
 
 def write_json(path: Path, document: Mapping[str, Any], *, overwrite: bool) -> None:
     """Write a JSON file, whole or not at all; raises InputError where it exists or cannot be written."""
+    write_text(path, format_json(document), overwrite=overwrite)
+
+
+def format_json(document: Mapping[str, Any]) -> str:
+    """Return the text of a JSON file."""
     text = json.dumps(document, indent=2, sort_keys=True, ensure_ascii=False)
     # Bytes of file names that are not UTF-8 are lone surrogates in Python; JSON can escape them.
-    write_text(path, text.encode(errors="backslashreplace").decode() + "\n", overwrite=overwrite)
+    return text.encode(errors="backslashreplace").decode() + "\n"
 
 
 def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> RunReport | None:

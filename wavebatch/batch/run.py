@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,14 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
-from wavebatch.batch.preflight import check_outputs, flight_path, load_flight, with_flight
-from wavebatch.batch.processes import Workers
+from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
+from wavebatch.batch.processes import WorkerDied, Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob
+from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
+from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import remove_stale, reporting
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Survey
@@ -120,7 +121,8 @@ def run_batch(
     start = time.perf_counter()
     check_outputs(jobs, options)
     saved = load_flight(jobs, options)
-    with Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs) as workers:
+    workers = Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs)
+    with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)
@@ -177,6 +179,7 @@ class _Batch:
     def run(self) -> None:
         """Work until every strip has an outcome."""
         while self._submit() or self._active:
+            interrupts.check()
             heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
             try:
                 done = self._workers.wait(heads)
@@ -209,9 +212,12 @@ class _Batch:
             queue = self._again or self._waiting
             if not queue:
                 return None
+            if alone:
+                self._workers.restart()  # nothing else shall need memory
             strip = StripTask(queue.popleft(), self._options, alone)
             self._active.append(strip)
             with self._failing(strip):
+                strip.claim()
                 report = strip.start()
                 self._tell({"event": "start", "strip": str(strip.job.path)})
                 if report is None:
@@ -238,28 +244,27 @@ class _Batch:
         """An error inside ends this strip only."""
         try:
             yield
-        except BrokenProcessPool:
-            self._restart()
+        except WorkerDied:
+            self._try_again(strip)
         except BrokenExecutor as error:
             self._give_up(error)
         except Exception as error:
+            interrupts.check()  # it may come from an interrupt that compiled code has turned into an error
             strip.drop()
             self._end(strip, Outcome(strip.job, "failed", error=error))
 
-    def _restart(self) -> None:
-        """A process has died: a strip that was alone fails; several are tried again one by one, to find the cause."""
-        self._workers.restart()
-        strips, self._active = self._active, []
-        for strip in strips:
-            strip.drop()
-        if len(strips) > 1:
-            self._again.extend(strip.job for strip in strips)
+    def _try_again(self, strip: StripTask) -> None:
+        """A process died at this strip: it is tried once more, alone, because several may need too much memory."""
+        strip.drop()
+        if not strip.alone:
+            self._active.remove(strip)
+            self._again.append(strip.job)
             return
         error = InputError(
-            f"{strips[0].job.path}: a worker process died while it worked on this strip (killed, or out of memory); "
-            "run again with --resume and fewer --jobs or less --memory"
+            f"{strip.job.path}: a worker process died while it worked on this strip (killed, or out of memory), also "
+            "when it was tried again alone; run again with --resume and fewer --jobs or less --memory"
         )
-        self._end(strips[0], Outcome(strips[0].job, "failed", error=error))
+        self._end(strip, Outcome(strip.job, "failed", error=error))
 
     def _give_up(self, reason: BrokenExecutor) -> None:
         """No worker is left: all strips that are not written fail, for one reason that is reported once."""
@@ -272,6 +277,7 @@ class _Batch:
             self._end(strip, Outcome(strip.job, "failed", error=error), again=strip is not unfinished[0])
 
     def _end(self, strip: StripTask, outcome: Outcome, *, again: bool = False) -> None:
+        strip.release()
         if strip in self._active:
             self._active.remove(strip)
         self.outcomes[outcome.job.path] = outcome

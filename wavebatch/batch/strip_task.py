@@ -26,8 +26,9 @@ from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_unit
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.disk.publish import Claim, check_target
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.text_file import draft_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +68,24 @@ class StripTask:
         self._options = options
         self._submitted = 0
         self._blob = b""
+        self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
         self._second: SecondPass | None = None
         self._report = RunReport()
         self._described: dict[str, Any] = {}
         self._files: list[Path] = []
         self._state: list[tuple[int, int]] = []
+
+    def claim(self) -> None:
+        """Keep other runs from making these outputs until the end; raises InputError while another one makes them."""
+        folder = self._options.folder
+        self._claim = Claim(folder, self.job.path.stem)
+
+    def release(self) -> None:
+        """Let other runs make these outputs; may be called twice."""
+        if self._claim is not None:
+            self._claim.discard()
+            self._claim = None
 
     def start(self) -> RunReport | None:
         """Look at strip and outputs before any work.
@@ -94,11 +107,15 @@ class StripTask:
         self._files = [job.path] + ([packet_file] if packet_file not in (None, job.path) else [])
         self._state = self._stat()
         self._described = report_file.describe_job(job, take_fingerprint(job.path, packet_file))
-        if options.resume:
-            return report_file.read_current(job, options.folder, self._described)
-        refuse_existing(report_file.cloud_path(job, options.folder), options.overwrite)
-        refuse_existing(report_file.report_path(job, options.folder), options.overwrite)
+        if options.resume and (report := report_file.read_current(job, options.folder, self._described)) is not None:
+            return report
+        self._check_targets()
         return None
+
+    def _check_targets(self) -> None:
+        options = self._options
+        for target in (report_file.cloud_path, report_file.report_path):
+            check_target(target(self.job, options.folder), overwrite=options.overwrite or options.resume)
 
     @property
     def has_more(self) -> bool:
@@ -166,7 +183,7 @@ class StripTask:
         self._report += RunReport(no_data=no_data, timing={"write": time.perf_counter() - start})
 
     def finish(self) -> RunReport:
-        """Publish the cloud, then its report, which means that the cloud is complete.
+        """Publish the cloud, then its report, which means that the cloud is complete; both or none.
 
         Returns
         -------
@@ -191,12 +208,17 @@ class StripTask:
         cloud = report_file.cloud_path(job, options.folder)
         report = report_file.report_path(job, options.folder)
         replaces = options.overwrite or options.resume
-        if replaces:
-            report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
-        self._writer.commit()
+        size = self._writer.complete()
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
-        document = report_file.build_document(self.prepared, self._described, self._report, cloud, self._writer.dropped)
-        report_file.write_json(report, document, overwrite=replaces)
+        dropped = self._writer.dropped
+        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size, dropped)
+        draft = draft_text(report, report_file.format_json(document), overwrite=replaces)
+        try:
+            if replaces:
+                report.unlink(missing_ok=True)  # before the new cloud: an old report must not vouch for it
+            self._writer.publish(draft)
+        finally:
+            draft.discard()
         self.warnings = document["warnings"]
         self.prepared.scan.close()
         return self._report
@@ -213,6 +235,7 @@ class StripTask:
             self._second.close()
         if self.prepared is not None:
             self.prepared.scan.close()
+        self.release()
 
     def _stat(self) -> list[tuple[int, int]]:
         """Size and time of the input files, to see whether they change during the run."""

@@ -7,11 +7,13 @@
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 import click
 
 from wavebatch import __version__
 from wavebatch.cli.messages import NearestGroup
+from wavebatch.core.interrupts import guard
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("wavebatch.cli.run:run", "Decompose strips into enriched point clouds: the main job."),
@@ -34,6 +36,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 class LazyGroup(NearestGroup):
     """A group that takes its commands from COMMANDS and imports only the one that is called."""
+
+    def __call__(self, *args: Any, **options: Any) -> None:
+        """Runs the program; tests call `main` instead, which leaves the signals alone."""
+        guard(lambda: self.main(*args, **options))
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of COMMANDS."""

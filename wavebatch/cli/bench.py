@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import one_line, print_json, print_result, talk
-from wavebatch.cli.options import common_options, from_options, parse_length, seed_option
+from wavebatch.cli.options import common_options, from_options, output_option, parse_length, seed_option
 from wavebatch.core.errors import InputError
 
 
@@ -43,8 +43,8 @@ from wavebatch.core.errors import InputError
 @click.option("--real", is_flag=True,
               help="Inject echoes into the waveforms of each STRIP and count those found, count false echoes, and "
               "compare surveys of parts of the strip (not with --no-stability).")
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
-              help="Folder for bench.json, bench.txt and the plots. Existing files are replaced.")
+@output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
+               folder=True)
 @common_options("json", "quiet")
 def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, **options: Any) -> None:
     """Measure error and run time of all shipped chains, of CHAIN files (.toml) and of other decomposers.

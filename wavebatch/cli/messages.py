@@ -20,12 +20,11 @@ from typing import IO, Any
 
 import click
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError
 
 EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
-EXIT_INTERRUPTED = 130
-"""Ctrl-C or SIGTERM."""
 
 
 class WrongUsage(click.ClickException):
@@ -46,10 +45,22 @@ class WrongUsage(click.ClickException):
         click.echo(f"error: {self.message}", file=file, err=file is None)
 
 
+class Interrupted(click.ClickException):
+    """Ctrl-C or SIGTERM as one line and an exit code; click would say `Aborted!` and give 1."""
+
+    exit_code = interrupts.EXIT_INTERRUPTED
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(self.message, file=file, err=file is None)
+
+
 @contextlib.contextmanager
-def _usage_in_one_line() -> Iterator[None]:
+def _errors_in_one_line() -> Iterator[None]:
     try:
         yield
+    except KeyboardInterrupt:
+        raise Interrupted("interrupted") from None
     except click.UsageError as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
             raise
@@ -61,12 +72,12 @@ class NearestGroup(click.Group):
 
     def make_context(self, *args: Any, **options: Any) -> click.Context:
         """Parses the options of the group."""
-        with _usage_in_one_line():
+        with _errors_in_one_line():
             return super().make_context(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Parses and runs the command."""
-        with _usage_in_one_line():
+        with _errors_in_one_line():
             return super().invoke(ctx)
 
     def resolve_command(
@@ -93,11 +104,31 @@ def printable(text: str) -> str:
 
 def print_json(value: Any) -> None:
     """Prints `value` (plain, or a dataclass) as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
+    click.echo(format_json(value))
+
+
+def format_json(value: Any) -> str:
+    """The value (plain, or a dataclass) as JSON text with sorted keys; NaN becomes null."""
     from wavebatch.core.no_data import without_nan
 
     value = asdict(value) if is_dataclass(value) else value
     text = json.dumps(without_nan(value), allow_nan=False, indent=2, sort_keys=True, ensure_ascii=False)
-    click.echo(text.encode(errors="backslashreplace").decode())
+    return text.encode(errors="backslashreplace").decode()
+
+
+def print_safely(text: str) -> bool:
+    """Prints the text on stdout; if that fails, says so once, drops all later output and returns False.
+
+    For a batch: a reader that has gone or a full disk must not stop it.
+    """
+    try:
+        click.echo(text.encode(errors="backslashreplace").decode())
+        return True
+    except (OSError, ValueError) as error:
+        talk(f"error: stdout: cannot be written: {getattr(error, 'strerror', None) or error}")
+        with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
+            os.dup2(nothing.fileno(), sys.stdout.fileno())  # else Python would fail with what is left at its end
+        return False
 
 
 def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
@@ -133,6 +164,9 @@ def row(name: str, values: Iterable[Any], form: str = "", *, width: int = 10) ->
 def one_line(error: BaseException) -> str:
     """The error's message on one line; a bug also shows its type."""
     text = printable(" ".join(str(error).split()))
+    if isinstance(error, OSError) and error.strerror:  # of a disk or a network, wherever it comes
+        place = "" if error.filename is None else f"{printable(os.fsdecode(error.filename))}: "
+        return f"{place}{error.strerror}; check disk and permissions"
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
@@ -141,8 +175,8 @@ def one_line(error: BaseException) -> str:
 def report_errors(failure: int = 1) -> Callable:
     """Decorator of a command function: wavebatch's errors become one line on stderr and an exit code.
 
-    failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE, an
-    interrupt EXIT_INTERRUPTED. The command's option `debug` prints the traceback too.
+    failure: exit code for files that cannot be read or written, and for bugs; a ConfigError gives EXIT_USAGE. The
+    command's option `debug` prints the traceback too.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -152,10 +186,9 @@ def report_errors(failure: int = 1) -> Callable:
                 return function(*args, **options)
             except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
                 raise
-            except KeyboardInterrupt:
-                talk("interrupted")
-                sys.exit(EXIT_INTERRUPTED)
             except Exception as error:
+                if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this
+                    raise Interrupted("interrupted") from None
                 if options.get("debug"):
                     traceback.print_exc()
                 talk(f"error: {one_line(error)}")
@@ -184,6 +217,8 @@ class Progress:
         if kind == "auto":
             kind = "bar" if sys.stderr.isatty() and level >= 0 else "none"
         self._json = kind == "json"
+        self.is_written = True
+        """Whether all events could be written to stdout."""
         self._level = level
         self._debug = debug
         self._sizes = {str(path): _size(path) for path in strips}
@@ -207,7 +242,7 @@ class Progress:
         error = event.get("error")
         if self._json:
             plain = event if error is None else {**event, "error": one_line(error)}
-            click.echo(json.dumps(plain, sort_keys=True, ensure_ascii=False))
+            self._json = self.is_written = print_safely(json.dumps(plain, sort_keys=True, ensure_ascii=False))
         kind, strip = event["event"], event["strip"]
         if self._bar is not None:
             share = event["done"] / event["of"] if kind == "unit" else float(kind != "start")
@@ -244,7 +279,7 @@ class Progress:
 def _size(path: Path) -> int:
     try:
         return os.path.getsize(path)
-    except OSError:
+    except (OSError, ValueError):
         return 0
 
 

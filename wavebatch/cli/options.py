@@ -6,6 +6,8 @@ Every command of `wavebatch.cli` is built from these. An option with a short for
 
 from __future__ import annotations
 
+import functools
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
@@ -16,6 +18,7 @@ import click
 
 from wavebatch.cli.messages import report_errors
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protecting, refuse_input
 
 if TYPE_CHECKING:
     from wavebatch.surveying.calibration import Calibration
@@ -25,15 +28,21 @@ if TYPE_CHECKING:
 _Options = TypeVar("_Options")
 
 
+class OutputPath(click.Path):
+    """The type of every option that names a file or folder to write; `click.Path` is that of files to read."""
+
+
 def file_option(*names: str, text: str, metavar: str = "FILE", **more: Any) -> Callable:
     """An option whose value is a path; text: its help."""
     return click.option(*names, type=click.Path(path_type=Path), metavar=metavar, help=text, **more)
 
 
-def output_option(text: str, metavar: str = "FILE", *, required: bool = True) -> Callable:
-    """`-o`: the file to write; text: its help."""
-    kind = click.Path(dir_okay=False, path_type=Path)
-    return click.option("-o", "--output", required=required, type=kind, metavar=metavar, help=text)
+def output_option(
+    text: str, metavar: str = "FILE", *names: str, required: bool = True, folder: bool = False
+) -> Callable:
+    """`-o`, or the option of these names: the file or folder to write; text: its help."""
+    kind = OutputPath(dir_okay=folder, file_okay=not folder, path_type=Path)
+    return click.option(*(names or ("-o", "--output")), required=required, type=kind, metavar=metavar, help=text)
 
 
 def seed_option(text: str) -> Callable:
@@ -102,9 +111,34 @@ def common_options(*names: str, failure: int = 1) -> Callable:
     """
 
     def decorate(command: Callable) -> Callable:
-        return together(*(_COMMON[name] for name in (*names, "debug")))(report_errors(failure)(command))
+        return together(*(_COMMON[name] for name in (*names, "debug")))(report_errors(failure)(_protected(command)))
 
     return decorate
+
+
+def _protected(command: Callable) -> Callable:
+    """The command; its outputs never replace its inputs, nor each other."""
+
+    @functools.wraps(command)
+    def call(*args: Any, **options: Any) -> Any:
+        inputs: list[Any] = []
+        outputs: dict[str, Any] = {}
+        context = click.get_current_context()
+        for parameter in context.command.params:
+            value = context.params.get(parameter.name)
+            if isinstance(parameter.type, OutputPath):
+                if value not in (None, "-"):
+                    outputs.setdefault(os.path.realpath(value), []).append(value)
+            elif isinstance(parameter.type, click.Path):
+                inputs += value if isinstance(value, tuple) else [value]
+        with protecting(inputs):
+            for same in outputs.values():
+                refuse_input(same[0])
+                if len(same) > 1:
+                    raise ConfigError(f"{same[0]}: two outputs have this name; choose another for one of them")
+            return command(*args, **options)
+
+    return call
 
 
 def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:

@@ -138,8 +138,8 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     """  # fmt: skip
     from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
 
-    check_picture(output, overwrite=options["overwrite"])
     clouds = find_files(map(str, clouds))
+    check_picture(output, overwrite=options["overwrite"])
     selection = _select(column, options)
     how = {"log": options["log"], "overwrite": options["overwrite"]}
     if is_flags(clouds[0], column):
@@ -193,11 +193,11 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     """  # fmt: skip
     from wavebatch.tools.plots.raster import grid_values
 
+    clouds = find_files(map(str, clouds))
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
-    clouds = find_files(map(str, clouds))
     selection = _select(column, options)
     found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bounds"])
     from wavebatch.tools.plots.draw_cloud import draw_map

@@ -8,27 +8,29 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_INTERRUPTED, EXIT_USAGE, Progress, count, one_line, print_json, talk
+from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, format_json, one_line, print_safely, talk
 from wavebatch.cli.options import (
+    OutputPath,
     calibration_option,
     chain_options,
     common_options,
+    output_option,
     read_sensor,
     sensor_options,
     strip_options,
     system_option,
 )
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.disk.protect import refuse_input
 
-EXIT_SOME_FAILED, EXIT_NOTHING = 3, 4
-"""Some strips failed; all strips failed."""
+EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
+"""All strips are written, but --report or stdout could not be; some strips failed; all strips failed."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
@@ -46,8 +48,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
-@click.option("-o", "--output", required=True, type=click.Path(file_okay=False, path_type=Path),
-              metavar="DIR", help="Folder for clouds and reports; created if it does not exist.")
+@output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
 @chain_options
 @click.option("--tolerance", metavar="LENGTH",
               help="For each strip, choose the cheapest shipped chain whose predicted range error is at most this, "
@@ -79,7 +80,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
               help="Waveforms processed at once. The result does not depend on it.  [default: by their length]")
 @click.option("--resume", is_flag=True, help="Skip strips whose output is complete and up to date; redo the others.")
 @click.option("--dry-run", is_flag=True, help="Print what would be done with each strip; write nothing.")
-@click.option("--report", type=click.Path(dir_okay=False, allow_dash=True), metavar="FILE",
+@click.option("--report", type=OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
               help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
@@ -94,6 +95,7 @@ def run(**options: Any) -> None:
     \b
     Exit codes:
       0    all strips are written
+      1    all strips are written, but --report or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
       3    some strips failed, the others are written
       4    all strips failed
@@ -103,18 +105,15 @@ def run(**options: Any) -> None:
         os.environ.setdefault(name, "1")
     _check_options(options)
     jobs, batch_options = _plan(options)
+    if options["report"] not in (None, "-"):
+        _check_report(Path(options["report"]), jobs, batch_options)
     if options["dry_run"]:
         sys.exit(_dry_run(jobs, batch_options))
-    signal.signal(signal.SIGTERM, _interrupt)
     try:
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
-        talk("interrupted: finished clouds are complete, no partial file remains; --resume continues")
-        sys.exit(EXIT_INTERRUPTED)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
+        text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
+        raise Interrupted(text) from None
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -130,6 +129,16 @@ def _check_options(options: dict[str, Any]) -> None:
         raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
     if report == "-" and options["progress"] == "json":
         raise ConfigError("--report - and --progress json would both write to stdout; give the report a file")
+
+
+def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
+    """Raises ConfigError if the summary would replace a file that is read or written by this run."""
+    from wavebatch.batch.preflight import find_outputs
+
+    refuse_input(report)
+    outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
+    if os.path.realpath(report) in outputs:
+        raise ConfigError(f"--report: {report} is an output of a strip; choose another name")
 
 
 _PASSED_ON = (
@@ -169,7 +178,6 @@ def _read_tolerance(text: str | None) -> float | None:
 
 
 def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
-    from wavebatch.batch.report_file import write_json
     from wavebatch.batch.run import run_batch
 
     level = -1 if options["quiet"] else int(options["verbose"])
@@ -181,14 +189,26 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         talk(f"{timing['elapsed_seconds']:.1f} s elapsed; of the processes' time: {parts}")
         if result.advice:
             talk(result.advice)
-    if options["report"] == "-":
-        print_json(result.to_json())
-    elif options["report"]:
-        write_json(Path(options["report"]), result.to_json(), overwrite=True)
+    is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     errors = [outcome.error for outcome in result.outcomes]
     if errors and all(isinstance(error, ConfigError) for error in errors):
         return EXIT_USAGE
-    return exit_code(result.failed, len(jobs))
+    return exit_code(result.failed, len(jobs)) or (0 if is_reported else EXIT_UNREPORTED)
+
+
+def _report(document: dict[str, Any], target: str | None) -> bool:
+    """Writes the summary; returns whether that worked. The clouds are written, whatever becomes of it."""
+    from wavebatch.batch.report_file import write_json
+
+    if target == "-":
+        return print_safely(format_json(document))
+    try:
+        if target is not None:
+            write_json(Path(target), document, overwrite=True)
+    except InputError as error:
+        talk(f"error: --report: {one_line(error)}")
+        return False
+    return True
 
 
 def exit_code(failed: int, strips: int) -> int:

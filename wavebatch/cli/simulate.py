@@ -14,7 +14,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import count, counting, print_summary
-from wavebatch.cli.options import common_options, file_option, from_options, given_options, output_option, seed_option
+from wavebatch.cli.options import common_options, from_options, given_options, output_option, seed_option
 from wavebatch.tools.simulate import (
     CANOPIES,
     PULSES,
@@ -52,7 +52,7 @@ _internal = click.option("--internal/--external", default=True,
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
 @click.argument("scene")
 @_output
-@file_option("--truth", text="Write the true echoes to this .npz file.")
+@output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
 @seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), help="Bits per sample.  [default: 8]")

@@ -29,7 +29,7 @@ _SURVEYED = 2000
 @click.command(name="slice")
 @shared.strip_argument
 @shared.output_option("Write the segments: .csv or .geojson.", required=False)
-@shared.file_option("--png", text="Draw the first slice of --lines.")
+@shared.output_option("Draw the first slice of --lines.", "FILE", "--png", required=False)
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,

@@ -19,7 +19,7 @@ import click
 from wavebatch.cli.messages import print_json, row, talk
 from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option
 from wavebatch.core.errors import InputError
-from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
@@ -53,8 +53,9 @@ def stats(
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
+    files = find_files(map(str, clouds))
     if output is not None:
-        refuse_existing(output, overwrite)
+        check_target(output, overwrite=overwrite)
     divisions = [] if size is None else [Grid(size)]
     divisions += [] if polygons is None else [PolygonSet(load_polygons(polygons))]
     failed: list[InputError] = []
@@ -65,7 +66,6 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    files = find_files(map(str, clouds))
     each, total = count_returns(files, skip, divisions=divisions)
     if output is not None:
         write_text(output, _format_table(each, total), overwrite=overwrite)

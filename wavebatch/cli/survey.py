@@ -28,8 +28,8 @@ EXIT_PROBLEMS = 1
 @click.command()
 @click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
 @output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
-@click.option("--chain", "chain_file", type=click.Path(dir_okay=False, path_type=Path), metavar="CHAIN.toml",
-              help="Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.")
+@output_option("Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.",
+               "CHAIN.toml", "--chain", "chain_file", required=False)
 @click.option("--waveforms", type=click.IntRange(1), metavar="N",
               help="Waveforms to look at, spread over all strips.  [default: 8192, fewer if they are long]")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
@@ -52,17 +52,17 @@ def survey(
     Exit code: 0 done, 1 a strip cannot be surveyed or does not belong to the others, or a file cannot be written, 2
     wrong usage.
     """  # fmt: skip
-    from wavebatch.files.disk.publish import refuse_existing
+    from wavebatch.files.disk.publish import check_target
     from wavebatch.files.inputs import find_files
     from wavebatch.files.text_file import write_text
     from wavebatch.surveying.auto_chain import chain_text
     from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
+    paths = find_files(strips)
     for target in (output, chain_file):
         if target is not None:
-            refuse_existing(target, overwrite)
-    paths = find_files(strips)
+            check_target(target, overwrite=overwrite)
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
+from wavebatch.files.disk.publish import Draft, check_target, reporting
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,7 +60,7 @@ def check_picture(target: Path, *, overwrite: bool) -> None:
         raise ConfigError(f"{target}: unknown kind of picture; use {', '.join(_METADATA)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError(f"{target}: pictures need matplotlib: pip install 'wavebatch[plot]'")
-    refuse_existing(target, overwrite)
+    check_target(target, overwrite=overwrite)
 
 
 @contextlib.contextmanager

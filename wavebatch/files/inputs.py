@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protect
 from wavebatch.files.text_file import read_text
 
 SUFFIXES = (".las", ".laz")
@@ -21,13 +22,14 @@ def find_files(arguments: Iterable[str]) -> list[Path]:
 
     A folder gives its LAS and LAZ files by name, without those of subfolders. `@list.txt` holds one argument per line,
     relative to the folder of the list; empty lines and lines that start with # are skipped. A file that does not exist
-    is kept: it fails in its turn, so that the other files are still processed.
+    or a folder that cannot be read is kept: it fails in its turn, so that the other files are still processed.
     Raises ConfigError if a folder, pattern or list gives no file.
     """
-    files: dict[Path, Path] = {}
+    files: dict[str, Path] = {}
     for argument in arguments:
         for path in _expand(argument, Path()):
-            files.setdefault(path.resolve(), path)
+            files.setdefault(_real_name(path), path)
+    protect(files.values())
     return list(files.values())
 
 
@@ -52,9 +54,14 @@ def _expand(argument: str, folder: Path) -> Iterator[Path]:
         yield from _read_list(folder / argument[1:])
         return
     path = folder / argument
-    if path.is_dir():
-        found, problem = sorted(path.iterdir()), f"{path}: the folder holds"
-    elif path.exists() or not glob.has_magic(argument):
+    if os.path.isdir(path):
+        try:
+            names = os.listdir(path)
+        except OSError:  # it fails in its turn
+            yield path
+            return
+        found, problem = sorted(path / name for name in names), f"{path}: the folder holds"
+    elif os.path.exists(path) or not glob.has_magic(argument):
         yield path
         return
     else:
@@ -65,11 +72,19 @@ def _expand(argument: str, folder: Path) -> Iterator[Path]:
     yield from strips
 
 
+def _real_name(path: Path) -> str:
+    try:
+        return os.path.realpath(path)
+    except (OSError, ValueError):  # no file can have this name
+        return os.path.abspath(path)
+
+
 def _is_strip(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and path.is_file() and not path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES and os.path.isfile(path) and not path.name.startswith(".")
 
 
 def _read_list(path: Path) -> Iterator[Path]:
+    protect([path])
     for number, line in enumerate(read_text(path, "the list", 1 << 30).splitlines(), 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):

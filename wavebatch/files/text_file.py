@@ -38,12 +38,26 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
 
     With `overwrite`, a device or a pipe (/dev/null, /dev/stdout) gets the text directly.
     """
-    data = text.encode(errors="replace")  # a strip's file name may hold bytes that are not text
     if overwrite and is_stream(path):
         with reporting(path), open_stream(path) as stream:
-            stream.write(data)
+            stream.write(_encode(text))
         return
-    with Draft(path, overwrite=overwrite) as draft:
-        with reporting(path):
-            draft.file.write(data)
+    with draft_text(path, text, overwrite=overwrite) as draft:
         draft.publish()
+
+
+def draft_text(path: Path, text: str, *, overwrite: bool) -> Draft:
+    """Write a text file under a temporary name, to be published; raises InputError if it cannot be written."""
+    draft = Draft(path, overwrite=overwrite)
+    try:
+        with reporting(path):
+            draft.file.write(_encode(text))
+            draft.file.flush()
+    except BaseException:
+        draft.discard()
+        raise
+    return draft
+
+
+def _encode(text: str) -> bytes:
+    return text.encode(errors="replace")  # a strip's file name may hold bytes that are not text

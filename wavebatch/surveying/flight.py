@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -168,6 +169,7 @@ def read_samples(
     """
     samples = []
     for path in paths:
+        interrupts.check()
         try:
             with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
                 share = waveforms or sample_size(reader, scan)

@@ -7,7 +7,6 @@ path and nothing that depends on the number of processes into the file.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import (
@@ -48,17 +48,19 @@ class CloudWriter(PointFile):
     layout: from `plan_output`. target: its suffix selects LAS or LAZ.
     provenance: how the cloud was made; becomes JSON in a VLR of user id "wavebatch".
     `dropped` lists the records of the input that are not copied, and why.
-    Raises InputError if the target exists (without overwrite), is the input itself, or cannot be written.
+    Raises InputError if the target exists (without overwrite) or cannot be written, ConfigError if it is the input.
     """
 
     def __init__(
         self, layout: OutputLayout, target: Path, *, provenance: Mapping[str, Any], overwrite: bool = False
     ) -> None:
         self._layout = layout
-        self._refuse_input(Path(target))
+        packets = layout.packets
+        self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         header = _build_header(layout, provenance, self._evlrs)
-        super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
+        with protecting(self._inputs):
+            super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
     def _append_records(self) -> None:
         with reporting(self._layout.source.path), open(self._layout.source.path, "rb") as source:
@@ -75,17 +77,11 @@ class CloudWriter(PointFile):
                 self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
             packet_file = self.target.with_suffix(".wdp")
-            self._refuse_input(packet_file)
-            draft = Draft(packet_file, overwrite=self.draft.overwrite)
+            with protecting(self._inputs):
+                draft = Draft(packet_file, overwrite=self.draft.overwrite)
             self.drafts.insert(0, draft)
             draft.file.write(head)
             copy_bytes(source, packets.start, packets.end, draft.file)
-
-    def _refuse_input(self, target: Path) -> None:
-        packets = self._layout.packets
-        for path in (self._layout.source.path, *([packets.file] if packets else [])):
-            if target.exists() and os.path.samefile(target, path):
-                raise InputError(f"{target}: is the input itself; choose another output folder")
 
 
 def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, str]]:

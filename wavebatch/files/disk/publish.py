@@ -6,20 +6,27 @@ removes; a lock shows which of them are still in use.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import filecmp
+import hashlib
 import os
 import secrets
 import stat
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.disk import locks
+from wavebatch.files.disk.protect import refuse_input
 
 _PREFIX, _SUFFIX = ".wavebatch-", ".tmp"
+_CLAIM_PATIENCE = 0.5
+"""Seconds after which a lock is taken for that of another run."""
 _NO_LINKS = {errno.EPERM, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EMLINK, errno.EINVAL}
 
 
@@ -28,9 +35,9 @@ def reporting(target: Path) -> Iterator[None]:
     """Turn an error of the operating system while `target` is written into one InputError line."""
     try:
         yield
+    except InputError:
+        raise
     except OSError as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{target}: cannot be written: {error.strerror or error}; {_remedy(error)}") from error
 
 
@@ -49,7 +56,8 @@ class Draft(contextlib.AbstractContextManager):
 
     target: its final name. overwrite: whether publishing replaces an existing file.
     As a context manager it discards the file unless it was published.
-    Raises InputError if the folder cannot be written, or the name is that of a device or a pipe.
+    Raises InputError if the folder cannot be written, or the name is that of a device or a pipe, and ConfigError if the
+    target is an input (see `protect`).
     """
 
     def __init__(self, target: Path, *, overwrite: bool) -> None:
@@ -57,10 +65,12 @@ class Draft(contextlib.AbstractContextManager):
         self.overwrite = overwrite
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
-        with reporting(self.target):
+        check_target(self.target, overwrite=True)
+        with uninterrupted(), reporting(self.target):
             self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
-        self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
-        self.published = False
+            self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
+            self.published = False
+            _open.add(self)
 
     def __exit__(self, *error: object) -> None:
         self.discard()
@@ -70,7 +80,7 @@ class Draft(contextlib.AbstractContextManager):
 
         same_is_fine: an existing file with the same bytes counts as published, because a killed run may have left it.
         """
-        with reporting(self.target):
+        with uninterrupted(), reporting(self.target):
             self.file.flush()
             os.fsync(self.file.fileno())
             if locks.fcntl is None:  # Windows cannot rename an open file
@@ -94,12 +104,24 @@ class Draft(contextlib.AbstractContextManager):
             self.file.close()
         with contextlib.suppress(OSError):
             os.unlink(self.path)
+        _open.discard(self)
 
     def withdraw(self) -> None:
         """Remove the published file again, because a file that belongs to it could not be published."""
         if self.published and not self.overwrite:
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
+
+
+_open: set[Draft | Claim] = set()
+"""What is neither published nor discarded."""
+
+
+@atexit.register
+def _discard_all() -> None:
+    """At the end of the process: what an interrupt in the middle of cleaning up has left."""
+    for draft in list(_open):
+        draft.discard()
 
 
 def is_stream(target: Path) -> bool:
@@ -122,6 +144,14 @@ def open_stream(target: Path) -> BinaryIO:
     return os.fdopen(descriptor, "wb")
 
 
+def check_target(target: Path, *, overwrite: bool) -> None:
+    """Raise, before long work, what `publish` would raise after it: the target is an input, exists, or cannot exist."""
+    refuse_input(target)
+    with reporting(target), contextlib.suppress(FileNotFoundError):
+        os.lstat(target)
+    refuse_existing(target, overwrite)
+
+
 def refuse_existing(target: Path, overwrite: bool = False) -> None:
     """Raise InputError if something of that name exists, without `overwrite`; publishing checks again."""
     if not overwrite and os.path.lexists(target):
@@ -131,19 +161,73 @@ def refuse_existing(target: Path, overwrite: bool = False) -> None:
 def publish_together(drafts: Sequence[Draft]) -> None:
     """Publish drafts in order; if the last one exists, all are complete.
 
-    On an error the earlier ones are removed again, except those that replaced an older file.
+    On an error the earlier ones are removed again, except those that replaced an older file: the error then names them.
     """
     done: list[Draft] = []
+    with uninterrupted():
+        try:
+            for draft in drafts:
+                draft.publish(same_is_fine=draft is not drafts[-1])
+                done.append(draft)
+        except BaseException as error:
+            for draft in done:
+                draft.withdraw()
+            for draft in drafts:
+                draft.discard()
+            kept = ", ".join(str(draft.target) for draft in done if draft.published and draft.overwrite)
+            if kept and isinstance(error, InputError):
+                raise InputError(f"{error}; {kept}: replaced before that, and complete") from error
+            raise
+
+
+class Claim:
+    """The right to make the outputs of a name in a folder: a second run there would mix its outputs with this one's.
+
+    Raises InputError while another process has it. Without file locks, everyone gets it.
+    """
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self._descriptor: int | None = None
+        if locks.fcntl is None:
+            return
+        digest = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+        self._path = folder / f"{_PREFIX}lock-{digest}{_SUFFIX}"
+        deadline = time.monotonic() + _CLAIM_PATIENCE
+        with uninterrupted(), reporting(folder / name):
+            while self._descriptor is None:
+                try:
+                    self._descriptor = _lock(self._path)
+                except BlockingIOError:  # `remove_stale` may hold it for an instant
+                    if time.monotonic() > deadline:
+                        what = "another run makes this output now; wait for that run, or choose another folder"
+                        raise InputError(f"{folder / name}: {what}") from None
+                    time.sleep(_CLAIM_PATIENCE / 10)
+            _open.add(self)
+
+    def discard(self) -> None:
+        """Give it back; may be called twice."""
+        if self._descriptor is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(self._path)
+            os.close(self._descriptor)
+            self._descriptor = None
+        _open.discard(self)
+
+
+def _lock(path: Path) -> int | None:
+    """A descriptor of the locked file; None if it was removed meanwhile. BlockingIOError if another process has it."""
+    descriptor = os.open(path, locks.FLAGS | os.O_CREAT, 0o666)
     try:
-        for draft in drafts:
-            draft.publish(same_is_fine=draft is not drafts[-1])
-            done.append(draft)
-    except BaseException:
-        for draft in done:
-            draft.withdraw()
-        for draft in drafts:
-            draft.discard()
+        locks.fcntl.flock(descriptor, locks.fcntl.LOCK_EX | locks.fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
         raise
+    except OSError:  # a file system without locks
+        return descriptor
+    if os.fstat(descriptor).st_nlink:
+        return descriptor
+    os.close(descriptor)
+    return None
 
 
 def remove_stale(folder: Path) -> list[Path]:

@@ -15,14 +15,33 @@ from typing import BinaryIO
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a file for reading; raises InputError for a folder, a device or a pipe, which could block for ever."""
-    if not stat.S_ISREG(os.stat(path).st_mode):
+    try:
+        mode = os.stat(path).st_mode
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read: no file can have this name ({error})") from error
+    if stat.S_ISDIR(mode):
+        os.scandir(path).close()  # a folder that cannot be read was meant as one: its error says more
+    if not stat.S_ISREG(mode):
         raise InputError(f"{path}: cannot be read: it is a folder, a pipe or a device; give a file")
     return open(path, "rb")
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn an error of the operating system while a file is opened into one InputError line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except OSError as error:
+        name = error.filename or path
+        raise InputError(f"{name}: cannot be read: {error.strerror or error}; check disk and permissions") from error
 
 
 def damaged(path: Path, what: str) -> InputError:
@@ -78,6 +97,7 @@ def reporting_reads(path: Path, what: str = "", remedy: str = "") -> Iterator[No
 def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
     """Turn any error of a decoder or of the disk into one InputError line that names the wanted points."""
     try:
+        interrupts.check()
         yield
     except InputError as error:
         if str(error).startswith(str(path)):
@@ -89,5 +109,6 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
         # lazrs raises PanicException, which is no Exception, when its Rust code panics.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
+        interrupts.check()  # it may come from an interrupt inside the decoder
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise damaged(path, f"points {start} to {stop} cannot be decompressed ({what})") from error

@@ -16,6 +16,7 @@ import lazrs
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.interrupts import uninterrupted
 from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
 
 try:
@@ -57,17 +58,19 @@ def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
 
 
 class _WatchedFile:
-    """File for the compressors that keeps the first OSError: they report only that a write failed, not why."""
+    """File for the compressors that keeps the first error: they report only that a write failed, not why."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._error: OSError | None = None
+        self._error: BaseException | None = None
 
     def __getattr__(self, name: str) -> Callable:
+        function = getattr(self._file, name)
+
         def watched(*arguments: Any) -> Any:
             try:
-                return getattr(self._file, name)(*arguments)
-            except OSError as error:
+                return function(*arguments)
+            except BaseException as error:
                 self._error = self._error or error
                 raise
 
@@ -75,8 +78,10 @@ class _WatchedFile:
 
     @contextlib.contextmanager
     def explaining(self) -> Iterator[None]:
+        """Around every call of a compressor, which would take KeyboardInterrupt for a failed write."""
         try:
-            yield
+            with uninterrupted():
+                yield
         except _ERRORS as error:
             raise self._error or InputError(f"the points cannot be compressed: {error}") from error
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wavebatch.files.disk.raw_bytes import guarded, read_exactly
+from wavebatch.files.disk.raw_bytes import guarded, read_exactly, reading
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.laszip_decode import LaszipPoints
 from wavebatch.files.las.laz_decode import LazPoints, open_laz
@@ -18,7 +18,8 @@ def open_points(checked: CheckedHeader) -> PointSource:
 
     Raises InputError if the records of the compression are damaged or no installed library can decode them.
     """
-    return open_laz(checked) if checked.header.compressed else _PlainPoints(checked)
+    with reading(checked.path):
+        return open_laz(checked) if checked.header.compressed else _PlainPoints(checked)
 
 
 class _PlainPoints:

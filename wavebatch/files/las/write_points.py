@@ -14,6 +14,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
@@ -63,6 +64,7 @@ class PointFile(contextlib.AbstractContextManager):
         """Append records (m,) of `dtype`."""
         if rows.dtype != self.dtype:
             raise InputError(f"{self.target}: rows of another layout than the file's; this is a bug, please report it")
+        interrupts.check()
         if not len(rows):
             return
         rows = np.ascontiguousarray(rows)
@@ -102,14 +104,24 @@ class PointFile(contextlib.AbstractContextManager):
 
     def commit(self) -> None:
         """Complete and publish the file with all that belongs to it; on an error nothing of it remains."""
+        self.complete()
+        self.publish()
+
+    def complete(self) -> int:
+        """Complete the file under its temporary name, and return its size; on an error nothing of it remains."""
         try:
             self.finish_points()
             self._append_records()
             self.finish()
-            publish_together(self.drafts)
+            with self._guarded():
+                return self.draft.file.seek(0, 2)
         except BaseException:
             self.abort()
             raise
+
+    def publish(self, *more: Draft) -> None:
+        """Publish the complete file, and the drafts that belong to it after it; on an error nothing of them remains."""
+        publish_together([*self.drafts, *more])
 
     def _append_records(self) -> None:
         """Place for subclasses to append extended records and further drafts."""

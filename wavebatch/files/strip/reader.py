@@ -16,7 +16,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer, ReturnTable, WaveformBlock
 from wavebatch.files.disk.closing import Closing
-from wavebatch.files.disk.raw_bytes import take_records, widen
+from wavebatch.files.disk.raw_bytes import reading, take_records, widen
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.las.read_points import open_points
 from wavebatch.files.strip.facts import StripFacts, find_facts
@@ -108,7 +108,11 @@ class StripReader(Closing):
     def __init__(self, path: Path | str | StripFacts, *, direction: str = "auto", headerless: bool = False) -> None:
         if direction not in OPTIONS:
             raise ConfigError(f"direction {direction!r}: must be one of {', '.join(OPTIONS)}")
-        facts = path if isinstance(path, StripFacts) else find_facts(Path(path), direction, headerless)
+        if isinstance(path, StripFacts):
+            facts = path
+        else:
+            with reading(Path(path)):
+                facts = find_facts(Path(path), direction, headerless)
         self.facts = facts
         self._points = open_points(facts)
         try:

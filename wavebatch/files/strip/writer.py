@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
@@ -83,11 +83,11 @@ class FullwaveWriter(PointFile):
         )
         header.vlrs = [*map(_build_descriptor, digitizers), *header.vlrs, *records]
         super().__init__(target, header, build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
-        packet_file = target.with_suffix(".wdp")
+        packet_file = target if internal else target.with_suffix(".wdp")
         try:
             refuse_existing(packet_file, internal or overwrite)
             self._packets = Draft(packet_file, overwrite=overwrite)
-        except InputError:
+        except BaseException:
             self.abort()
             raise
         self.drafts.insert(0, self._packets)

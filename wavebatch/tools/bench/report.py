@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
+from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
 from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
 
@@ -202,5 +203,5 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> str:
     with reporting(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
-            (folder / name).write_text(text + "\n", "utf-8")
+            write_text(folder / name, text + "\n", overwrite=True)
     return f"{folder}: {', '.join(texts)}"

@@ -16,6 +16,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.return_io import ReturnReader
+from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
@@ -167,7 +168,7 @@ def synthesize_strip(
     """
     options = options or SynthesisOptions()
     recordings = [options.recording(length) for length in _LENGTHS]
-    with ReturnReader(cloud) as reader:
+    with protecting([cloud]), ReturnReader(cloud) as reader:
         if not reader.has_gps_time:
             raise InputError(
                 f"{cloud}: point format {reader.point_format} has no GPS times, which are needed to group points into "

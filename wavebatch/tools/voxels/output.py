@@ -16,6 +16,7 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
@@ -40,12 +41,11 @@ Piece = tuple[np.ndarray, Mapping[str, np.ndarray]]
 
 
 def check_target(target: Path, strip: Path) -> None:
-    """Raises ConfigError for an unknown suffix, InputError where the output is the strip or cannot be written."""
+    """Raises ConfigError for an unknown suffix or where the output is the strip, InputError if it cannot be written."""
     if target.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{target}: voxels are written as {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if target.exists() and strip.exists() and target.samefile(strip):
-        raise InputError(f"{target}: is the strip itself; choose another output")
-    Draft(target, overwrite=True).discard()
+    with protecting([strip]):
+        Draft(target, overwrite=True).discard()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

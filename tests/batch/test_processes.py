@@ -1,0 +1,94 @@
+"""Worker processes that are killed or stopped at the worst instants: the parent process never waits for them."""
+
+import multiprocessing.connection
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from wavebatch.batch.processes import WorkerDied, Workers
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+
+
+def square(number):
+    return number * number
+
+
+def raise_error(number):
+    raise ValueError(f"bad {number}")
+
+
+def die_while_sending(keeper=False):
+    """The process is killed after half of its result is in the pipe; `keeper`: a child of it holds the pipe open."""
+    if keeper and os.fork() == 0:
+        time.sleep(15)
+        os._exit(0)
+
+    def send_half(self, buffer, write=os.write):
+        write(self._handle, bytes(buffer)[: len(buffer) // 2])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    multiprocessing.connection.Connection._send = send_half
+    return bytes(1000)
+
+
+def stop():
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def stop_later():
+    """The process stops when it waits for its next call."""
+    if os.fork() == 0:
+        time.sleep(0.3)
+        os.kill(os.getppid(), signal.SIGSTOP)
+        os._exit(0)
+
+
+def test_results_and_errors_come_back():
+    with Workers(2) as workers:
+        futures = [workers.submit(square, number) for number in range(20)] + [workers.submit(raise_error, 7)]
+        left = list(futures)
+        while left:
+            left = [future for future in left if future not in workers.wait(left)]
+        assert [future.result() for future in futures[:-1]] == [number**2 for number in range(20)]
+        with pytest.raises(ValueError, match="bad 7"):
+            futures[-1].result()
+
+
+@pytest.mark.parametrize("keeper", [False, True])
+def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(keeper):
+    with Workers(2) as workers:
+        dying, fine = workers.submit(die_while_sending, keeper), workers.submit(square, 3)
+        start = time.monotonic()
+        while not dying.done():
+            workers.wait([dying])
+        assert isinstance(dying.exception(), WorkerDied) and time.monotonic() - start < 12
+        workers.wait([fine])
+        assert fine.result() == 9
+        again = workers.submit(square, 4)  # by a new process, or the other one
+        workers.wait([again])
+        assert again.result() == 16
+
+
+@pytest.mark.parametrize("function", [stop, stop_later])
+def test_a_stopped_process_does_not_keep_this_one_from_ending(function):
+    start = time.monotonic()
+    with Workers(2) as workers:
+        workers.submit(function)
+        other = workers.submit(square, 5)
+        workers.wait([other])
+        time.sleep(1)
+    assert time.monotonic() - start < 15
+
+
+def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
+    with Workers(2) as workers:
+        futures = [workers.submit(die_while_sending) for _ in range(6)]
+        start = time.monotonic()
+        while not all(future.done() for future in futures):
+            workers.wait([future for future in futures if not future.done()])
+        assert time.monotonic() - start < 12
+        assert all(isinstance(future.exception(), WorkerDied) for future in futures)

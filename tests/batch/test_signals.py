@@ -1,0 +1,159 @@
+"""Ctrl-C and SIGTERM at any instant of any command: exit code 130, one line, no temporary file, nothing half done."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from batch_tools import make_job
+
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.strip_task import BatchOptions
+from wavebatch.files.disk.publish import Draft
+from wavebatch.tools.simulate import simulate_strip
+
+pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at signals through /proc")
+
+
+@pytest.fixture(scope="module")
+def strip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("strip") / "a.las"
+    simulate_strip("flat", path, pulses=3000, seed=1)
+    return path
+
+
+def _start(command, *, code=None):
+    program = ["-m", "wavebatch"] if code is None else ["-c", code]
+    return subprocess.Popen(
+        [sys.executable, *program, *map(str, command)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+def _wait_for_handlers(process):
+    """Until the program has begun: from then on no signal may be lost."""
+    while process.poll() is None:
+        with open(f"/proc/{process.pid}/status") as file:
+            caught = next(int(line.split()[1], 16) for line in file if line.startswith("SigCgt"))
+        if caught >> (signal.SIGTERM - 1) & 1:
+            return
+        time.sleep(0.0005)
+
+
+def _commands(strip, folder):
+    """Every command that writes, long enough to be interrupted in its work."""
+    return {
+        "run": ["run", strip, "-o", folder, "--profile", "fast"],
+        "run-2": ["run", strip, "-o", folder, "--profile", "fast", "--jobs", "2"],
+        "simulate": ["simulate", "flat", "-o", folder / "a.laz", "--truth", folder / "a.npz", "--pulses", "100000000"],
+        "synthesize": ["synthesize", strip, "-o", folder / "a.laz", "--external"],
+        "slice": ["slice", strip, "-o", folder / "a.csv"],
+        "voxelize": ["voxelize", strip, "-o", folder / "a.npz", "--size", "0.5"],
+        "stats": ["stats", strip, "-o", folder / "a.csv", "--area", "5"],
+        "survey": ["survey", strip, "-o", folder / "a.toml", "--chain", folder / "c.toml"],
+        "plot": ["plot", "waveform", strip, "-o", folder / "a.png"],
+        "bench": ["bench", "-o", folder, "--waveforms", "2000", "--pulses", "2000"],
+    }
+
+
+@pytest.mark.parametrize("name", list(_commands(Path(), Path())))
+def test_a_signal_at_any_instant_of_any_command_gives_130_and_leaves_nothing(strip, tmp_path, name):
+    for number, second in [(signal.SIGTERM, None), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]:
+        folder = tmp_path / f"{number}{second}"
+        folder.mkdir()
+        process = _start(_commands(strip, folder)[name])
+        _wait_for_handlers(process)
+        time.sleep(random.Random(name + folder.name).choice([0, 0.05, 0.2, 0.5, 1.0]))
+        process.send_signal(number)
+        for _ in range(3):
+            if second is not None:
+                time.sleep(0.003)
+                process.send_signal(second)
+        _, said = process.communicate(timeout=60)
+        assert not list(folder.glob(".*")), said
+        if process.returncode == 0:  # all was done before
+            assert list(folder.iterdir())
+            continue
+        *before, last = said.splitlines()
+        assert process.returncode == 130 and last.startswith("interrupted"), said
+        assert all(line.startswith((str(strip), str(folder))) for line in before), said
+
+
+_IN_COMPRESSOR = """
+import os, signal
+from wavebatch.files.las import laz_encode
+from wavebatch.__main__ import main
+
+class File(laz_encode._WatchedFile):
+    def write(self, data):
+        os.kill(os.getpid(), signal.{name})
+        return super().write(data)
+
+laz_encode._WatchedFile = File
+main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_inside_the_compressor_is_not_taken_for_a_failed_write(strip, tmp_path, name):
+    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast"], code=_IN_COMPRESSOR.format(name=name))
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and said.startswith("interrupted: finished clouds are complete"), said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_inside_the_compressor_reaches_a_program_that_uses_the_library(strip, tmp_path, monkeypatch):
+    from wavebatch.files.las import laz_encode
+
+    class File(laz_encode._WatchedFile):
+        def write(self, data):
+            os.kill(os.getpid(), signal.SIGINT)
+            return super().write(data)
+
+    monkeypatch.setattr(laz_encode, "_WatchedFile", File)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_batch([make_job(strip)], BatchOptions(tmp_path))
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert list(tmp_path.iterdir()) == []
+
+
+_LOST = """
+import os, signal
+from wavebatch.batch import run
+from wavebatch.__main__ import main
+
+class Lost:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)  # Python drops what is raised here
+
+start = run.StripTask.start
+
+def lose(self):
+    Lost()
+    return start(self)
+
+run.StripTask.start = lose
+main()
+"""
+
+
+def test_an_interrupt_that_python_drops_is_seen_by_the_loop(strip, tmp_path):
+    process = _start(["run", strip, "-o", tmp_path, "--profile", "fast"], code=_LOST)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and "interrupted: finished" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_draft_that_is_left_open_goes_with_its_process(tmp_path):
+    code = "import sys; from wavebatch.files.disk.publish import Draft; Draft(sys.argv[1], overwrite=False)"
+    subprocess.run([sys.executable, "-c", code, tmp_path / "a"], check=True)
+    assert list(tmp_path.iterdir()) == []
+    Draft(tmp_path / "a", overwrite=False).discard()
