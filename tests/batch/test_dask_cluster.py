@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +34,9 @@ class Dask:
         self.address = json.loads(file.read_text())["address"]
 
     def start_worker(self):
-        path = os.pathsep.join(filter(None, (os.path.dirname(os.path.dirname(__file__)), os.environ.get("PYTHONPATH"))))
+        # A function of this file travels as "tests.batch.test_dask_cluster": the worker must be able to import that.
+        tests = Path(__file__).parents[1]
+        path = os.pathsep.join(filter(None, (str(tests.parent), str(tests), os.environ.get("PYTHONPATH"))))
         common = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--memory-limit", "0")
         return self._start(*_WORKER, self.address, *common, PYTHONPATH=path)
 
