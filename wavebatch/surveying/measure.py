@@ -109,20 +109,20 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
     """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
 
-    first: width to begin with [samples], and to end with where too few echoes are isolated.
+    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
     """
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_block(block, FIRST_LOOK)
-    width, last = first, 0.0
+    width, last = first, first if known else 0.0
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
         system, last = _gaussian_system(few, width, saturation), width
         width = _isolated_width(few, system)
-    system = _gaussian_system(block, width, saturation)
+    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
     return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
 
 
