@@ -1,0 +1,115 @@
+"""Log-normals: the strip's skew where the survey chose another pulse, a skew per echo, the formula as printed."""
+
+from dataclasses import replace
+
+import naive
+import numpy as np
+import pytest
+
+from wavebatch import surveying
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import parse_chain
+
+LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))
+TEXT = "\n".join(f'[[chain]]\nstage = "{name}"' for name in ("noise.pooled", "detect.maximum", "decompose.skewed"))
+COLUMNS = "\n".join(f'\n[[chain]]\nstage = "attribute.{name}"' for name in ("skew", "echo_width", "energy"))
+
+
+def strip(skews, *, n=1500, std=1.0, seed=1, tail=0.04):
+    """Single echoes with one of these skews each, an after-pulse of `tail`, noise and rounding; what they are."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(90.0)
+    kappa = rng.choice(skews, n)
+    amplitude, time = rng.uniform(60, 180, n), 30 + rng.uniform(-3, 3, n)
+    y = np.stack([a * naive.pulse(x, t, 2.4, k) for a, t, k in zip(amplitude, time, kappa, strict=True)])
+    y += np.stack([tail * a * naive.pulse(x, t + 14, 2.4) for a, t in zip(amplitude, time, strict=True)])
+    counts = np.clip(np.rint(12 + y + std * rng.standard_normal(y.shape)), 0, 255).astype(np.uint8)
+    return WaveformBlock.from_samples(counts), kappa, time
+
+
+def test_the_survey_keeps_the_skew_beside_a_learned_pulse():
+    """Its pulse is a sum of Gaussians, because of the after-pulse; the skew of the main lobe is known all the same."""
+    block, _, _ = strip([0.23], tail=0.15)
+    system = surveying.survey_block(block).system
+    assert len(system.components) > 1 and system.kappa == 0
+    assert system.skew == pytest.approx(0.23, abs=0.03)
+    chain = parse_chain(TEXT, "c")
+    fitted, plain = (chain.run(block, one) for one in (system, replace(system, components=(), skew=None)))
+    strong = [table.take(table.amplitude > 40) for table in (fitted, plain)]
+    assert np.median(strong[0].residual) < 0.6 * np.median(strong[1].residual)
+
+
+def test_without_a_skew_of_the_survey_a_learned_pulse_is_refused():
+    block, _, _ = strip([0.23], n=20)
+    system = SystemPulse(2.4, baseline=12, noise_std=1.0, components=LEARNED)
+    with pytest.raises(ConfigError, match="survey again, or give kappa"):
+        parse_chain(TEXT, "c").run(block, system)
+    assert len(parse_chain(TEXT + "\nkappa = 0.2", "c").run(block, system))
+    assert len(parse_chain(TEXT, "c").run(block, replace(system, skew=0.2)))
+
+
+def test_every_echo_gets_its_skew_and_its_error():
+    block, kappa, time = strip([0.05, 0.30], tail=0.0)
+    system = surveying.survey_block(block).system
+    assert system.skew_spread > 0.05
+    chain = parse_chain(TEXT + '\nkappa = "free"' + COLUMNS, "c")
+    assert chain.makes[:2] == ("skew", "skew_err")
+    found = chain.run(block, system)
+    found = found.take((found.count(len(block))[found.waveform] == 1) & (found.amplitude > 50))
+    assert len(found) > 1300
+    skew, error = found.attributes["skew"], found.attributes["skew_err"]
+    for true in (0.05, 0.30):
+        here = kappa[found.waveform] == true
+        assert np.median(skew[here]) == pytest.approx(true, abs=0.03)
+    assert np.mean(np.abs(skew - kappa[found.waveform]) < error) > 0.5
+    assert np.median(np.abs(found.time - time[found.waveform])) < 0.05
+    # Width and area are those of the pulse with this skew, not of a Gaussian.
+    true = 2 * np.sinh(1.17741 * kappa) / kappa * 2.4
+    assert np.median(found.attributes["echo_width"] / true[found.waveform]) == pytest.approx(1.0, abs=0.01)
+    area = found.amplitude * found.sigma * np.sqrt(2 * np.pi) * np.exp(skew**2 / 2)
+    np.testing.assert_allclose(found.attributes["energy"], area, rtol=1e-4)
+
+
+def test_one_skew_does_for_one_target_what_free_ones_do():
+    block, _, _ = strip([0.2], tail=0.0)
+    system = surveying.survey_block(block).system
+    tables = [parse_chain(TEXT + extra, "c").run(block, system) for extra in ("", '\nkappa = "free"')]
+    assert len(tables[0]) == len(tables[1]) and "skew" not in tables[0].attributes
+    assert np.median(np.abs(tables[0].time - tables[1].time)) < 0.03
+
+
+@pytest.mark.parametrize(("origin", "low", "high"), [("segment", 0.1, 0.4), ("waveform", 0.05, 0.09)])
+def test_the_printed_formula_has_the_skew_of_its_origin(origin, low, high):
+    """The width over the distance of the peak from the origin, whatever the pulse is."""
+    block, _, _ = strip([0.0], n=200, tail=0.0)
+    system = SystemPulse(2.4, baseline=12, noise_std=1.0)
+    chain = parse_chain(TEXT.replace("skewed", "log_normal") + f'\norigin = "{origin}"' + COLUMNS, "c")
+    found = chain.run(block, system)
+    skew = found.attributes["skew"]
+    assert low < np.median(skew) < high
+    if origin == "waveform":
+        np.testing.assert_allclose(skew, found.sigma / (found.time + 1.0), rtol=1e-4)
+
+
+def test_a_column_of_skews_needs_a_skew_per_echo():
+    for text in (TEXT + COLUMNS, TEXT.replace("skewed", "gaussian") + COLUMNS):
+        with pytest.raises(ConfigError, match='kappa = "free"'):
+            parse_chain(text, "c")
+
+
+@pytest.mark.parametrize("value", ['"fre"', "1.5", "true", "[1]"])
+def test_a_wrong_skew_is_refused(value):
+    with pytest.raises(ConfigError, match="kappa"):
+        parse_chain(f"{TEXT}\nkappa = {value}", "c")
+
+
+def test_too_few_echoes_leave_the_skew_unknown():
+    block, _, _ = strip([0.2], n=30)
+    assert surveying.survey_block(block).system.skew is None
+
+
+def test_stages_says_numbers_and_words():
+    parameter = STAGES["decompose.skewed"].parameters["kappa"]
+    assert parameter.types == (float, str) and parameter.choices == ("free",) and parameter.range == (-0.9, 0.9)
