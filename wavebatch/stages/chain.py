@@ -12,7 +12,7 @@ import time
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -306,7 +306,9 @@ class Chain:
                 ) from error
             data[slot[step.stage.kind]] = result
             if step.stage.fits is not None:
-                data["system"] = step.stage.fits(system, step.effective())
+                fitted = step.stage.fits(system, step.effective())
+                other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
+                data["system"] = replace(fitted, other_pulse=other)
             if timing is not None:
                 timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
         return data["echoes"]
