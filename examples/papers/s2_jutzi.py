@@ -47,6 +47,8 @@ FALSE_ALARMS = {
 """Least, most and expected share [%] of waveforms of 200 samples of noise with an echo."""
 PULSES = {"1": (20.4, 2.10), "2": (12.3, 3.49), "3": (29.4, 1.46), "4": (20.7, 2.07)}
 """Table 1: amplitude over noise and bound of the range [mm] of its pulses, 0.217 m wide, sampled every 50 ps."""
+APART, WIDE = (9.908, 6.164, 2.440), 0.217
+"""Table 1: distances of its pulses one after the other, and the mean of their sigmas, both [m]."""
 BASIN = {0.5: (99.9, 100), 1.0: (99.9, 100), 1.5: (0, 45), 2.0: (0, 0.5), 3.0: (0, 0.5)}
 """Least and most share of undamped fits that converge [%], by distance of the start in sigma."""
 START_WIDTHS = (0.4, 0.7, 1.0, 1.5, 2.0, 3.0)
@@ -115,6 +117,35 @@ def table_of_precision(number: int, seed: int) -> Table:
     return table
 
 
+def table_of_profile(number: int, seed: int) -> Table:
+    """Table 1 as one waveform: its four pulses at their distances, every 50 ps, and what comes back of each."""
+    table = Table("table 1, the profile of four pulses: paper, and what comes back", 3)
+    spacing = 0.05
+    range_of = np.r_[0.0, np.cumsum(APART)]
+    time = 10 + range_of / HALF_C
+    heights = np.array([ratio for ratio, _ in PULSES.values()])
+    sigma = WIDE / HALF_C
+    recording = fine_recording(1.0, sigma, n_samples=int(time[-1] / spacing) + 200, spacing=spacing)
+    n, rng = max(number // 40, 5), np.random.default_rng(seed)
+    block, _ = simulate_echoes(recording, np.tile(time, (n, 1)), heights * FINE, sigma, rng)
+    noise, system = known_noise(recording, n), known_system(recording)
+    found = gauss_newton(block, noise, system, matched_filter(block, noise, system))
+    table.near("pulses per waveform", len(found) / n, 4.0)
+    rows = found.take(np.isin(found.waveform, np.flatnonzero(found.count(n) == 4)))
+    table.add("  waveforms with four [%]", 25 * len(rows) / n, 99)
+    mean = {name: getattr(rows, name).reshape(-1, 4).mean(axis=0) for name in ("time", "amplitude", "sigma")}
+    for pulse, (height, apart) in enumerate(zip(heights, np.r_[np.nan, APART], strict=True)):
+        # The errors of one waveform are 1.5 to 3.5 mm, the paper rounds to millimetres and tenths of a millivolt.
+        if pulse:
+            ours = HALF_C * (mean["time"][pulse] - mean["time"][pulse - 1])
+            table.near(f"pulse {pulse + 1}: distance from the one before [m]", ours, apart, within=0.004, paper=apart)
+        ours = mean["amplitude"][pulse] / FINE
+        table.near(f"pulse {pulse + 1}: maximum [mV]", ours, height, within=0.4, paper=height)
+        width = HALF_C * mean["sigma"][pulse]
+        table.near(f"pulse {pulse + 1}: sigma [m]", width, WIDE, within=0.004, paper=WIDE)
+    return table
+
+
 def table_of_basins(number: int, seed: int) -> Table:
     """Fits that reach the echo from starts that are off, mean over widths of the start; sigma 2, SNR 100."""
     table = Table("fits that converge, by the start's distance [%]", 1)
@@ -156,7 +187,7 @@ def table_of_lines(number: int, seed: int) -> Table:
     rng = np.random.default_rng(seed)
     options = SliceOptions(geometry="time", sigma=8.0)
     for slope in SLOPES:
-        off, turn, alone = [], [], []
+        off, turn, alone, heights = [], [], [], []
         for _ in range(max(number // 500, 2)):
             middle = 200 + rng.uniform(-3, 3)
             line = scan_line(paint_slice(rng, [(middle, slope, 0, 320)]))
@@ -164,9 +195,13 @@ def table_of_lines(number: int, seed: int) -> Table:
             alone.append(len(segments) == 1)
             time, pulse = np.mean(segments[0].ends, axis=0)
             off.append((time - slope * (pulse - 160) - middle) / np.hypot(1, slope))
+            # Windows begin at a height of 100 m and look straight down.
+            places = segments[0].start, segments[0].end
+            heights += [end[2] - (100 - HALF_C * at) for end, (at, _) in zip(places, segments[0].ends, strict=True)]
             turn.append((segments[0].theta - np.degrees(np.arctan2(-slope, 1)) + 90) % 180 - 90)
         table.add(f"slope {slope:g}: rms position [px]", np.sqrt(np.mean(np.square(off))), 0, 0.05, spec=0.02)
         table.add(f"slope {slope:g}: rms angle [deg]", np.sqrt(np.mean(np.square(turn))), 0, 0.1, spec=0.04)
+        table.add(f"slope {slope:g}: rms height of the ends [m]", np.sqrt(np.mean(np.square(heights))), 0, 1e-3)
         table.near(f"slope {slope:g}: slices with one segment [%]", 100 * np.mean(alone), 100)
     line = scan_line(paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)]))
     segments = find_segments(cut_slice(line, options), options)
@@ -180,6 +215,7 @@ def measure(number: int, seed: int) -> list[Table]:
     return [
         table_of_detection(number, seed),
         table_of_precision(max(number // 2, 10), seed),
+        table_of_profile(number, seed),
         table_of_basins(number, seed),
         table_of_lines(number, seed),
     ]
