@@ -1,16 +1,19 @@
 """Log-normals: the strip's skew where the survey chose another pulse, a skew per echo, the formula as printed."""
 
+import json
 from dataclasses import replace
 
 import naive
 import numpy as np
 import pytest
 
+import wavebatch as wb
 from wavebatch import surveying
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import parse_chain
+from wavebatch.tools.compare.goodness import measure_fit
 
 LEARNED = ((1.0, 0.0, 2.0), (0.3, 3.0, 2.4), (0.02, 9.0, 2.0))
 TEXT = "\n".join(f'[[chain]]\nstage = "{name}"' for name in ("noise.pooled", "detect.maximum", "decompose.skewed"))
@@ -113,3 +116,37 @@ def test_too_few_echoes_leave_the_skew_unknown():
 def test_stages_says_numbers_and_words():
     parameter = STAGES["decompose.skewed"].parameters["kappa"]
     assert parameter.types == (float, str) and parameter.choices == ("free",) and parameter.range == (-0.9, 0.9)
+
+
+def measure_real(path, decomposer, **parameters):
+    """Mean goodness of fit E of single echoes, and echoes beyond one in packets with one return of the vendor."""
+    strip = wb.open_strip(path)
+    system = wb.survey(strip).system
+    lines = "".join(f"{name} = {json.dumps(value)}\n" for name, value in parameters.items())
+    chain = parse_chain(TEXT.replace("skewed", decomposer) + "\n" + lines, "c")
+    fits, more, single = [], 0, 0
+    for block in strip.blocks():
+        own = system.of(block)
+        found = chain.run(block, system)
+        number = found.count(len(block))
+        fit, _ = measure_fit(block, chain.steps[0].stage.function(block, own), own, chain.steps[2], found)
+        fits.append(fit[number == 1])
+        alone = np.bincount(block.returns.waveform, minlength=len(block)) == 1
+        more, single = more + np.maximum(number[alone] - 1, 0).sum(), single + alone.sum()
+    strip.close()
+    return np.nanmean(np.concatenate(fits)), more / single
+
+
+def test_a_real_strip_has_the_ratio_of_the_paper(leica):
+    """Log-normal over Gaussian: 0.60 over both of the paper's classes of Leica echoes; it was 1.00."""
+    gaussian, one = (measure_real(leica, name)[0] for name in ("gaussian", "skewed"))
+    free = measure_real(leica, "skewed", kappa="free")[0]
+    assert 0.45 < one / gaussian < 0.65 and free <= one * 1.01
+
+
+@pytest.mark.parametrize(
+    ("model", "low", "high"), [("gaussian", 0.5, 0.9), ("skewed", 0.05, 0.2), ("learned", 0.0, 0.01)]
+)
+def test_false_echoes_of_the_residual_loop_on_real_single_returns(leica, model, low, high):
+    """Its gain on a real strip is the misfit of its pulse: docs/algorithms.md 1.2."""
+    assert low <= measure_real(leica, "residual_loop", model=model)[1] <= high
