@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
@@ -76,12 +77,32 @@ def skew(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTa
 
 @stage("attribute", makes=("energy",))
 def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse."""
+    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse.
+
+    Of a generalized Gaussian it is that of its exponent.
+    """
     factor = (SQRT_2PI * np.exp(0.5 * _skew_of(system, echoes) ** 2)).astype(np.float32)
+    if "power" in echoes.attributes:
+        factor = _area_factor(echoes.attributes["power"].astype(np.float64)).astype(np.float32)
     return echoes.with_attributes(energy=echoes.amplitude * echoes.sigma * factor)
 
 
-@stage("attribute", makes=("pulse_deviation",))
+def _area_factor(power: np.ndarray) -> np.ndarray:
+    """Area of exp(-|z|^p / 2) over its full width at half maximum, times 2.354820; sqrt(2 pi) for p = 2."""
+    half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
+    return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width
+
+
+def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse decomposers that give every echo a pulse of its own: none is common to compare with."""
+    decomposer = chain.steps[2]
+    own = decomposer.effective().get("kappa") == "free" or decomposer.effective().get("model") == "generalized"
+    if own or decomposer.stage.name in ("decompose.log_normal", "decompose.generalized_gaussian"):
+        return f"{decomposer.stage.name} gives every echo a shape of its own; use it after decompose.adaptive"
+    return ""
+
+
+@stage("attribute", makes=("pulse_deviation",), check=_need_one_pulse)
 def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Deviation of each echo from the fitted pulse: sqrt(h3^2 + h4^2) of its residual, per unit of A/std sqrt(s/T).
 
