@@ -210,7 +210,7 @@ def test_windows_that_open_at_different_heights_keep_the_relief(tilt):
         for end in (segment.start, segment.end):
             assert end[2] == pytest.approx(0.0, abs=0.35 if tilt == 0 else 1.0)
         # What is drawn is what is placed: the time on the axis of the slice leads to the same height.
-        assert abs(segment.start[0] - segment.end[0]) > 5
+        assert abs(segment.start[0] - segment.end[0]) > 2.5
 
 
 def test_the_axis_of_time_does_not_depend_on_where_windows_open():
