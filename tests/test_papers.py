@@ -115,6 +115,18 @@ def zero_the_heights(monkeypatch, load):
     return load("s2_jutzi").table_of_lines(1000, 0)
 
 
+def zero_the_heights_of_a_strip(monkeypatch, load):
+    right = segments.Slice.locate
+    monkeypatch.setattr(segments.Slice, "locate", lambda piece, end: (*right(piece, end)[:2], 0.0))
+    return load("s2_jutzi").table_of_a_strip(3000, 0)
+
+
+def forget_where_windows_open(monkeypatch, load):
+    """Times count from the first sample of each packet: the relief is lost."""
+    monkeypatch.setattr(segments, "align_times", lambda line: np.zeros(len(line)))
+    return load("s2_jutzi").table_of_a_strip(3000, 0)
+
+
 def drop_from_equation(power):
     def run(monkeypatch, load):
         script, right = load("s4_ussyshkin"), radar.receive_power
@@ -169,7 +181,7 @@ RIGHT = {
 WRONG = [
     double_amplitudes, double_strengths, double_distances, leave_the_pulse_in, zero_the_heights, drop_from_equation(2),
     drop_from_equation(4), drop_from_footprint, drop_from_backscatter, drop_from_section, forget_the_skew,
-    stretch_the_times,
+    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times,
 ]  # fmt: skip
 
 

@@ -9,6 +9,8 @@ and the straight lines that the Hough transform finds in a slice of waveforms (d
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from published import PULSE_SIGMA, paint_slice
@@ -16,6 +18,7 @@ from table import Table, main
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.least_squares import Limits, Windows, fit_windows
@@ -23,8 +26,9 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.decompose.models import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.tools.slices.lines import ScanLine
+from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes, simulate_strip
+from wavebatch.tools.simulate.geometry import GROUND
+from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
@@ -210,6 +214,27 @@ def table_of_lines(number: int, seed: int) -> Table:
     return table
 
 
+def table_of_a_strip(number: int, seed: int) -> Table:
+    """`wavebatch slice` on a strip of a village: heights of its level ground and roofs, in both geometries."""
+    table = Table("segments of a village, ground at 120 m")
+    with TemporaryDirectory() as folder:
+        strip = Path(folder) / "village.las"
+        simulate_strip("village", strip, pulses=max(number, 3000), seed=seed)
+        with StripReader(strip) as reader:
+            lines = list(read_scan_lines(reader, reader.scan()))
+        for geometry in ("plane", "time"):
+            options = SliceOptions(geometry=geometry, sigma=0.65)
+            found = [one for line in lines for one in find_segments(cut_slice(line, options), options)]
+            level = np.array([(one.start[2], one.end[2]) for one in found if abs(one.slope) < 1.5])
+            ground = level[level.mean(axis=1) < GROUND + 2].mean(axis=1) if len(level) else np.empty(0)
+            table.add(f"{geometry}: segments per scan line", len(found) / len(lines), 10)
+            table.add(f"{geometry}: of these level and on the ground [%]", 100 * len(ground) / len(found), 25, 70)
+            off = np.median(np.abs(ground - GROUND)) if len(ground) else np.inf
+            table.add(f"{geometry}: median distance of these from the ground [m]", min(off, 1e3), 0, 0.05)
+            table.add(f"{geometry}: highest segment above the ground [m]", np.max(level, initial=0) - GROUND, 4, 40)
+    return table
+
+
 def measure(number: int, seed: int) -> list[Table]:
     """All tables."""
     return [
@@ -218,6 +243,7 @@ def measure(number: int, seed: int) -> list[Table]:
         table_of_profile(number, seed),
         table_of_basins(number, seed),
         table_of_lines(number, seed),
+        table_of_a_strip(number, seed),
     ]
 
 
