@@ -34,6 +34,9 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 }
 """Physical columns, and what each needs besides the sensor's position."""
 
+FASTEST = 120.0
+"""Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
+
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
@@ -59,6 +62,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """
     lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
     lines += _find_gaps(prepared.sensor, report.no_data)
+    lines += _doubt_units(prepared)
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -98,6 +102,18 @@ def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
             f"range: by the trajectory echoes are {abs(sensor.farther):.1f} m {which} than by the packets' vectors, "
             f"whose error is {sensor.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
             "the ellipsoid?"
+        )
+
+
+def _doubt_units(prepared: Prepared) -> Iterator[str]:
+    """An aircraft that is too fast: its strip may be in feet without saying so."""
+    facts = dict(prepared.sensor.facts)
+    named = any(unit.horizontal is not None or unit.kind is not None for unit in prepared.facts.units)
+    if prepared.sensor.kind != "trajectory" and not named and facts.get("speed_m_s", 0.0) > FASTEST:
+        yield (
+            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
+            f"{facts['height_m']:.0f} m above the points; no CRS says so: are they in feet? Then ranges are 3.28 times "
+            "too long: project the strip to metres"
         )
 
 

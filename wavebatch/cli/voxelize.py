@@ -131,6 +131,6 @@ def _tell_ratio(summary: VoxelSummary) -> Iterator[str]:
     elif summary.reflectance_ratio_source == "assumed":
         yield (
             "note: the strip does not show the reflectance of canopy over ground (fewer than 100 pulses, all shared by "
-            "both alike, or too different in energy); it was taken as 1, so 1 - share is a gap probability only if both "
-            "reflect alike: give --reflectance-ratio"
+            "both alike, or too different in energy); it was taken as 1, so 1 - share is a gap probability only if "
+            "both reflect alike: give --reflectance-ratio"
         )

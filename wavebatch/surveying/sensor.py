@@ -15,7 +15,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.strip.ray_sample import Rays, sample_rays
+from wavebatch.files.strip.ray_sample import Rays, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
@@ -162,7 +162,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
-    """Raise InputError where the coordinates are not in metres, or where the packet vectors make that doubtful."""
+    """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
     remedy = "project the strip to metres, or leave out the stages that measure in metres"
     for unit in units:
@@ -173,10 +173,18 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
             f"that its coordinates are in feet: {remedy}"
         )
+    if all(unit.horizontal is None for unit in units):
+        scale = measure_scale(reader, scan)
+        if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
+            raise InputError(
+                f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
+                f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
+            )
 
 
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
-    crs = request.crs or (reader.facts.crs if (reader.facts.crs or "").endswith("]") else None)
+    own = reader.facts.crs or ""
+    crs = request.crs or (own if own.endswith("]") or own.startswith("EPSG:") else None)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))
