@@ -14,7 +14,7 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.files.las.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
+from wavebatch.files.las.crs import METRES, CrsUnits, looks_geocentric, parse_geotiff, parse_wkt
 from wavebatch.files.las.epsg_units import find_unit
 from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
@@ -251,3 +251,39 @@ def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
     else:  # single returns show no distance: only the flight does
         assert scale is None and done["feet"].exit_code == 0
         assert "197 m/s" in done["feet"].stderr and "are they in feet?" in done["feet"].stderr
+
+
+@pytest.mark.parametrize(
+    ("middle", "geocentric"),
+    [
+        ((4_194_000, 1_162_000, 4_647_000), True),  # Munich
+        ((-2_700_000, -4_290_000, 3_855_000), True),  # San Francisco
+        ((-4_646_000, 2_553_000, -3_534_000), True),  # Sydney
+        ((1_500_000, 6_193_000, 150_000), True),  # 1.4 degrees north
+        ((500_000, 5_400_000, 120), False),
+        ((500_000, 6_350_000, 120), False),  # UTM in Scotland: as far from its origin
+        ((500_000, 6_350_000, 29_000), False),  # the same in feet, on Everest
+        ((0, 0, 0), False),
+        ((np.nan, 0, 0), False),
+        ((6.37e306, 1e308, 1e308), False),
+    ],
+)
+def test_geocentric_coordinates_are_told_by_their_size(middle, geocentric):
+    middle = np.array(middle, float)
+    with np.errstate(over="ignore"):
+        assert bool(looks_geocentric(middle - 2000, middle + 2000)) is geocentric
+
+
+@pytest.mark.parametrize("records", [[], [projection(34735, b"\xff" * 40)]], ids=["no CRS", "a broken one"])
+def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
+    raw = make_raw(60)
+    raw.vlrs = [descriptor(1), *records]
+    strip = raw.write(tmp_path / "s.las")
+    content = bytearray(strip.read_bytes())
+    struct.pack_into("<3d", content, 155, 4_194_000.0, 1_162_000.0, 4_647_000.0)
+    struct.pack_into("<6d", content, 179, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3)
+    strip.write_bytes(content)
+    arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
+    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
+    assert CliRunner().invoke(main, arguments).exit_code == 0

@@ -10,7 +10,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,14 @@ METRES = {
     9093: 1609.344, 9096: 0.9144,
 }  # fmt: skip
 """Metres per unit by EPSG code of the unit (GeoTIFF specification 6.3.1.3)."""
+
+_EARTH = (6.34e6, 6.40e6)
+"""Distance of land from the centre of the Earth [m]: 6,357 km at the poles to 6,378 km at the equator, and room for
+mountains.
+"""
+
+_HIGHEST = 3e4
+"""Height that no projected strip has, be it in metres or feet."""
 
 _NAMES = {1.0: "metres", 0.3048: "international feet", 1200 / 3937: "US survey feet"}
 
@@ -68,6 +76,16 @@ class CrsUnits:
         return along if self.vertical is None or up == along else f"{along} with heights in {up}"
 
 
+def looks_geocentric(mins: Sequence[float], maxs: Sequence[float]) -> bool:
+    """Whether the extent of a strip lies on the surface of the Earth as seen from its centre.
+
+    Projected coordinates may be as far from their origin, but none has heights of tens of kilometres.
+    """
+    middle = [0.5 * (low + high) for low, high in zip(mins, maxs, strict=True)]
+    distance = math.hypot(*middle)
+    return _EARTH[0] < distance < _EARTH[1] and abs(middle[2]) > _HIGHEST
+
+
 def _name_unit(metres: float | None) -> str:
     if metres is None:
         return "metres"
@@ -78,7 +96,10 @@ def _name_unit(metres: float | None) -> str:
 
 
 def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits, ...]]:
-    """Return the WKT of a strip, else code or name of its GeoTIFF keys, else None, and the units that each gives."""
+    """Return the WKT of a strip, else code or name of its GeoTIFF keys, else None, and the units that each gives.
+
+    Where none gives a kind or a unit, coordinates that are geocentric by their size are one more entry.
+    """
     records = _read_records(path, header)
     units, text = [], None
     if WKT_ID in records:
@@ -88,6 +109,8 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
         citation = records.get(CITATION_ID, b"").split(b"\0")[0].decode("latin-1").strip("| ")
         text = text or _read_code(records[GEOTIFF_ID]) or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
         units.append(parse_geotiff(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b"")))
+    if all(unit == CrsUnits() for unit in units) and looks_geocentric(header.mins, header.maxs):
+        units.append(CrsUnits("geocentric"))
     return text, tuple(units)
 
 
