@@ -12,7 +12,6 @@ from wavebatch.batch.counts import AMPLITUDE_BINS, RunReport
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
-from wavebatch.surveying.sensor import SensorSource
 
 _ANGLE = "incidence_angle"
 
@@ -34,9 +33,6 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 }
 """Physical columns, and what each needs besides the sensor's position."""
 
-LEAST_DOUBT = 2.0
-"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
-
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """Find what a user should know about a strip that is written.
@@ -53,7 +49,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report)]
+    lines += filter(None, [prepared.sensor.doubt()])
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -82,17 +79,6 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
             "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"
-        )
-
-
-def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
-    """A trajectory that contradicts the packet vectors."""
-    if sensor.farther is not None and abs(sensor.farther) > max(LEAST_DOUBT, 5.0 * sensor.vectors_error):
-        which = "farther" if sensor.farther > 0 else "nearer"
-        yield (
-            f"range: by the trajectory echoes are {abs(sensor.farther):.1f} m {which} than by the packets' vectors, "
-            f"whose error is {sensor.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
-            "the ellipsoid?"
         )
 
 

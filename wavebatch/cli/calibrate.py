@@ -6,16 +6,17 @@ Only reads options and prints; the work is in `wavebatch.surveying.targets`.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, talk
+from wavebatch.core.errors import ConfigError
 
-LEAST_DOUBT = 0.03
-"""Smallest relative error that a target is credited with: constants of targets that differ by more than six times
-this, or six times the stated error, give a note."""
+if TYPE_CHECKING:
+    from wavebatch.surveying.calibration import ChannelConstant, TargetResult
+    from wavebatch.surveying.targets import CalibrationOptions
 
 
 @click.command()
@@ -29,6 +30,7 @@ this, or six times the stated error, give a note."""
               help="Attenuation of the air, one way [dB/km].")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
+@shared.chain_options
 @shared.system_option
 @shared.sensor_options
 @shared.direction_option
@@ -44,30 +46,46 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.files.text_file import write_text
-    from wavebatch.surveying.calibration import format_calibration
-    from wavebatch.surveying.targets import calibrate_strip, load_targets
+    from wavebatch.surveying.calibrating.calibration_file import format_calibration
+    from wavebatch.surveying.calibrating.target_file import load_targets
+    from wavebatch.surveying.targets import calibrate_strip
 
-    sensor = shared.read_sensor(options)
     refuse_existing(output, overwrite)
-    loaded, saved = load_targets(targets), shared.read_system(options)
+    found = calibrate_strip(strip, load_targets(targets), _read_options(options))
+    write_text(output, format_calibration(found), overwrite=overwrite)
+    for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
+        talk(line)
+    for note in found.notes:
+        talk(f"warning: {note}")
+    talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
+
+
+def _read_options(options: dict[str, Any]) -> CalibrationOptions:
+    """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
+    from wavebatch.surveying.targets import CalibrationOptions
+    from wavebatch.tools.api.run import find_request
+
+    if options["chain_file"] is not None and options["profile"] is not None:
+        raise ConfigError("--chain and --profile exclude each other; give one of them")
+    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
-    found = calibrate_strip(strip, loaded, sensor=sensor, system=saved.survey.system if saved else None, **figures)
-    write_text(output, format_calibration(found), overwrite=overwrite)
-    for target in found.targets:
-        result = "too few, left out"
-        if target.constant is not None:
-            numbers = f"constant {target.constant:.4g}, spread {100 * target.spread:.1f} %"
-            result = f"{numbers}, incidence {target.incidence_deg:.1f} deg"
-        talk(f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, {result}")
-    constants = [target.constant for target in found.targets if target.constant is not None]
-    ratio = max(constants) / min(constants)
-    # Channels may have different constants, so that their targets may differ too.
-    if ratio > 1 + 6 * max(options["reflectance_error"], LEAST_DOUBT) and not found.channels:
-        talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
-    for channel in found.channels:
-        error, spread = 100 * channel.relative_error, 100 * channel.spread
-        numbers = f"constant {channel.constant:.4g} +- {error:.1f} %, spread {spread:.1f} %"
-        where = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
-        talk(f"{where}: {count(channel.echoes, 'echo')}, {numbers}")
-    talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
+    return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
+
+
+def _describe_target(target: TargetResult) -> str:
+    if target.constant is None:
+        return f"{target.name}: reflectance {target.reflectance:g}, refused: {target.refused}"
+    return (
+        f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, constant "
+        f"{target.constant:.4g}, spread {100 * target.spread:.1f} %, incidence {target.incidence_deg:.1f} +- "
+        f"{target.incidence_error_deg:.1f} deg"
+    )
+
+
+def _describe_channel(channel: ChannelConstant) -> str:
+    return (
+        f"digitizer {channel.digitizer}, scanner channel {channel.scanner}: {count(channel.echoes, 'echo')}, constant "
+        f"{channel.constant:.4g} +- {100 * channel.relative_error:.1f} %, spread {100 * channel.spread:.1f} %, "
+        f"from shot to shot {100 * channel.shot_energy:.1f} %"
+    )

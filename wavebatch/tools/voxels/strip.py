@@ -22,9 +22,10 @@ from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
-from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import Request, make_choice
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
@@ -93,7 +94,9 @@ class VoxelSummary:
     sensor: str | None = None
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
-    """Waveforms with signal of unknown cross section."""
+    """Waveforms with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
+    warnings: tuple[str, ...] = ()
+    """Why cross sections may be less sure than the calibration says."""
 
 
 def voxelize_strip(
@@ -122,8 +125,8 @@ def voxelize_strip(
     check_target(target, strip)
     refuse_existing(target, overwrite)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-        pulse = _find_pulse(reader, scan, system, calibration)
         source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
+        pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
         middle = _find_middle(reader, scan, options)
         ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
         with _open_grid(reader, middle, options, calibration is not None, held) as grid:
@@ -149,26 +152,33 @@ def voxelize_strip(
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
                 noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
+                warnings=doubts,
             )
 
 
 def _find_pulse(
-    reader: StripReader, scan: StripScan, saved: SavedSurvey | None, calibration: Calibration | None
-) -> SystemPulse:
-    """The system pulse, saved or learned from the strip, with the calibration."""
+    reader: StripReader,
+    scan: StripScan,
+    saved: SavedSurvey | None,
+    calibration: Calibration | None,
+    sensor: SensorSource,
+) -> tuple[SystemPulse, tuple[str, ...]]:
+    """The system pulse that `wavebatch run` would use, with the calibration of each channel, and warnings."""
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
-    system = survey_blocks(read_sample(reader, scan)).system if saved is None else saved.survey.system
+    choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
+    system = choice.survey.system
     if calibration is None:
-        return system
-    system = calibration.apply(system)
+        return system, ()
+    fitted = match_strip(calibration, reader, scan, system, sensor, choice.chain)
+    system = fitted.calibration.apply(system)
     if system.divergence is None:
         raise ConfigError(
             "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration or give "
             "a --system file that has it"
         )
-    return system
+    return system, (*fitted.warnings, *filter(None, [sensor.doubt()]))
 
 
 def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | None) -> SensorSource:
