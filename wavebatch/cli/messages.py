@@ -251,15 +251,16 @@ class Progress:
             if self._debug:
                 self._say("".join(traceback.format_exception(error)).rstrip())
             self._say(f"error: {_place(printable(strip), one_line(error))}")
-        elif kind == "written":
-            # Warnings are printed with --quiet too: they say how far what is written can be trusted.
-            lines = [f"warning: {line}" for line in event["warnings"]]
-            if self._level >= 0:
-                self._say(printable(_summary(event, self._level > 0)))
-                lines += [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
-                lines += event["remarks"]
-            for line in lines:
+        elif kind == "written" and self._level >= 0:
+            self._say(printable(_summary(event, self._level > 0)))
+            warnings = [f"warning: {line}" for line in event["warnings"]]
+            more = [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
+            for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
+        elif kind == "written":
+            # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
+            for line in event["doubts"]:
+                self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
         elif kind == "flight" and self._level > 0:
