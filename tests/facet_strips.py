@@ -26,7 +26,7 @@ AIR = 0.22
 class Facet:
     """A plane z = z0 + sx (x - x0) + sy (y - y0) where `inside(x, y)`; `inside` None: everywhere."""
 
-    reflectance: float
+    reflectance: float | Callable[[np.ndarray, np.ndarray], np.ndarray]
     z0: float = 0.0
     slope: tuple[float, float] = (0.0, 0.0)
     centre: tuple[float, float] = (0.0, 0.0)
@@ -145,7 +145,8 @@ def _trace(origin: np.ndarray, ray: np.ndarray, facets: Sequence[Facet], sensor:
         hit = (fall > 0) & (t > 0) & (t < best) & (True if facet.inside is None else facet.inside(x, y))
         facing = fall / np.sqrt(1 + sx * sx + sy * sy)
         best = np.where(hit, t, best)
-        strength = np.where(hit, facet.reflectance * facing, strength)
+        bright = facet.reflectance(x, y) if callable(facet.reflectance) else facet.reflectance
+        strength = np.where(hit, bright * facing, strength)
     best = np.where(np.isfinite(best), best, 1e6)
     air = 10.0 ** (-2e-4 * AIR * best)
     return best, sensor.light * strength * air / best**2 / len(offsets)

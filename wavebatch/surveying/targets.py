@@ -133,9 +133,9 @@ def build_calibration(
         reasons = "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
-    ranging = _ranging_error(source.sensor, used, options.attenuation)
+    ranging = measure_ranging(source.sensor, used["distance"], options.attenuation)
     channels = tuple(
-        _describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
+        describe_channel(replace(row, relative_error=float(np.hypot(row.relative_error, ranging))), source)
         for row in _measure_channels(measured)
     )
     # The constant of all together serves files of tools that know no channels; its error covers how far they differ.
@@ -168,10 +168,10 @@ def _fit_errors(parts: Sequence[np.ndarray]) -> np.ndarray:
     return rows["light_err"] / rows["light"]
 
 
-def _ranging_error(sensor: SensorSource, used: np.ndarray, attenuation: float) -> float:
-    """Relative error of the constant from that of the sensor's position, which all echoes share."""
-    distance = np.array([np.median(used["distance"])])
-    return float(backscatter_error(np.zeros(1), distance, sensor.error, 0.0, attenuation)[0])
+def measure_ranging(sensor: SensorSource, distance: np.ndarray, attenuation: float) -> float:
+    """Return the relative error of the constant from that of the sensor's position, which all echoes share."""
+    middle = np.array([np.median(distance)])
+    return float(np.nan_to_num(backscatter_error(np.zeros(1), middle, sensor.error, 0.0, attenuation)[0]))
 
 
 def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndarray]]) -> list[ChannelConstant]:
@@ -190,8 +190,8 @@ def _measure_channels(measured: Sequence[tuple[TargetResult, np.ndarray, np.ndar
     return found
 
 
-def _describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstant:
-    """The row with how its channel records, for the comparison with other strips."""
+def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstant:
+    """Return the row with how its channel records, for the comparison with other strips."""
     digitizer = source.reader.facts.digitizers[row.digitizer]
     system = source.system.digitizers.get(row.digitizer, source.system)
     return replace(
@@ -220,7 +220,7 @@ def _list_doubts(
                 f"{result.name}: echoes near its outline give a constant {100 * result.edge:+.1f} % off that of its "
                 "middle: check outline and coordinates; the error holds it"
             )
-        if result.strange > MOST_STRANGE and len(channels) < 2:
+        if result.strange > MOST_STRANGE:
             yield (
                 f"{result.name}: {100 * result.strange:.0f} % of its echoes are darker or brighter than the target by "
                 "far: check its outline and the coordinates"

@@ -38,6 +38,9 @@ ECHO = np.dtype([
 _BLOCK = 8192
 """Waveforms that are read at a time."""
 
+_CHANNEL_SAMPLE = 4096
+"""Waveforms that show which scanner channels a strip has."""
+
 _LIGHT = "relative_backscatter"
 _GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 _ADJUSTED = 1e9
@@ -159,3 +162,17 @@ def read_sensor_name(facts: StripFacts) -> str:
     """Return the system identifier of the header; empty where it names no sensor."""
     name = decode_text(facts.header.system_identifier).strip()
     return "" if name.upper() in ("OTHER", "MERGE", "MODIFICATION", "EXTRACTION", "TRANSFORMATION", "") else name
+
+
+def see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], float]:
+    """Return the share of the waveforms of each digitizer and scanner channel, by a sample for the scanner channels."""
+    total = sum(scan.by_descriptor.values())
+    counts: dict[int, np.ndarray] = {}
+    for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
+        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
+        counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
+    shares = {}
+    for index, number in sorted(scan.by_descriptor.items()):
+        of = counts.get(index, np.eye(SCANNERS)[0])
+        shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}
+    return shares

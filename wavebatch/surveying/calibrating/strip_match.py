@@ -22,7 +22,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibrating.strip_echoes import SCANNERS, read_day, read_sensor_name
+from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 
@@ -43,8 +43,8 @@ AIR_DOUBT = 0.5
 FAR = 1.3
 """Ratio of distances from which the strip's and the targets' are named."""
 
-_CHAIN_SAMPLE, _CHANNEL_SAMPLE = 2048, 4096
-"""Waveforms on which two chains are compared, and that show which scanner channels a strip has."""
+_CHAIN_SAMPLE = 2048
+"""Waveforms on which two chains are compared."""
 
 _LEAST_SHARED = 50
 """Echoes that both chains must have for a comparison."""
@@ -110,7 +110,7 @@ def match_strip(
         pulse = own.sigma_ref * FWHM_PER_SIGMA
         found, reasons[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
         rows += found
-    have, seen = {(row.digitizer, row.scanner) for row in rows}, _see_channels(reader, scan)
+    have, seen = {(row.digitizer, row.scanner) for row in rows}, see_channels(reader, scan)
     problems = {
         f"{reasons[index] or f'scanner channel {scanner} of digitizer {index} was not calibrated'}": share
         for (index, scanner), share in seen.items()
@@ -129,20 +129,6 @@ def match_strip(
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, reader.facts))
     return StripMatch(replace(calibration, constant=math.nan, channels=tuple(rows)), tuple(dict.fromkeys(warnings)))
-
-
-def _see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], float]:
-    """Share of the waveforms of each digitizer and scanner channel, by a sample for the scanner channels."""
-    total = sum(scan.by_descriptor.values())
-    counts: dict[int, np.ndarray] = {}
-    for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
-        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
-        counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
-    shares = {}
-    for index, number in sorted(scan.by_descriptor.items()):
-        of = counts.get(index, np.eye(SCANNERS)[0])
-        shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}
-    return shares
 
 
 def _match_digitizer(

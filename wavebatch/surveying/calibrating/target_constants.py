@@ -95,14 +95,15 @@ def measure_target(
         )
         return replace(blank, refused=reason, inset_m=round(inset, 3)), *nothing
     constant = 4.0 * target.reflectance * np.cos(angle[used]) / rows["light"][used]
-    edge, edge_err = _compare_edge(constant, depth[used])
+    relative = _by_channel(constant, rows["channel"][used])
+    edge, edge_err = _compare_edge(relative, depth[used])
     result = replace(
         summarise(blank, constant),
         incidence_deg=float(np.degrees(np.median(angle[used]))),
         incidence_error_deg=float(np.degrees(angle_err)),
         inset_m=round(inset, 3),
         edge=edge,
-        strange=_share_strange(constant),
+        strange=_share_strange(relative),
     )
     inner = result.spread / np.sqrt(result.echoes)
     error = float(np.sqrt(reflectance_error**2 + facing_err**2 + inner**2 + edge_err**2))
@@ -114,6 +115,12 @@ def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
     middle = float(np.median(constant))
     spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
     return replace(blank, echoes=len(constant), constant=middle, spread=spread)
+
+
+def _by_channel(constant: np.ndarray, channel: np.ndarray) -> np.ndarray:
+    """Constants over the median of their channel."""
+    _, group = np.unique(channel, return_inverse=True)
+    return constant / np.array([np.median(constant[group == k]) for k in range(int(group.max()) + 1)])[group]
 
 
 def _share_strange(constant: np.ndarray) -> float:
