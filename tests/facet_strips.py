@@ -182,8 +182,13 @@ def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit) -> 
             points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
         points["gps_time"] = sensor.time + seconds
         points["bit_fields"] = 1 | (1 << (4 if sensor.scanners else 3))
+        heading = np.radians(sensor.heading)
+        across = np.degrees(np.arctan2(ray @ [-np.cos(heading), np.sin(heading), 0.0], -ray[:, 2]))
         if sensor.scanners:
+            points["scan_angle"] = np.rint(across / 0.006)
             points["classification_flags"] = (channel - 1) << 4
+        else:
+            points["scan_angle_rank"] = np.rint(across)
         points["wavepacket_index"] = used
         points["wavepacket_offset"] = offset
         points["wavepacket_size"] = sensor.n_samples * samples.dtype.itemsize

@@ -116,7 +116,8 @@ def make_ties(rng, constants, cells, outliers=0.0):
     value = bright[cell] - np.asarray(constants)[source] + rng.normal(0, 0.01, 2 * cells)
     value[rng.random(2 * cells) < outliers] += 0.7
     centre = np.column_stack([5.0 * cell, np.zeros(2 * cells)])
-    return Ties(cell, source, value, np.full(2 * cells, 0.005), np.zeros(2 * cells), centre, 5.0)
+    zero = np.zeros(2 * cells)
+    return Ties(cell, source, value, np.full(2 * cells, 0.005), zero, zero, centre, 5.0)
 
 
 def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
@@ -163,3 +164,47 @@ def test_cells_that_are_rough_or_seen_in_one_line_tie_nothing(rng):
     ties = measure_ties(np.concatenate(parts), 5.0)
     assert set(map(tuple, ties.centre)) == {(2.5, 2.5)}
     assert np.exp(ties.value) == pytest.approx([0.5, 0.5], rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def clouds(flight, tmp_path_factory):
+    """Clouds of strips a and b with the flight's calibration, and of b with that of a."""
+    folder, out = flight[0], tmp_path_factory.mktemp("clouds")
+    text = (folder / "cal.toml").read_text()
+    # Without the rows of the strips both get the mean constant of the channel, and their drifts show.
+    (out / "mean.toml").write_text(text[: text.index("[[flight_strip]]")])
+    for name, cal in (("own", folder / "cal.toml"), ("mean", out / "mean.toml")):
+        done = call("run", folder / "a.las", folder / "b.las", "-o", out / name, "--calibration", cal)
+        assert done.exit_code == 0, done.output
+    return out
+
+
+@pytest.mark.parametrize(("kind", "ratio"), [("own", 0.0), ("mean", 1 / 1.08 - 1)])
+def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
+    done = call("compare", clouds / kind / "a.laz", clouds / kind / "b.laz", "--overlap", "--json")
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    gamma = found["columns"]["backscatter_coefficient"]
+    # The scan angle does not know that the ground falls to one side: the error holds that.
+    assert gamma["cells"] > 100 and abs(gamma["median"] - ratio) < 2 * gamma["error"] < 0.01
+    assert 0.03 < gamma["stated"] < 0.2
+    assert abs(found["height"]["median"]) < 0.003
+
+
+def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
+    import laspy
+
+    cloud = laspy.read(clouds / "own" / "b.laz")
+    cloud.z = cloud.z + 0.12
+    cloud.write(tmp_path / "b.laz")
+    done = call("compare", clouds / "own" / "a.laz", tmp_path / "b.laz", "--overlap")
+    line = next(line for line in done.stdout.splitlines() if line.startswith("height"))
+    assert float(line.split()[6]) == pytest.approx(-0.12, abs=0.003)
+
+
+def test_clouds_that_do_not_overlap_are_one_line(flight):
+    folder, _ = flight
+    done = call("compare", folder / "a.las", folder / "d.las", "--overlap")
+    assert done.exit_code == 2 and "they do not overlap" in done.stderr
+    done = call("compare", folder / "a.las", "--overlap")
+    assert done.exit_code == 2 and "--overlap needs two clouds" in done.stderr

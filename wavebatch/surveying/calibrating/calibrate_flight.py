@@ -20,7 +20,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying.calibrating.adjust_flight import LEAST_TIES, Adjustment, adjust_constants
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, measure_ties
+from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
 from wavebatch.surveying.targets import (
     CalibrationOptions,
@@ -38,8 +38,6 @@ HEIGHT_DOUBT, LEAST_HEIGHT = 5.0, 0.05
 
 LEAST_DRIFT = 4.0
 """Drifts of this many standard deviations are named."""
-
-_SQUARE = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +166,7 @@ def _read_strip(
             inside = np.zeros(len(xyz), bool)
             for bottom, top in tied:
                 inside |= ((xyz[:, :2] >= bottom) & (xyz[:, :2] <= top)).all(axis=1)
-            return inside & (_hash_squares(xyz) < share)
+            return inside & (hash_squares(xyz) < share)
 
         for rows in source.echoes(lambda xyz: near(xyz) | tying(xyz)):
             for target, some in zip(targets, on_targets, strict=True):
@@ -199,15 +197,6 @@ def _thin(source: EchoSource, own: tuple[np.ndarray, np.ndarray], tied: Sequence
     common = [np.maximum(np.minimum(own[1], top) - np.maximum(own[0], low), 0.0) for low, top in tied]
     shared = min(sum(float(np.prod(edge)) for edge in common), area)
     return MOST_TIES / max(source.scan.packets * shared / area, MOST_TIES)
-
-
-def _hash_squares(xyz: np.ndarray) -> np.ndarray:
-    """A number from 0 to 1 for each square of 10 m, the same in every strip."""
-    x, y = (np.floor(xyz[:, axis] / _SQUARE).astype(np.int64).astype(np.uint64) for axis in (0, 1))
-    mixed = (x * np.uint64(0x9E3779B97F4A7C15)) ^ (y * np.uint64(0xC2B2AE3D27D4EB4F))
-    mixed ^= mixed >> np.uint64(29)
-    mixed *= np.uint64(0xBF58476D1CE4E5B9)
-    return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
 def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:

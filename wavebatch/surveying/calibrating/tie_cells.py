@@ -44,7 +44,9 @@ class Ties:
     error: np.ndarray
     """Standard deviation of the value by the scatter of the echoes."""
     height: np.ndarray
-    """Mean height of the source's echoes over the plane through the echoes of all sources [m]."""
+    """Median height of the source's echoes over one plane of the cell [m]: it compares within a cell only."""
+    slope: np.ndarray
+    """Slope of the cell [rad]."""
     centre: np.ndarray
     """Centre of the cell, f8 (k, 2) [m]."""
     size: float
@@ -61,7 +63,19 @@ def choose_size(rows: np.ndarray) -> float:
     return float(np.clip(max(sizes, default=SMALLEST), SMALLEST, LARGEST))
 
 
-def measure_ties(rows: np.ndarray, size: float) -> Ties:
+def hash_squares(xyz: np.ndarray) -> np.ndarray:
+    """Return a number from 0 to 1 for the square of 10 m that each position f8 (n, 3) lies in, the same in every strip.
+
+    Echoes below a share come from that share of the squares: a sample with whole cells.
+    """
+    x, y = (np.floor(xyz[:, axis] / LARGEST).astype(np.int64).astype(np.uint64) for axis in (0, 1))
+    mixed = (x * np.uint64(0x9E3779B97F4A7C15)) ^ (y * np.uint64(0xC2B2AE3D27D4EB4F))
+    mixed ^= mixed >> np.uint64(29)
+    mixed *= np.uint64(0xBF58476D1CE4E5B9)
+    return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
+
+
+def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> Ties:
     """Measure what each source saw in each flat cell.
 
     Parameters
@@ -70,6 +84,8 @@ def measure_ties(rows: np.ndarray, size: float) -> Ties:
         Clean single echoes of all sources.
     size : float
         Edge of a cell [m].
+    slope : float, optional
+        Largest slope of a cell [rad]; by default any that rays do not strike too steeply.
 
     Returns
     -------
@@ -82,23 +98,23 @@ def measure_ties(rows: np.ndarray, size: float) -> Ties:
     rows, cell, pair = _keep_shared(rows, cell)
     if not len(rows):
         empty = np.empty(0)
-        return Ties(empty.astype(int), empty.astype(int), empty, empty, empty, np.empty((0, 2)), size)
+        return Ties(empty.astype(int), empty.astype(int), empty, empty, empty, empty, np.empty((0, 2)), size)
     _, cell = np.unique(cell, return_inverse=True)
-    off, facing, flat = _fit_cells(rows, cell)
+    off, facing, tilt, flat = _fit_cells(rows, cell, np.unique(pair, return_inverse=True)[1], slope)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.log(rows["light"].astype(np.float64) / (4.0 * facing))
     good = flat & np.isfinite(value)
-    rows, cell, value, off = rows[good], cell[good], value[good], off[good]
-    rows, kept_cell, pair, value, off = _keep_shared(rows, cell, value, off)
+    rows, cell, value, off, tilt = rows[good], cell[good], value[good], off[good], tilt[good]
+    rows, kept_cell, pair, value, off, tilt = _keep_shared(rows, cell, value, off, tilt)
     if not len(rows):
         return measure_ties(rows, size)
-    pairs, at, number = np.unique(pair, return_index=True, return_counts=True)
-    middle, spread = _medians(value, pair, len(pairs))
+    _, at, number = np.unique(pair, return_index=True, return_counts=True)
+    middle, spread = _medians(value, pair)
     _, cells = np.unique(kept_cell[at], return_inverse=True)
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
-    height = np.bincount(np.unique(pair, return_inverse=True)[1], off) / number
+    height, _ = _medians(off, pair)
     error = 1.2533 * np.maximum(spread, 1e-3) / np.sqrt(number)
-    return Ties(cells, rows["source"][at], middle, error, height, centre.astype(np.float64), size)
+    return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size)
 
 
 def _keep_shared(rows: np.ndarray, cell: np.ndarray, *more: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -116,26 +132,38 @@ def _keep_shared(rows: np.ndarray, cell: np.ndarray, *more: np.ndarray) -> tuple
     return rows[order], cell[order], pair[order], *(values[order] for values in more)
 
 
-def _fit_cells(rows: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Height over the plane of its cell [m], cosine of the incidence, and whether to use it, for each row."""
-    n = int(cell[-1]) + 1
-    count = np.bincount(cell, minlength=n)
+def _fit_cells(
+    rows: np.ndarray, cell: np.ndarray, pair: np.ndarray, slope: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Height over the plane of its cell [m], cosine of the incidence, slope [rad], and whether to use it, of each row.
+
+    The plane goes through the echoes of every source less their mean: strips that lie over each other by a step have
+    the same slope, and the step shows in the heights.
+    """
     xyz = rows["xyz"].astype(np.float64)
-    mean = np.stack([np.bincount(cell, xyz[:, axis], n) / count for axis in range(3)], axis=1)
-    local = xyz - mean[cell]
+    local, n = xyz - _means(xyz, pair)[pair], int(cell[-1]) + 1
     planes = fit_planes(local, cell, n)
     normal = planes.normal * np.where(planes.normal[:, 2:] < 0, -1.0, 1.0)
     along = np.einsum("ij,ij->i", local - planes.centre[cell], normal[cell])
     facing = np.abs(np.einsum("ij,ij->i", rows["ray"].astype(np.float64), normal[cell]))
-    flat = (planes.spreads[:, 0] < MOST_SCATTER**2) & (planes.kept >= LEAST_KEPT * count)
+    flat = (planes.spreads[:, 0] < MOST_SCATTER**2) & (planes.kept >= LEAST_KEPT * np.bincount(cell, minlength=n))
     # The plane must be known in two directions: scan lines of one strip may cross a cell in one line.
     flat &= planes.spreads[:, 1] > np.maximum(25.0 * planes.spreads[:, 0], 1e-4)
+    tilt = np.arccos(np.clip(normal[:, 2], 0.0, 1.0))
+    if slope is not None:
+        flat &= tilt <= slope
     on = np.abs(along) <= planes.limit[cell]
-    up = np.maximum(normal[cell, 2], 0.1)
-    return along / up, facing, flat[cell] & on & (facing > np.cos(STEEPEST))
+    height = np.einsum("ij,ij->i", xyz - _means(xyz, cell)[cell], normal[cell]) / np.maximum(normal[cell, 2], 0.1)
+    return height, facing, tilt[cell], flat[cell] & on & (facing > np.cos(STEEPEST))
 
 
-def _medians(value: np.ndarray, pair: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+def _means(xyz: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """Mean of the rows of each group, f8 (groups, 3)."""
+    count = np.bincount(group)
+    return np.stack([np.bincount(group, xyz[:, axis]) / count for axis in range(3)], axis=1)
+
+
+def _medians(value: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Median and robust standard deviation of the values of each pair; pairs are in order."""
     _, group, count = np.unique(pair, return_inverse=True, return_counts=True)
     start = np.cumsum(count) - count
