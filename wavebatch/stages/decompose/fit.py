@@ -253,8 +253,8 @@ def describe_solutions(
     flat = [_flatten(clusters, solution) for solution in solutions]
     waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
+    errors *= error_factors(system, block.spacing, parameters[:, 2])
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
-    errors *= error_factors(system, block.spacing)
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1
