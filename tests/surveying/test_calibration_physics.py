@@ -315,6 +315,16 @@ def test_what_is_extrapolated_is_named_and_widens_the_error(tmp_path, channels, 
     assert np.nanmedian(relative) > least
 
 
+def test_a_check_whose_key_is_taken_out_of_the_file_is_not_made(tmp_path, channels):
+    lines = (channels / "two.toml").read_text().splitlines()
+    (tmp_path / "cal.toml").write_text("\n".join(line for line in lines if not line.startswith("pulse_ns")))
+    strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(pulse=((1.0, 0.0, 1.0),)), 3000)
+    assert run_with(tmp_path, strip, channels / "two.toml").exit_code == 4
+    assert run_with(tmp_path, strip, tmp_path / "cal.toml").exit_code == 0
+    strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(bits=8, light=6e7), 3000)
+    assert run_with(tmp_path, strip, tmp_path / "cal.toml").exit_code == 4
+
+
 def test_an_old_file_that_cannot_be_checked_says_so(tmp_path, channels):
     (tmp_path / "old.toml").write_text(
         'schema = "wavebatch.calibration/1"\nconstant = 1.6e-8\nrelative_error = 0.02\ndivergence_mrad = 0.5\n'

@@ -79,8 +79,8 @@ class ChannelConstant:
 
     @property
     def is_described(self) -> bool:
-        """Whether it is known how the channel records."""
-        return None not in (self.bits, self.spacing_ns, self.gain, self.pulse_ns)
+        """Whether anything is known of how the channel records."""
+        return any(value is not None for value in (self.bits, self.spacing_ns, self.gain, self.pulse_ns))
 
 
 @dataclass(frozen=True, slots=True)

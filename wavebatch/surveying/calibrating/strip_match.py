@@ -151,7 +151,7 @@ def _match_digitizer(
     if not found:
         numbers = ", ".join(sorted({str(row.digitizer) for row in fitting}, key=int))
         return [], f"digitizer {digitizer.index} was not calibrated, only {numbers}, which may have another gain"
-    ratio = pulse / found[0].pulse_ns
+    ratio = pulse / (found[0].pulse_ns or pulse)
     if max(ratio, 1 / ratio) > NEAR_PULSE:
         warnings.append(
             f"calibration: the pulse of this strip is {pulse:.3g} ns wide, that of the calibration "
@@ -162,16 +162,16 @@ def _match_digitizer(
 
 
 def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str:
-    """Why a channel's constant cannot hold for a digitizer; empty where it can."""
-    if row.bits != digitizer.bits:
+    """Why a channel's constant cannot hold for a digitizer; empty where it can. What is not known is not checked."""
+    if row.bits is not None and row.bits != digitizer.bits:
         return f"digitizer {digitizer.index} has {digitizer.bits} bits, the calibration {row.bits}"
     for name, unit, own, other in (
         ("spacing", "ns", digitizer.spacing, row.spacing_ns),
         ("gain", "V per count", digitizer.gain, row.gain),
     ):
-        if abs(own - other) > SAME * max(abs(own), abs(other)):
+        if other is not None and abs(own - other) > SAME * max(abs(own), abs(other)):
             return f"digitizer {digitizer.index} has a {name} of {own:g} {unit}, the calibration {other:g}"
-    ratio = pulse / row.pulse_ns
+    ratio = pulse / (row.pulse_ns or pulse)
     if max(ratio, 1 / ratio) > OTHER_PULSE:
         return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns"
     return ""
@@ -183,7 +183,7 @@ def _pool_lengths(rows: list[ChannelConstant], digitizer: Digitizer) -> list[Cha
     Some sensors have a descriptor per packet length for one and the same digitizer. A descriptor of the same length is
     another channel: nobody knows its gain.
     """
-    if any(row.samples == digitizer.n_samples for row in rows):
+    if any(row.samples in (None, digitizer.n_samples) for row in rows):
         return []
     pooled = []
     for scanner in sorted({row.scanner for row in rows}):
