@@ -73,6 +73,7 @@ def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(fligh
     first, second = load_calibration(flight[0] / "cal.toml").channels
     assert first.relative_error == pytest.approx(np.hypot(0.03, np.std(np.log([1, 1.08, 0.95]), ddof=1)), rel=0.02)
     assert second.constant * 0.4275 / TRUE == pytest.approx(1.0, abs=0.002)
+    assert second.relative_error == pytest.approx(first.relative_error, rel=0.02)
 
 
 def test_a_strip_that_nothing_ties_is_named_and_has_no_constant(flight):

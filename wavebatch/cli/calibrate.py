@@ -87,7 +87,10 @@ def calibrate(strips: tuple[Path, ...], targets: Path, output: Path, overwrite: 
         talk(line)
     for note in found.notes:
         talk(f"warning: {note}")
-    talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
+    numbers = f"constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %"
+    if len(found.channels) > 1:
+        numbers = f"constants of {len(found.channels)} channels"
+    talk(f"{output}: {numbers}; {found.conditions}")
 
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
@@ -142,8 +145,9 @@ def _describe_target(target: TargetResult) -> str:
 
 
 def _describe_channel(channel: ChannelConstant) -> str:
-    return (
-        f"digitizer {channel.digitizer}, scanner channel {channel.scanner}: {count(channel.echoes, 'echo')}, constant "
-        f"{channel.constant:.4g} +- {100 * channel.relative_error:.1f} %, spread {100 * channel.spread:.1f} %, "
-        f"from shot to shot {100 * channel.shot_energy:.1f} %"
-    )
+    name = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
+    constant = f"constant {channel.constant:.4g} +- {100 * channel.relative_error:.1f} %"
+    if not channel.echoes:
+        return f"{name}: no target, by overlap, {constant}"
+    scatter = f"spread {100 * channel.spread:.1f} %, from shot to shot {100 * channel.shot_energy:.1f} %"
+    return f"{name}: {count(channel.echoes, 'echo')}, {constant}, {scatter}"

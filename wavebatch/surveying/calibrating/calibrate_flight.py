@@ -244,14 +244,15 @@ def _assemble(
     """The calibration of the flight: a constant per channel, and one per channel and strip."""
     good = [strip.found for strip in strips if strip.found is not None]
     shared = _reflectance_error(good, options)
-    channels, rows = [], []
+    channels, rows, scatter = [], [], _drift_scatter(sources, adjusted)
     for channel in sorted({channel for _, channel in sources}):
         mine = [k for k, (_, other) in enumerate(sources) if other == channel and np.isfinite(adjusted.value[k])]
         if not mine:
             continue
         mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
         drift = adjusted.value[mine] - mean
-        apart = float(np.std(drift, ddof=1)) if len(mine) > 1 else 0.0
+        # A channel of one strip says nothing of its drift: it is credited with that of the others.
+        apart = float(np.std(drift, ddof=1)) if len(mine) > 1 else scatter
         ranging = float(np.mean([strips[sources[k][0]].ranging for k in mine]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
         channels.append(_describe_row(strips, sources, mine, math.exp(mean), error))
@@ -279,6 +280,17 @@ def _assemble(
         strips=tuple(rows),
         notes=notes,
     )
+
+
+def _drift_scatter(sources: Sequence[tuple[int, int]], adjusted: Adjustment) -> float:
+    """Standard deviation of the logarithms of a channel's constants between strips; 0 where no channel has two."""
+    channel = np.array([other for _, other in sources])
+    squares, freedom = 0.0, 0
+    for one in np.unique(channel):
+        values = adjusted.value[(channel == one) & np.isfinite(adjusted.value)]
+        squares += float(np.sum((values - values.mean()) ** 2)) if len(values) else 0.0
+        freedom += max(len(values) - 1, 0)
+    return math.sqrt(squares / freedom) if freedom else 0.0
 
 
 def _name_target(row: TargetResult, strip: _Strip) -> TargetResult:
@@ -364,7 +376,7 @@ def _list_notes(
     for row in calibration.strips:
         if row.drift_error > 0 and abs(row.drift) > max(LEAST_DRIFT * row.drift_error, 0.01):
             yield (
-                f"{row.strip}: its constant is {100 * row.drift:+.1f} +- {100 * row.drift_error:.1f} % off the mean of "
+                f"{row.strip}: its constant is {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} % off the mean of "
                 f"digitizer {row.digitizer}, scanner channel {row.scanner}"
             )
     for pair in pairs:

@@ -45,11 +45,11 @@ def _draw_drifts(axes: Axes, strips: Sequence[StripConstant]) -> None:
         [100 * row.drift for row in strips], rows, xerr=[100 * row.drift_error for row in strips], fmt="o", ms=4,
         color="#1f5a99", capsize=2,
     )  # fmt: skip
-    names = [f"{row.strip}: {row.digitizer}, {row.scanner}" for row in strips]
+    names = [f"{row.strip}: {row.digitizer}.{row.scanner}" for row in strips]
     axes.set_yticks(rows, [plain_text(name) for name in names])
     axes.invert_yaxis()
-    axes.set_title("Constant of each strip off the mean of its channel (strip: digitizer, scanner channel)")
-    axes.set_xlabel("drift [%]")
+    axes.set_title("Drift of each strip (strip: digitizer.scanner channel)")
+    axes.set_xlabel("constant off the mean of its channel [%]")
 
 
 def _draw_pairs(axes: Axes, pairs: Sequence[PairOverlap]) -> None:
@@ -59,8 +59,13 @@ def _draw_pairs(axes: Axes, pairs: Sequence[PairOverlap]) -> None:
         [100 * (pair.after - 1) for pair in pairs], rows, xerr=[100 * pair.spread for pair in pairs], fmt="o", ms=4,
         color="#2f7d4f", capsize=2, label="after; bars: spread of the cells",
     )  # fmt: skip
-    axes.set_yticks(rows, [plain_text(f"{pair.a} / {pair.b} ({pair.cells})") for pair in pairs])
+    axes.set_yticks(rows, [plain_text(f"{_shorten(pair.a)} / {_shorten(pair.b)} ({pair.cells})") for pair in pairs])
     axes.invert_yaxis()
-    axes.set_title("Light of each two strips where they overlap (cells)")
-    axes.set_xlabel("difference [%]")
+    axes.set_title("Overlaps (number of cells)")
+    axes.set_xlabel("light of the first over that of the second [%]")
     axes.legend(loc="best")
+
+
+def _shorten(name: str) -> str:
+    """The name of a source as it is drawn: `c.las: 2.0` for digitizer 2, scanner channel 0."""
+    return name.replace(" digitizer ", ": ").replace(" scanner channel ", ".")
