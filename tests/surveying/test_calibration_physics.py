@@ -11,9 +11,10 @@ from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_str
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
 from wavebatch.kernels.geometry.facets import fit_facet
+from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.targets import CalibrationOptions, calibrate_strip
+from wavebatch.surveying.targets import CalibrationOptions
 
 RINGING = ((1.0, 0.0, 2.0), (0.06, 9.0, 2.2), (0.03, 16.0, 2.5))
 TAIL = ((1.0, 0.0, 2.0), (0.3, 3.0, 3.0))
@@ -23,6 +24,10 @@ DENSE = {"speed": 30.0, "line_rate": 50.0, "half_angle": 4.0}
 
 def call(*arguments):
     return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+def calibrate_strip(path, targets, options):
+    return calibrate_flight([path], targets, options).calibration
 
 
 def outline(x0, y0, x1, y1):

@@ -18,7 +18,8 @@ from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
-    from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration, PairOverlap
+    from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+    from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
     from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
     from wavebatch.surveying.targets import CalibrationOptions
 

@@ -1,7 +1,7 @@
-"""Calibration on reference targets: measures the constant of every channel from a strip over targets.
+"""Calibration on reference targets: from the echoes on them to the constant of every channel of one strip.
 
-`wavebatch calibrate` calls `calibrate_strip`; `calibrating` has the parts. Before you change it: pulse, chain and
-energy must be those of `wavebatch run`, or the constant would not fit the columns that it is used for.
+`calibrating.calibrate_flight` reads the strips and calls `build_calibration` for each. Before you change it: pulse,
+chain and energy must be those of `wavebatch run`, or the constant would not fit the columns that it is used for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.calibrating.strip_echoes import (
-    ECHO,
     EchoSource,
     open_source,
     read_day,
@@ -61,38 +60,6 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
 
 
-def calibrate_strip(path: Path, targets: Sequence[Target], options: CalibrationOptions | None = None) -> Calibration:
-    """Measure the calibration constant of a strip over reference targets.
-
-    It is the median over targets of the median of each target's clean echoes that are alone in their waveform, lie on
-    the target's plane, and have their whole footprint inside its outline.
-
-    Parameters
-    ----------
-    path : Path
-        The strip.
-    targets : sequence of Target
-    options : CalibrationOptions, optional
-
-    Returns
-    -------
-    Calibration
-
-    Raises
-    ------
-    InputError
-        Where no target gives a constant, or the sensor's position is unknown.
-
-    Notes
-    -----
-    docs/algorithms.md 5.
-    """
-    options = options or CalibrationOptions()
-    with open_strip_source(path, options) as source:
-        found = collect_targets(source, targets)
-        return build_calibration(source, targets, found, options)
-
-
 def open_strip_source(path: Path, options: CalibrationOptions):
     """Open a strip for a calibration; see `strip_echoes.open_source`."""
     return open_source(
@@ -105,23 +72,36 @@ def open_strip_source(path: Path, options: CalibrationOptions):
     )
 
 
-def collect_targets(source: EchoSource, targets: Sequence[Target]) -> list[np.ndarray]:
-    """Return the clean single echoes (ECHO) on every target; only waveforms near a target are decomposed."""
-    found: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in targets]
-    corners = np.concatenate([target.corners for target in targets])
-    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-    for rows in source.echoes(lambda xyz: ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)):
-        x, y = rows["xyz"][:, 0], rows["xyz"][:, 1]
-        for target, parts in zip(targets, found, strict=True):
-            if sum(map(len, parts)) < MOST_ECHOES:
-                parts.append(rows[target.contains(x, y)])
-    return [np.concatenate(parts)[:MOST_ECHOES] for parts in found]
-
-
 def build_calibration(
     source: EchoSource, targets: Sequence[Target], found: Sequence[np.ndarray], options: CalibrationOptions
 ) -> Calibration:
-    """Turn the echoes on targets into a calibration; raises InputError where no target gives a constant."""
+    """Turn the echoes on targets into a calibration.
+
+    The constant is the median over targets of the median of each target's clean echoes that are alone in their
+    waveform, lie on the target's plane, and have their whole footprint inside its outline.
+
+    Parameters
+    ----------
+    source : EchoSource
+        The strip.
+    targets : sequence of Target
+    found : sequence of arrays of ECHO
+        Clean single echoes inside the outline of each target.
+    options : CalibrationOptions
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        Where no target gives a constant.
+
+    Notes
+    -----
+    docs/algorithms.md 5.
+    """
     divergence = options.divergence or source.system.divergence
     measured = [
         measure_target(target, rows, divergence, options.reflectance_error)

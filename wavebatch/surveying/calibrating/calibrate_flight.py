@@ -7,22 +7,23 @@ to a target has no constant, and a constant never goes from one channel to anoth
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.calibrating.adjust_flight import LEAST_TIES, Adjustment, adjust_constants
+from wavebatch.surveying.calibrating.adjust_flight import Adjustment, adjust_constants
+from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
 from wavebatch.surveying.calibrating.target_file import Target
 from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
 from wavebatch.surveying.targets import (
+    MOST_ECHOES,
     CalibrationOptions,
     build_calibration,
     describe_channel,
@@ -33,29 +34,8 @@ from wavebatch.surveying.targets import (
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
 
-HEIGHT_DOUBT, LEAST_HEIGHT = 5.0, 0.05
-"""Height differences of two strips are named from so many standard errors, and this [m]."""
-
-LEAST_DRIFT = 4.0
-"""Drifts of this many standard deviations are named."""
-
-
-@dataclass(frozen=True, slots=True)
-class PairOverlap:
-    """What two sources have in common."""
-
-    a: str
-    b: str
-    cells: int
-    ratio: float
-    """Light of a over that of b in the same cells, median: what differs before the calibration."""
-    after: float
-    """The same with their constants: 1 where the adjustment brings them together."""
-    spread: float
-    """Robust standard deviation of the ratio between cells, relative."""
-    height: float
-    """Median height of a over b [m]."""
-    height_spread: float
+_Box = tuple[np.ndarray, np.ndarray]
+"""Lower and upper corner in x and y [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +107,13 @@ def calibrate_flight(
     given, given_error = _list_given(strips, sources, options)
     adjusted = adjust_constants(ties, given, given_error)
     calibration = _assemble(strips, sources, adjusted, options)
-    pairs = tuple(_compare_pairs(ties, adjusted, [_name(strips, source) for source in sources]))
-    notes = [*calibration.notes, *_list_notes(strips, sources, adjusted, calibration, pairs)]
+    names = [_name(strips, source) for source in sources]
+    pairs = tuple(compare_pairs(ties, adjusted, names))
+    notes = [*calibration.notes, *find_doubts(names, adjusted, calibration.strips, pairs)]
     return FlightCalibration(replace(calibration, notes=tuple(notes)), pairs, ties.size)
 
 
-def _find_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _find_box(path: Path) -> _Box:
     """Lower and upper corner of a strip in x and y by its header."""
     with StripReader(path) as reader:
         header = reader.facts.header
@@ -142,61 +123,74 @@ def _find_box(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _read_strip(
     path: Path,
     number: int,
-    boxes: Sequence[tuple[np.ndarray, np.ndarray]],
+    boxes: Sequence[_Box],
     targets: Sequence[Target],
     options: CalibrationOptions,
 ) -> _Strip:
     """Decompose what lies on targets or in the overlap with other strips, in one pass."""
     with open_strip_source(path, options) as source:
-        channels = tuple(
-            SCANNERS * digitizer + scanner for digitizer, scanner in see_channels(source.reader, source.scan)
-        )
+        seen = see_channels(source.reader, source.scan)
+        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen)
         others = [box for i, box in enumerate(boxes) if i != number]
-        tied = [boxes[number]] if len(channels) > 1 else others
-        corners = np.concatenate([target.corners for target in targets])
-        low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
-        share = _thin(source, boxes[number], tied)
-        on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in targets]
-        parts = [np.empty(0, TIE)]
-
-        def near(xyz: np.ndarray) -> np.ndarray:
-            return ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1)
-
-        def tying(xyz: np.ndarray) -> np.ndarray:
-            inside = np.zeros(len(xyz), bool)
-            for bottom, top in tied:
-                inside |= ((xyz[:, :2] >= bottom) & (xyz[:, :2] <= top)).all(axis=1)
-            return inside & (hash_squares(xyz) < share)
-
-        for rows in source.echoes(lambda xyz: near(xyz) | tying(xyz)):
-            for target, some in zip(targets, on_targets, strict=True):
-                some.append(rows[target.contains(rows["xyz"][:, 0], rows["xyz"][:, 1])])
-            parts.append(_shorten(rows[tying(rows["xyz"])], boxes[0][0]))
+        area = _TieArea(
+            boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets
+        )
+        on_targets, ties = _collect(source, targets, area)
         found, refused = None, ""
         try:
-            found = build_calibration(source, targets, [np.concatenate(some) for some in on_targets], options)
+            found = build_calibration(source, targets, on_targets, options)
         except InputError as error:
             refused = str(error)
         blank = [ChannelConstant(channel // SCANNERS, channel % SCANNERS, 1.0, 0.0) for channel in channels]
         distance = np.array([source.sensor.distance or math.inf])
         return _Strip(
-            path,
-            take_fingerprint(path, source.reader.facts.packets.file)["sha256_sampled"],
-            found,
-            refused,
-            channels,
-            tuple(describe_channel(row, source) for row in blank),
-            measure_ranging(source.sensor, distance, options.attenuation),
-            np.concatenate(parts),
+            path=path,
+            sha256=take_fingerprint(path, source.reader.facts.packets.file)["sha256_sampled"],
+            found=found,
+            refused=refused,
+            channels=channels,
+            described=tuple(describe_channel(row, source) for row in blank),
+            ranging=measure_ranging(source.sensor, distance, options.attenuation),
+            ties=ties,
         )
 
 
-def _thin(source: EchoSource, own: tuple[np.ndarray, np.ndarray], tied: Sequence) -> float:
-    """Share of the squares that are used, so that about MOST_TIES waveforms are decomposed."""
-    area = float(np.prod(np.maximum(own[1] - own[0], 1.0)))
-    common = [np.maximum(np.minimum(own[1], top) - np.maximum(own[0], low), 0.0) for low, top in tied]
-    shared = min(sum(float(np.prod(edge)) for edge in common), area)
-    return MOST_TIES / max(source.scan.packets * shared / area, MOST_TIES)
+class _TieArea:
+    """Where a strip is decomposed for ties: squares in the boxes of those that it is tied to."""
+
+    def __init__(self, own: _Box, origin: np.ndarray, tied: Sequence[_Box], packets: int) -> None:
+        self.origin, self._tied = origin, tied
+        area = float(np.prod(np.maximum(own[1] - own[0], 1.0)))
+        common = [np.maximum(np.minimum(own[1], top) - np.maximum(own[0], low), 0.0) for low, top in tied]
+        shared = min(sum(float(np.prod(edge)) for edge in common), area)
+        self._share = MOST_TIES / max(packets * shared / area, MOST_TIES)
+        """Of the squares, so that about MOST_TIES waveforms are decomposed."""
+
+    def contains(self, xyz: np.ndarray) -> np.ndarray:
+        """Return which positions f8 (n, 3) count, bool (n,)."""
+        inside = np.zeros(len(xyz), bool)
+        for low, top in self._tied:
+            inside |= ((xyz[:, :2] >= low) & (xyz[:, :2] <= top)).all(axis=1)
+        return inside & (hash_squares(xyz) < self._share)
+
+
+def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> tuple[list[np.ndarray], np.ndarray]:
+    """Echoes on each target (ECHO), and those for ties (TIE, with channels as sources)."""
+    corners = np.concatenate([target.corners for target in targets])
+    low, high = corners.min(axis=0) - 1.0, corners.max(axis=0) + 1.0
+    on_targets: list[list[np.ndarray]] = [[np.empty(0, ECHO)] for _ in targets]
+    parts = [np.empty(0, TIE)]
+
+    def wanted(xyz: np.ndarray) -> np.ndarray:
+        return ((xyz[:, :2] >= low) & (xyz[:, :2] <= high)).all(axis=1) | area.contains(xyz)
+
+    for rows in source.echoes(wanted):
+        x, y = rows["xyz"][:, 0], rows["xyz"][:, 1]
+        for target, some in zip(targets, on_targets, strict=True):
+            if sum(map(len, some)) < MOST_ECHOES:
+                some.append(rows[target.contains(x, y)])
+        parts.append(_shorten(rows[area.contains(rows["xyz"])], area.origin))
+    return [np.concatenate(some)[:MOST_ECHOES] for some in on_targets], np.concatenate(parts)
 
 
 def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -250,25 +244,14 @@ def _assemble(
         if not mine:
             continue
         mean, trials = float(adjusted.value[mine].mean()), adjusted.trials[:, mine]
-        drift = adjusted.value[mine] - mean
         # A channel of one strip says nothing of its drift: it is credited with that of the others.
-        apart = float(np.std(drift, ddof=1)) if len(mine) > 1 else scatter
+        apart = float(np.std(adjusted.value[mine], ddof=1)) if len(mine) > 1 else scatter
         ranging = float(np.mean([strips[sources[k][0]].ranging for k in mine]))
         error = float(np.sqrt(np.std(trials.mean(axis=1), ddof=1) ** 2 + shared**2 + apart**2 + ranging**2))
         channels.append(_describe_row(strips, sources, mine, math.exp(mean), error))
-        off = np.std(trials - trials.mean(axis=1)[:, None], axis=0, ddof=1) if len(mine) > 1 else np.zeros(1)
-        for k, own, own_error in zip(mine, drift, off, strict=True):
-            strip = strips[sources[k][0]]
-            whole = float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + strip.ranging**2))
-            rows.append(
-                StripConstant(
-                    strip.path.name, strip.sha256, channel // SCANNERS, channel % SCANNERS,
-                    math.exp(adjusted.value[k]), whole, math.expm1(own), float(own_error), int(adjusted.ties[k]),
-                )
-            )  # fmt: skip
+        rows += _list_strips(strips, sources, mine, adjusted, shared)
     constants = np.array([row.constant for row in channels])
     error = float(np.hypot(np.std(constants) / constants.mean(), max(row.relative_error for row in channels)))
-    notes = tuple(f"{strip.path.name}: {note}" for strip in strips if strip.found for note in strip.found.notes)
     return replace(
         good[0],
         constant=float(np.median(constants)),
@@ -278,8 +261,33 @@ def _assemble(
         targets=tuple(_name_target(row, strip) for strip in strips if strip.found for row in strip.found.targets),
         channels=tuple(channels),
         strips=tuple(rows),
-        notes=notes,
+        notes=tuple(f"{strip.path.name}: {note}" for strip in strips if strip.found for note in strip.found.notes),
     )
+
+
+def _list_strips(
+    strips: Sequence[_Strip],
+    sources: Sequence[tuple[int, int]],
+    mine: Sequence[int],
+    adjusted: Adjustment,
+    shared: float,
+) -> Iterator[StripConstant]:
+    """The constants of one channel on each strip; mine: its sources, shared: error of the targets' reflectance."""
+    values, trials = adjusted.value[mine], adjusted.trials[:, mine]
+    errors = np.std(trials - trials.mean(axis=1)[:, None], axis=0, ddof=1)
+    for k, drift, error in zip(mine, np.expm1(values - values.mean()), errors, strict=True):
+        strip, channel = strips[sources[k][0]], sources[k][1]
+        yield StripConstant(
+            strip=strip.path.name,
+            sha256=strip.sha256,
+            digitizer=channel // SCANNERS,
+            scanner=channel % SCANNERS,
+            constant=math.exp(adjusted.value[k]),
+            relative_error=float(np.sqrt(adjusted.error[k] ** 2 + shared**2 + strip.ranging**2)),
+            drift=float(drift),
+            drift_error=float(error),
+            ties=int(adjusted.ties[k]),
+        )
 
 
 def _drift_scatter(sources: Sequence[tuple[int, int]], adjusted: Adjustment) -> float:
@@ -333,53 +341,3 @@ def _name(strips: Sequence[_Strip], source: tuple[int, int]) -> str:
     if len(strips[i].channels) == 1:
         return strips[i].path.name
     return f"{strips[i].path.name} digitizer {channel // SCANNERS} scanner channel {channel % SCANNERS}"
-
-
-def _compare_pairs(ties: Ties, adjusted: Adjustment, names: Sequence[str]):
-    """What each two sources have in common, where they share enough cells."""
-    order = np.argsort(ties.source, kind="stable")
-    rows = {k: order[ties.source[order] == k] for k in range(len(names))}
-    for a in range(len(names)):
-        for b in range(a):
-            _, left, right = np.intersect1d(ties.cell[rows[a]], ties.cell[rows[b]], return_indices=True)
-            if len(left) < LEAST_TIES:
-                continue
-            i, j = rows[a][left], rows[b][right]
-            value, height = ties.value[i] - ties.value[j], ties.height[i] - ties.height[j]
-            middle, level = float(np.median(value)), float(np.median(height))
-            yield PairOverlap(
-                names[a],
-                names[b],
-                len(i),
-                math.exp(middle),
-                math.exp(middle + adjusted.value[a] - adjusted.value[b]),
-                MAD_TO_STD * float(np.median(np.abs(value - middle))),
-                level,
-                MAD_TO_STD * float(np.median(np.abs(height - level))),
-            )
-
-
-def _list_notes(
-    strips: Sequence[_Strip],
-    sources: Sequence[tuple[int, int]],
-    adjusted: Adjustment,
-    calibration: Calibration,
-    pairs: Sequence[PairOverlap],
-):
-    """Sources without a constant, drifts, heights that do not fit."""
-    for number, source in enumerate(sources):
-        if not np.isfinite(adjusted.value[number]):
-            yield (
-                f"{_name(strips, source)}: has no constant: no target lies on it, and fewer than {LEAST_TIES} flat "
-                "cells tie it to a strip or channel that has one"
-            )
-    for row in calibration.strips:
-        if row.drift_error > 0 and abs(row.drift) > max(LEAST_DRIFT * row.drift_error, 0.01):
-            yield (
-                f"{row.strip}: its constant is {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} % off the mean of "
-                f"digitizer {row.digitizer}, scanner channel {row.scanner}"
-            )
-    for pair in pairs:
-        error = pair.height_spread / math.sqrt(pair.cells)
-        if abs(pair.height) > max(HEIGHT_DOUBT * error, LEAST_HEIGHT):
-            yield f"{pair.a} lies {pair.height:+.2f} m over {pair.b}: check boresight, trajectory and heights"

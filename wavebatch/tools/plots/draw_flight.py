@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration, PairOverlap
+from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
 from wavebatch.surveying.calibration import StripConstant
 
 if TYPE_CHECKING:
