@@ -296,3 +296,13 @@ def crlb_joint(time, amplitude, sigma, noise_std, spacing, n_samples):
     variance = (vectors**2 / values[:, None, :]).sum(axis=2).T
     std = np.sqrt(np.where(np.isnan(variance), np.inf, variance)) / scale * noise_std
     return std[:k], std[k : 2 * k], std[2 * k :]
+
+
+def fit_slope(across, along, shared):
+    """Slope (2,) of `along` over places across (k, 2), and its covariance: points share an error within a scan line."""
+    table = np.column_stack([across, np.ones(len(across))])
+    solution, *_ = np.linalg.lstsq(table, along, rcond=None)
+    left = along - table @ solution
+    noise = left @ left / (len(along) - 3)
+    spread = np.cov(across.T, bias=True)
+    return solution[:2], np.linalg.inv(spread) * (noise / len(along) + shared**2 / 4)

@@ -10,7 +10,6 @@ import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip, write_trajectory
 from wavebatch.cli import main
 from wavebatch.core.errors import InputError
-from wavebatch.kernels.geometry.facets import fit_facet
 from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibrating.target_file import Target
@@ -130,39 +129,6 @@ def test_a_target_of_one_scan_line_is_refused_by_name_and_needs_its_incidence(tm
     found = calibrate_strip(strip, [known, target], CalibrationOptions(divergence=0.2))
     assert found.constant == pytest.approx(constant_of(sensor), rel=0.01)
     assert [bool(result.refused) for result in found.targets] == [False, True]
-
-
-def test_the_error_of_a_plane_holds_its_error(rng):
-    """Two scan lines at any distance, each a centimetre off: the angle's error in units of the stated one."""
-    ratios = []
-    for _ in range(300):
-        apart, k = rng.uniform(0.1, 3.0), 20
-        line = np.arange(2 * k) % 2
-        u, v = rng.uniform(-3, 3, 2 * k), apart * line
-        slope = rng.uniform(-0.6, 0.6, 2)
-        w = slope[0] * u + slope[1] * v + rng.normal(0, 0.01, 2)[line] / math.sqrt(2) + rng.normal(0, 0.02, 2 * k)
-        facet = fit_facet(np.column_stack([u, v, -w]), np.tile([0.0, 0.0, -1.0], (2 * k, 1)))
-        true = math.atan(math.hypot(*slope))
-        if np.isfinite(facet.angle_error):
-            ratios.append((facet.angles(np.array([[0, 0, -1.0]]))[0] - true) / facet.angle_error)
-    within = np.mean(np.abs(ratios) < 1)
-    assert len(ratios) > 250 and 0.6 < within < 0.92
-
-
-def test_rays_in_a_line_know_no_angle(rng):
-    u = rng.uniform(-3, 3, 100)
-    xyz = np.column_stack([u, 0.3 * u, 0.1 * u + rng.normal(0, 0.02, 100)])
-    facet = fit_facet(xyz, np.tile([0.0, 0.0, -1.0], (100, 1)))
-    assert math.isinf(facet.angle_error) and math.isinf(facet.facing_error)
-
-
-def test_a_car_on_the_target_does_not_tilt_it(rng):
-    uv = rng.uniform(-5, 5, (400, 2))
-    car = (uv[:, 0] > 1) & (np.abs(uv[:, 1]) < 3)
-    w = 0.2 * uv[:, 0] + rng.normal(0, 0.01, 400) - 1.5 * car
-    facet = fit_facet(np.column_stack([uv, -w]), np.tile([0.0, 0.0, -1.0], (400, 1)))
-    assert not facet.kept[car].any() and facet.kept[~car].mean() > 0.99
-    assert facet.angles(np.array([[0, 0, -1.0]]))[0] == pytest.approx(math.atan(0.2), abs=2e-3)
 
 
 def tarp_strip(path, size, divergence):

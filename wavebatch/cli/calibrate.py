@@ -113,6 +113,7 @@ def _list_report(flight: FlightCalibration) -> dict[str, Any]:
     return {
         "schema": "wavebatch.calibration-report/1",
         **found.describe(),
+        "strips": [asdict(row) for row in found.strips],
         "targets": [asdict(row) for row in found.targets],
         "pairs": [asdict(row) for row in flight.pairs],
         "cell_m": flight.cell,

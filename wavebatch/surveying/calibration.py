@@ -6,6 +6,7 @@ each strip with `calibrating.strip_match`. Before you change it: give new fields
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -18,6 +19,8 @@ NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectanc
 """Columns that need the sensor's position."""
 
 _REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
+_MOST_DESCRIBED = 8
+"""Strips that a description lists one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +171,15 @@ class Calibration:
             "section_constant": self.section_constant,
             **{name: getattr(self, name) for name in _REPORTED},
             "channels": [asdict(row) for row in self.channels],
-            "strips": [asdict(row) for row in self.strips],
+            "strips": self._describe_strips(),
         }
+
+    def _describe_strips(self) -> Any:
+        """The constants of single strips, or their number and hash: every cloud of a flight holds this description."""
+        if len(self.strips) <= _MOST_DESCRIBED:
+            return [asdict(row) for row in self.strips]
+        text = repr([tuple(asdict(row).values()) for row in self.strips])
+        return {"number": len(self.strips), "sha256": hashlib.sha256(text.encode(errors="replace")).hexdigest()}
 
 
 def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:

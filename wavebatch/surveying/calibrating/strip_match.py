@@ -128,7 +128,8 @@ def match_strip(
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, reader.facts))
-    return StripMatch(replace(calibration, constant=math.nan, channels=tuple(rows)), tuple(dict.fromkeys(warnings)))
+    fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
+    return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
 
 
 def _match_digitizer(

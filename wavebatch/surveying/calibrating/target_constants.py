@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.facets import fit_facet
 from wavebatch.surveying.calibrating.strip_echoes import SCANNERS
 from wavebatch.surveying.calibrating.target_file import Target
@@ -105,7 +105,7 @@ def measure_target(
         edge=edge,
         strange=_share_strange(relative),
     )
-    inner = result.spread / np.sqrt(result.echoes)
+    inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
     error = float(np.sqrt(reflectance_error**2 + facing_err**2 + inner**2 + edge_err**2))
     return replace(result, relative_error=error), rows[used], constant
 
@@ -137,7 +137,7 @@ def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None
     parts = [constant[outer], constant[~outer]]
     middle = [float(np.median(part)) for part in parts]
     spreads = [MAD_TO_STD * np.median(np.abs(p / m - 1.0)) for p, m in zip(parts, middle, strict=True)]
-    errors = [1.2533 * s / np.sqrt(len(p)) for s, p in zip(spreads, parts, strict=True)]  # of a median
+    errors = [MEDIAN_ERROR * s / np.sqrt(len(p)) for s, p in zip(spreads, parts, strict=True)]
     off = middle[0] / middle[1] - 1.0
     if abs(off) < max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
         return None, 0.0

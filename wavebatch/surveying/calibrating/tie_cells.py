@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.geometry.planes import fit_planes
 
 TIE = np.dtype([("xyz", "<f4", 3), ("ray", "<f4", 3), ("light", "<f4"), ("source", "<i4")])
@@ -113,7 +113,7 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
     _, cells = np.unique(kept_cell[at], return_inverse=True)
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
     height, _ = _medians(off, pair)
-    error = 1.2533 * np.maximum(spread, 1e-3) / np.sqrt(number)
+    error = MEDIAN_ERROR * np.maximum(spread, 1e-3) / np.sqrt(number)
     return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size)
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.files.cloud.overlap_reader import (
     LIGHT_COLUMNS,
     OVERLAP_COLUMNS,
@@ -165,9 +165,9 @@ def _summarise(ties: Ties, difference: np.ndarray, stated: float = math.nan) -> 
     _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
     block = block.ravel()
     means = np.array([np.median(difference[block == k]) for k in range(int(block.max()) + 1)])
-    apart = 1.2533 * MAD_TO_STD * float(np.median(np.abs(means - np.median(means)))) / math.sqrt(len(means))
+    apart = MEDIAN_ERROR * MAD_TO_STD * float(np.median(np.abs(means - np.median(means)))) / math.sqrt(len(means))
     return OverlapFigure(
-        len(difference), middle, max(apart, 1.2533 * spread / math.sqrt(len(difference))), spread, stated
+        len(difference), middle, max(apart, MEDIAN_ERROR * spread / math.sqrt(len(difference))), spread, stated
     )
 
 
