@@ -209,3 +209,13 @@ def test_clouds_that_do_not_overlap_are_one_line(flight):
     assert done.exit_code == 2 and "they do not overlap" in done.stderr
     done = call("compare", folder / "a.las", "--overlap")
     assert done.exit_code == 2 and "--overlap needs two clouds" in done.stderr
+
+
+def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
+    folder, _ = flight
+    strip = tmp_path / "a.las"
+    strip.write_bytes((folder / "a.las").read_bytes())
+    for options in (("-o", strip), ("-o", tmp_path / "cal.toml", "--report", strip)):
+        done = call("calibrate", tmp_path, "--targets", folder / "t.csv", *options, "--overwrite")
+        assert done.exit_code == 2 and "would replace this input" in done.stderr
+    assert strip.read_bytes() == (folder / "a.las").read_bytes()

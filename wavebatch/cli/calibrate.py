@@ -14,6 +14,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
 
@@ -65,14 +66,16 @@ def calibrate(strips: tuple[Path, ...], targets: Path, output: Path, overwrite: 
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
 
-    for target in (output, options["report"]):
-        if target is not None:
-            refuse_existing(target, overwrite)
-    if options["plot"] is not None:
-        check_picture(options["plot"], overwrite=overwrite)
     paths = find_files(map(str, strips))
     if not paths:
         raise ConfigError("no strip given")
+    with protecting(paths):  # a folder or a list among STRIPs holds inputs too
+        for target in filter(None, (output, options["report"], options["plot"])):
+            refuse_input(target)
+    for target in filter(None, (output, options["report"])):
+        refuse_existing(target, overwrite)
+    if options["plot"] is not None:
+        check_picture(options["plot"], overwrite=overwrite)
     flight = calibrate_flight(paths, load_targets(targets), _read_options(options))
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
