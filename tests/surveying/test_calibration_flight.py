@@ -146,6 +146,13 @@ def test_sources_without_ties_stay_unknown(rng):
     assert np.isfinite(found.value).tolist() == [True, False, True]
 
 
+def test_channels_without_any_tie_have_the_constants_of_their_targets():
+    nothing = measure_ties(np.zeros(0, TIE), 5.0)
+    found = adjust_constants(nothing, np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02]))
+    assert found.value[[0, 2]].tolist() == pytest.approx([0.1, 0.4], rel=1e-9) and np.isnan(found.value[1])
+    assert found.error[[0, 2]] == pytest.approx([0.01, 0.02], rel=0.35)
+
+
 def test_cells_that_are_rough_or_seen_in_one_line_tie_nothing(rng):
     def rows(source, xy, z):
         out = np.zeros(len(xy), TIE)

@@ -105,15 +105,15 @@ def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
 def _solve(cell, source, value, weight, given, given_error, reached) -> np.ndarray:
     """Constants f8 (n,) for these weights; NaN for sources that are not reached."""
     n, known = len(given), np.isfinite(given)
-    cells = int(cell.max(initial=-1)) + 1
-    table = csr_array((weight, (cell, source)), (cells, n))
-    whole = np.asarray(table.sum(axis=1)).ravel()
-    share = csr_array((np.divide(1.0, whole, where=whole > 0, out=np.zeros(cells)), (range(cells), range(cells))))
-    mean = np.bincount(cell, weight * value, cells) * share.diagonal() if cells else np.empty(0)
-    normal = np.diag(np.asarray(table.sum(axis=0)).ravel())
-    if cells:
-        normal = normal - (table.T @ share @ table).toarray()
-    right = -np.bincount(source, weight * (value - mean[cell]), n) if cells else np.zeros(n)
+    normal, right = np.zeros((n, n)), np.zeros(n)
+    if len(cell):
+        cells = int(cell.max()) + 1
+        table = csr_array((weight, (cell, source)), (cells, n))
+        whole = np.maximum(np.bincount(cell, weight, cells), 1e-300)
+        mean = np.bincount(cell, weight * value, cells) / whole
+        shared = csr_array((weight / whole[cell], (cell, source)), (cells, n))
+        normal = np.diag(np.bincount(source, weight, n)) - (shared.T @ table).toarray()
+        right = -np.bincount(source, weight * (value - mean[cell]), n)
     fixed = np.zeros(n)
     fixed[known] = given_error[known] ** -2.0
     right = right + np.where(known, fixed * np.where(known, given, 0.0), 0.0)

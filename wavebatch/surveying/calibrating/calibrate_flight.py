@@ -257,11 +257,16 @@ def _assemble(
         constant=float(np.median(constants)),
         relative_error=error,
         strip=", ".join(strip.path.name for strip in strips),
-        conditions=f"{len(strips)} strips, {len(rows)} constants of strips and channels, {good[0].conditions}",
-        targets=tuple(_name_target(row, strip) for strip in strips if strip.found for row in strip.found.targets),
+        conditions=good[0].conditions if len(strips) == 1 else f"{len(strips)} strips, {good[0].conditions}",
+        targets=tuple(_list_targets(strips)),
         channels=tuple(channels),
         strips=tuple(rows),
-        notes=tuple(f"{strip.path.name}: {note}" for strip in strips if strip.found for note in strip.found.notes),
+        notes=tuple(
+            note if len(strips) == 1 else f"{strip.path.name}: {note}"
+            for strip in strips
+            if strip.found
+            for note in strip.found.notes
+        ),
     )
 
 
@@ -301,8 +306,14 @@ def _drift_scatter(sources: Sequence[tuple[int, int]], adjusted: Adjustment) -> 
     return math.sqrt(squares / freedom) if freedom else 0.0
 
 
-def _name_target(row: TargetResult, strip: _Strip) -> TargetResult:
-    return replace(row, name=f"{row.name} on {strip.path.name}")
+def _list_targets(strips: Sequence[_Strip]) -> Iterator[TargetResult]:
+    """What the targets gave on each strip; those without any echo on a strip of several are left out."""
+    for strip in strips:
+        for row in strip.found.targets if strip.found else ():
+            if len(strips) == 1:
+                yield row
+            elif row.echoes:
+                yield replace(row, name=f"{row.name} on {strip.path.name}")
 
 
 def _describe_row(
