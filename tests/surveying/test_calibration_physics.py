@@ -286,6 +286,14 @@ def test_what_is_extrapolated_is_named_and_widens_the_error(tmp_path, channels, 
     assert np.nanmedian(relative) > least
 
 
+def test_two_divergences_are_named(tmp_path, channels):
+    strip = channels / "two.las"
+    assert call("survey", strip, "-o", tmp_path / "sys.toml", "--divergence", 0.8).exit_code == 0
+    done = run_with(tmp_path, strip, channels / "two.toml", "--system", tmp_path / "sys.toml", "-q")
+    assert "measured with a divergence of 0.5 mrad, the survey has 0.8 mrad, which is used" in done.stderr
+    assert "makes cross sections 156 % wrong" in done.stderr
+
+
 def test_a_check_whose_key_is_taken_out_of_the_file_is_not_made(tmp_path, channels):
     lines = (channels / "two.toml").read_text().splitlines()
     (tmp_path / "cal.toml").write_text("\n".join(line for line in lines if not line.startswith("pulse_ns")))

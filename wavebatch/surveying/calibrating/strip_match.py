@@ -102,7 +102,7 @@ def match_strip(
         )
         return StripMatch(calibration, tuple(warnings))
     growth, reasons = _find_growth(calibration, reader, sensor)
-    warnings += reasons
+    warnings += [*reasons, *_compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
     for index in sorted(scan.by_descriptor):
@@ -225,6 +225,15 @@ def _find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSo
             "bits, spacing, gain and pulse agree"
         )
     return float(np.sqrt(np.sum(np.square(parts)))), lines
+
+
+def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
+    own, other = system.divergence, calibration.divergence
+    if own is not None and other is not None and abs(own / other - 1.0) > NEAR_PULSE - 1.0:
+        yield (
+            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: one "
+            f"of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
+        )
 
 
 def _compare_decomposers(
