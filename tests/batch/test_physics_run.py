@@ -14,11 +14,9 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibration import (
     Calibration,
-    format_calibration,
-    load_calibration,
-    parse_calibration,
     with_physics,
 )
 from wavebatch.tools.simulate import simulate_strip

@@ -40,9 +40,6 @@ FASTEST = 120.0
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
-LEAST_DOUBT = 2.0
-"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
-
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """Find what a user should know about a strip that is written.
@@ -60,7 +57,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors, or
         that does not cover the strip.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report)]
+    lines += filter(None, [prepared.sensor.doubt()])
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     for column, counts in sorted(report.no_data.items()):
@@ -91,17 +89,6 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
         yield (
             f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
             "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"
-        )
-
-
-def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
-    """A trajectory that contradicts the packet vectors."""
-    if sensor.farther is not None and abs(sensor.farther) > max(LEAST_DOUBT, 5.0 * sensor.vectors_error):
-        which = "farther" if sensor.farther > 0 else "nearer"
-        yield (
-            f"range: by the trajectory echoes are {abs(sensor.farther):.1f} m {which} than by the packets' vectors, "
-            f"whose error is {sensor.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
-            "the ellipsoid?"
         )
 
 

@@ -82,6 +82,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
 
@@ -141,7 +142,12 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "warnings": [
+            *facts.warnings,
+            *prepared.scan.warnings,
+            *prepared.doubts,
+            *(f"{name}: {why}" for name, why in lost.items()),
+        ],
         "timing": build_timing(report),
     }
 

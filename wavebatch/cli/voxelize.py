@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_summary
+from wavebatch.cli.messages import count, counting, print_summary, talk
 
 if TYPE_CHECKING:
     from wavebatch.tools.voxels.strip import VoxelSummary
@@ -101,6 +101,8 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
             progress=show,
             **{name: options[name] for name in ("direction", "headerless", "overwrite", "profiles")},
         )
+    for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
+        talk(f"warning: {line}")
     print_summary(options, summary, _list_lines(summary))
 
 

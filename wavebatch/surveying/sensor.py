@@ -51,6 +51,9 @@ JERK, JERK_LEFT = 1.0, 0.025
 """Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
 parabola leaves of it: a root mean square of JERK half^3 times this."""
 
+LEAST_DOUBT = 2.0
+"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
+
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known."""
 
@@ -113,6 +116,17 @@ class SensorSource:
         with np.errstate(divide="ignore", invalid="ignore"):
             back = block.direction * ((low[:, None] + self.height - block.origin[:, 2:]) / down)
         return replace(block, sensor=np.where(down > 0, block.origin - back, np.nan))
+
+    def doubt(self) -> str:
+        """Return the line about a trajectory that contradicts the packet vectors; empty where it does not."""
+        if self.farther is None or abs(self.farther) <= max(LEAST_DOUBT, 5.0 * (self.vectors_error or 0.0)):
+            return ""
+        which = "farther" if self.farther > 0 else "nearer"
+        return (
+            f"range: by the trajectory echoes are {abs(self.farther):.1f} m {which} than by the packets' vectors, "
+            f"whose error is {self.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
+            "the ellipsoid?"
+        )
 
     def describe(self) -> dict[str, Any]:
         """Return kind, errors and the other values for reports."""

@@ -124,17 +124,20 @@ def _measure_sections(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross section of each sample, f8 (n, s) [m2], and waveforms where it is unknown, bool (n,).
 
-    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (docs/algorithms.md 5).
+    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (docs/algorithms.md 5), with C'
+    and pulse of the waveform's channel.
     """
+    system = system.of(block)
     section = np.zeros(profiles.value.shape)
     if block.sensor is None:
         return section, profiles.seen
     row, sample = np.nonzero(profiles.value)
+    constant, _ = system.calibrate(block)
     off = start[row] + block.direction[row] * (sample * block.spacing)[:, None] - block.sensor[row]
     distance = radiometry.known_distance(measure_lengths(off))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(
-            system.calibration, distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
+            constant[row], distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
         )
         value = radiometry.cross_section(gamma, distance, 1e-3 * system.divergence)
     # A sample without range makes the sum of its ray NaN, which the comparison counts as unknown.

@@ -23,9 +23,10 @@ from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
-from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import Request, make_choice
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
@@ -106,7 +107,7 @@ class VoxelSummary:
     sensor: str | None = None
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
-    """Waveforms with signal of unknown cross section."""
+    """Waveforms with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
     reflectance_ratio: float = 1.0
     """Reflectance of canopy over that of ground, by which light is shared between them."""
     reflectance_ratio_err: float | None = None
@@ -117,6 +118,8 @@ class VoxelSummary:
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
+    warnings: tuple[str, ...] = ()
+    """Why cross sections may be less sure than the calibration says."""
 
 
 def voxelize_strip(
@@ -149,9 +152,9 @@ def voxelize_strip(
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-        pulse = _find_pulse(reader, scan, system, calibration)
-        middle = _find_middle(reader, scan, options)
         source = _seek_sensor(reader, scan) if calibration is None else _find_sensor(reader, scan, sensor)
+        pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
+        middle = _find_middle(reader, scan, options)
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
         sample = (source.fill(block) for block in reader.sample_blocks(scan, SAMPLED))
@@ -189,6 +192,7 @@ def voxelize_strip(
                 reflectance_ratio=ratio.ratio,
                 reflectance_ratio_err=ratio.error,
                 reflectance_ratio_source=ratio.source,
+                warnings=doubts,
             )
 
 
@@ -208,22 +212,28 @@ def _write_both(
 
 
 def _find_pulse(
-    reader: StripReader, scan: StripScan, saved: SavedSurvey | None, calibration: Calibration | None
-) -> SystemPulse:
-    """The system pulse, saved or learned from the strip, with the calibration."""
+    reader: StripReader,
+    scan: StripScan,
+    saved: SavedSurvey | None,
+    calibration: Calibration | None,
+    sensor: SensorSource,
+) -> tuple[SystemPulse, tuple[str, ...]]:
+    """The system pulse that `wavebatch run` would use, with the calibration of each channel, and warnings."""
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
-    system = survey_blocks(read_sample(reader, scan)).system if saved is None else saved.survey.system
+    choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
+    system = choice.survey.system
     if calibration is None:
-        return system
-    system = calibration.apply(system)
+        return system, ()
+    fitted = match_strip(calibration, reader, scan, system, sensor, choice.chain)
+    system = fitted.calibration.apply(system)
     if system.divergence is None:
         raise ConfigError(
             "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration or give "
             "a --system file that has it"
         )
-    return system
+    return system, (*fitted.warnings, *filter(None, [sensor.doubt()]))
 
 
 def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | None) -> SensorSource:
