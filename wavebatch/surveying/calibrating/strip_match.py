@@ -231,8 +231,8 @@ def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterat
     own, other = system.divergence, calibration.divergence
     if own is not None and other is not None and abs(own / other - 1.0) > NEAR_PULSE - 1.0:
         yield (
-            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: one "
-            f"of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
+            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "
+            f"one of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
         )
 
 
