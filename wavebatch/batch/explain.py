@@ -53,7 +53,12 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines = [
+        *prepared.scan.notes,
+        *prepared.doubts,
+        *_doubt_waveforms(prepared, report),
+        *_doubt_trajectory(prepared.sensor),
+    ]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:

@@ -25,10 +25,11 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.angle_limits import angle_parameters, sample_level
+from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 
@@ -106,6 +107,8 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    doubts: tuple[str, ...] = ()
+    """Sentences about inputs that the strip itself contradicts."""
 
     @property
     def system(self) -> SystemPulse:
@@ -115,13 +118,25 @@ class Prepared:
     @property
     def second_step(self) -> Step | None:
         """The step whose columns need a second pass over the strip's points; None where none of them is written."""
-        step = self.job.chain.second_step
-        return step if step is not None and set(step.stage.makes) & set(self.job.options.columns) else None
+        step, wanted = self.job.chain.second_step, set(self.job.options.columns)
+        return step if step is not None and (self.late_steps or set(step.stage.makes) & wanted) else None
+
+    @property
+    def late_steps(self) -> tuple[Step, ...]:
+        """Steps that complete written columns from those of the second pass."""
+        wanted = set(self.job.options.columns)
+        return tuple(step for step in self.job.chain.late_steps if set(step.stage.makes) & wanted)
 
     @property
     def row_layout(self) -> OutputLayout:
         """The layout of a unit's rows: that of the cloud, then the columns that a second pass needs."""
-        return self.layout if self.second_step is None else self.layout.extended(RAY)
+        return self.layout if self.second_step is None else self.layout.extended(list_carried(self.late_steps))
+
+
+def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
+    """Columns that rows carry for a second pass, and the cloud does not get: those of late steps, then the rays."""
+    hidden = (name for step in late for name in step.stage.makes if not COLUMNS[name].extra_bytes)
+    return (*hidden, *RAY)
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
@@ -221,14 +236,26 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
-            choice = _see_level(reader, scan, job, choice, sensor)
+            choice, doubts = _see_level(reader, scan, job, choice, sensor)
+            job = replace(job, chain=_set_radius(reader, scan, job.chain))
             layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger)
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, doubts)
+
+
+def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
+    """The chain with a radius in place of one of 0, which means that the distance between the points decides."""
+    steps = [
+        replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+        if step.stage.second_pass is not None and step.effective()["radius"] == 0
+        else step
+        for step in chain.steps
+    ]
+    return replace(chain, steps=tuple(steps))
 
 
 def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
@@ -238,18 +265,30 @@ def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
     return hold_strip(reader, scan, job.request.system.survey)
 
 
-def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
-    """The choice with the widths of level ground, where angles are computed and no saved survey has them."""
+def _see_level(
+    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
+) -> tuple[Choice, tuple[str, ...]]:
+    """The choice with the widths of surfaces that face the sensor, where angles are computed and no saved survey has
+    them; and what is doubtful about the beam."""
     parameters = angle_parameters(job.chain)
-    saved = job.request.system is not None and not job.request.flight
-    if parameters is None or sensor is UNKNOWN or saved:
-        return choice
     survey = choice.survey
+    saved = job.request.system is not None and not job.request.flight and survey.system.level_error is not None
+    if parameters is None or sensor is UNKNOWN or saved:
+        return choice, ()
     used = job.calibrate(survey.system)
     used = replace(used, divergence=parameters["divergence"] or used.divergence)
-    seen = sample_level(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
-    system = replace(survey.system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
-    return replace(choice, survey=replace(survey, system=system))
+    seen = sample_reference(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
+    doubt = seen.doubt()
+    error = abs(seen.divergence / used.divergence - 1.0) if doubt else survey.system.divergence_error
+    system = replace(_take_reference(survey.system, seen.system), divergence_error=error)
+    return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
+
+
+def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
+    """The system with the reference of angles, each digitizer with its own."""
+    others = {index: _take_reference(other, seen.digitizers[index]) for index, other in system.digitizers.items()}
+    names = ("level_variance", "level_error", "width_scatter")
+    return replace(system, digitizers=others, **{name: getattr(seen, name) for name in names})
 
 
 def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:

@@ -21,7 +21,10 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 
-NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+NEEDS_SENSOR = (
+    "range", "backscatter_coefficient", "cross_section", "reflectance", "level_reflectance", "incidence_angle",
+    "relative_backscatter", "relative_cross_section", "relative_reflectance",
+)  # fmt: skip
 """Columns that need the sensor's position."""
 
 _NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
@@ -73,6 +76,8 @@ class ChannelConstant:
     """Robust standard deviation of the echoes' constants, relative."""
     echoes: int = 0
     """Echoes that the constant was measured from."""
+    shot_energy: float = 0.0
+    """Scatter of the energy from shot to shot and of the targets' surfaces, relative: `spread` without fit errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +113,7 @@ class Calibration:
             calibration=self.constant,
             calibration_err=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
+            shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -144,9 +150,11 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
     names += ["attribute.incidence_angle"] if divergence else []
     names += ["attribute.backscatter_coefficient"] if calibrated else []
     names += ["attribute.cross_section"] if calibrated and divergence else []
-    names += ["attribute.reflectance"] if calibrated else []
     have = {step.stage.name for step in chain.steps}
-    added = tuple(Step(STAGES[name]) for name in names if name not in have)
+    if calibrated and "attribute.reflectance" not in have:
+        names += ["attribute.level_reflectance", "attribute.incidence_angle_normals", "attribute.reflectance"]
+    chosen = {"attribute.incidence_angle_normals": {"radius": 0.0}}
+    added = tuple(Step(STAGES[name], chosen.get(name, {})) for name in names if name not in have)
     return replace(chain, steps=(*chain.steps, *added)) if added else chain
 
 
@@ -230,4 +238,5 @@ def _read_channel(table: TomlTable) -> ChannelConstant:
         *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
         spread=table.number("spread", 0.0, 1e6, 0.0),
         echoes=table.integer("echoes", 0, 10**12, 0),
+        shot_energy=table.number("shot_energy", 0.0, 1e6, 0.0),
     )

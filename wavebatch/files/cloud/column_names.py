@@ -79,6 +79,12 @@ _SHORT = {
     "incidence_angle_normals": "ray to plane of points",
     "incidence_angle_normals_err": "1 sigma of angle to plane",
     "pulse_deviation": "Gauss-Hermite deviation",
+    "level_reflectance": "reflectance if level",
+    "level_reflectance_err": "1 sigma, slope unknown",
+    "facing_reflectance": "reflectance if facing",
+    "facing_reflectance_err": "1 sigma, facing",
+    "facing_relative_reflectance": "relative, facing",
+    "facing_relative_reflectance_err": "1 sigma, facing",
     **{f"relative_{name}": "relative to strip only" for name in _RELATIVE},
     **{f"relative_{name}_err": "1 sigma, relative" for name in _RELATIVE},
 }

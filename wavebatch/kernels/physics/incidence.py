@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
 from wavebatch.kernels.signal.runs import lobe_edges
@@ -156,6 +157,62 @@ def angles_of_variance(
     error = 0.5 * (high - low)
     steep = middle > STEEPEST
     return np.where(steep, np.nan, middle), np.where(steep, np.nan, error)
+
+
+def angles_above(
+    variance: np.ndarray, variance_err: np.ndarray, distance: np.ndarray, divergence: float, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Angles of echoes that are given only because their variance exceeds so many errors.
+
+    Parameters
+    ----------
+    variance, variance_err, distance, divergence
+        As for `angles_of_variance`; all variances exceed the threshold.
+    threshold : float
+        In errors of the variance.
+
+    Returns
+    -------
+    angle, error : float64 (m,), rad
+        Of the true variance for which half of all echoes above the threshold lie above this one, and half the distance
+        of those for which 16 and 84 % do.
+
+    Notes
+    -----
+    Of echoes near the threshold those are seen that noise has widened, so that their plain angles are too large: by
+    1.75 errors where a tenth is seen. These angles and errors hold for the echoes that are seen, whatever their share.
+    """
+    bounds = []
+    with np.errstate(invalid="ignore", divide="ignore"):
+        over = variance / variance_err - threshold
+        for true in _conditional_table().T[1:]:
+            place = np.interp(over, _conditional_table()[:, 0], true)
+            beyond = over > _FARTHEST
+            true_variance = variance_err * (threshold + np.where(beyond, over + true[-1] - _FARTHEST, place))
+            bounds.append(angle_of_spread(np.sqrt(np.maximum(true_variance, 0.0)), distance, divergence))
+    low, middle, high = bounds
+    steep = middle > STEEPEST
+    return np.where(steep, np.nan, middle), np.where(steep, np.nan, 0.5 * (high - low))
+
+
+_FARTHEST = 8.0
+"""Errors above a threshold beyond which it no longer matters."""
+
+
+@lru_cache(maxsize=1)
+def _conditional_table() -> np.ndarray:
+    """Rows: a measurement above a threshold at 0, then the means of the normal law (of width 1) for which 16, 50 and
+    84 % of the measurements that are above the threshold lie above it."""
+    over = np.r_[np.geomspace(1e-3, 0.1, 60), np.linspace(0.1, _FARTHEST, 400)[1:]]
+    columns = [over]
+    for share in (0.1587, 0.5, 0.8413):
+        low, high = np.full(len(over), -4000.0), np.full(len(over), _FARTHEST + 8.0)
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            above = np.exp(scipy.special.log_ndtr(middle - over) - scipy.special.log_ndtr(middle))
+            low, high = np.where(above < share, middle, low), np.where(above < share, high, middle)
+        columns.append(0.5 * (low + high))
+    return np.stack(columns, axis=1)
 
 
 def _radius(variance: np.ndarray, variance_err: np.ndarray, spread: np.ndarray) -> np.ndarray:

@@ -136,7 +136,7 @@ def diffuse_reflectance(gamma: np.ndarray, incidence: np.ndarray) -> np.ndarray:
 def energy_error(
     amplitude: np.ndarray, sigma: np.ndarray, amplitude_err: np.ndarray, sigma_err: np.ndarray
 ) -> np.ndarray:
-    """Relative standard deviation of amplitude times sigma, whose errors have the correlation -1/sqrt(3).
+    """Relative standard deviation of amplitude times sigma of a lone echo: errors with the correlation -1/sqrt(3).
 
     Parameters
     ----------
@@ -160,6 +160,7 @@ def backscatter_error(
     attenuation: float,
     *,
     power: int = 2,
+    attenuation_err: float = 0.0,
 ) -> np.ndarray:
     """Relative standard deviation of gamma, or of the cross section.
 
@@ -175,14 +176,41 @@ def backscatter_error(
         Of the air, one way.
     power : int
         Power of the distance: 2 for gamma, 4 for the cross section.
+    attenuation_err : float, dB/km
+        Standard deviation of the attenuation.
 
     Returns
     -------
     float64 (m,)
     """
-    slope = power / known_distance(distance) + 2.0e-4 * attenuation * math.log(10.0)
-    ranging = slope * np.asarray(distance_err, np.float64)
-    return np.sqrt(energy_err * energy_err + ranging * ranging + constant_err * constant_err)
+    distance = known_distance(distance)
+    per_db = 2.0e-4 * math.log(10.0)
+    ranging = (power / distance + per_db * attenuation) * np.asarray(distance_err, np.float64)
+    air = per_db * attenuation_err * distance
+    return np.sqrt(energy_err * energy_err + ranging * ranging + constant_err * constant_err + air * air)
+
+
+def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
+    """Relative error of a reflectance for which a surface of unknown slope was taken as level.
+
+    Parameters
+    ----------
+    incidence : float (m,), rad
+        Angle at which the ray strikes level ground.
+    slope : float, rad
+        Slope of the surface, in any direction.
+
+    Returns
+    -------
+    float64 (m,)
+        Root mean square over the directions of cos(true angle) / cos(incidence) - 1.
+
+    Notes
+    -----
+    A surface of slope d whose steepest direction is turned by p from the ray has cos(true angle) = cos(a) cos(d) -
+    sin(a) sin(d) cos(p), a the angle to level ground.
+    """
+    return np.hypot(1.0 - math.cos(slope), np.tan(incidence) * (math.sin(slope) / math.sqrt(2.0)))
 
 
 def reflectance_error(relative: np.ndarray, incidence: np.ndarray, incidence_err: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
+from wavebatch.stages.attribute.light import light_error
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
 
@@ -41,11 +42,23 @@ def _width_factor(kappa: float) -> float:
     return FWHM_PER_SIGMA if abs(kappa) < 1e-6 else float(2 * np.sinh(half * kappa) / kappa)
 
 
-@stage("attribute", makes=("energy",))
+@stage("attribute", makes=("energy", "energy_err"))
 def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse."""
-    factor = np.float32(SQRT_2PI * np.exp(0.5 * system.kappa**2))
-    return echoes.with_attributes(energy=echoes.amplitude * echoes.sigma * factor)
+    """Integral of each echo over time [DN ns], and its error.
+
+    Amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse; of a learned pulse the sum over its Gaussians,
+    with tails and after-pulses.
+    """
+    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
+    if shape.components:
+        whole = np.stack([echoes.amplitude, np.zeros(len(echoes)), echoes.sigma / block.spacing], axis=1)
+        amplitude, _, width = model_parameters(shape, limits, whole.astype(np.float64)).T
+        area = amplitude * width * block.spacing * (1.0 + sum(weight for weight, _, _ in shape.components))
+    else:
+        area = echoes.amplitude.astype(np.float64) * echoes.sigma * np.exp(0.5 * system.kappa**2)
+    value = SQRT_2PI * area
+    error = np.abs(value) * light_error(echoes)
+    return echoes.with_attributes(energy=value.astype(np.float32), energy_err=error.astype(np.float32))
 
 
 @stage("attribute", makes=("pulse_deviation",))

@@ -251,10 +251,12 @@ def describe_solutions(
     if not solutions:
         return EchoTable.empty()
     flat = [_flatten(clusters, solution) for solution in solutions]
-    waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
+    waveform, parameters, errors, energy_err, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
-    errors *= error_factors(system, block.spacing)
+    *factors, energy_factor = error_factors(system, block.spacing)
+    errors *= factors
+    energy_err *= energy_factor
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1
@@ -267,7 +269,8 @@ def describe_solutions(
     spacing = block.spacing
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
-        amplitude_err=amplitude_err, sigma_err=width_err * spacing, residual=misfit[keep], flags=flags[keep],
+        amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
+        residual=misfit[keep], flags=flags[keep],
     )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
     if settings.shape.components:
@@ -276,7 +279,7 @@ def describe_solutions(
 
 
 def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
-    """One row per echo: waveform, parameters (m, 3), errors (m, 3), misfit, flags."""
+    """One row per echo: waveform, parameters (m, 3), errors (m, 3), relative error of the energy, misfit, flags."""
     k = solution.parameters.shape[2]
     flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
     flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
@@ -286,6 +289,7 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
         np.repeat(clusters.waveform[solution.cluster], k),
         solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
         solution.errors.transpose(0, 2, 1).reshape(-1, 3),
+        solution.energy_errors.reshape(-1),
         np.repeat(solution.misfit, k),
         flags.reshape(-1),
     )
