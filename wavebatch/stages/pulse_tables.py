@@ -20,7 +20,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     evaluate_pulse,
     measure_pulse,
 )
-from wavebatch.kernels.signal.noise import colour_factors
+from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -66,33 +66,6 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
         Level [count].
     """
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
-
-
-@lru_cache(maxsize=8)
-def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
-
-    To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
-    """
-    if not correlation:
-        return np.ones(4)
-    reach = int(np.ceil(5 * width)) + 1
-    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
-    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
-    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
-    return np.array(colour_factors(correlation, *(np.asarray(row)[:, 0] for row in rows)))
-
-
-def error_factors(system: SystemPulse, spacing: float) -> np.ndarray:
-    """Errors of amplitude, time and width (3,) in coloured noise, over those that a fit says with `noise_std`.
-
-    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less of noise that changes slowly.
-    """
-    if not system.correlation:
-        return np.ones(3)
-    shape = pulse_shape(system, spacing)
-    alone, *fitted = noise_factors(shape, shape_limits(system, spacing).ref, system.correlation)
-    return np.array(fitted) / max(alone, 1.0)
 
 
 class ShapeLimits(NamedTuple):
@@ -145,6 +118,86 @@ def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
         The table.
     """
     return measure_pulse(shape, limits.low, limits.high)
+
+
+@lru_cache(maxsize=8)
+def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
+    """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
+
+    To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
+    """
+    return np.array(colour_factors(correlation, *_pulse_rows(shape, width)))
+
+
+def _pulse_rows(shape: PulseShape, width: float) -> np.ndarray:
+    """A pulse of amplitude 1 and its derivatives by time and width, at every sample where it is more than noise."""
+    reach = int(np.ceil(5 * width)) + 1
+    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
+    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
+    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
+    return np.stack([np.asarray(row)[:, 0] for row in rows])
+
+
+FACTOR_WIDTHS = 12
+"""Widths at which the factors of errors are tabulated."""
+
+
+def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
+    """Errors of lone echoes over those that a fit in white noise gives to the main component of the pulse.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    width : float array, shape (m,)
+        Fitted widths [samples].
+
+    Returns
+    -------
+    float64 array, shape (m, 4)
+        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 for a Gaussian in white
+        noise.
+
+    Notes
+    -----
+    Two things make them differ from 1. `noise_std` is what coloured noise does to amplitudes; times and widths suffer
+    less from noise that changes slowly. And peak and delay of a learned pulse change with its width, whose error is
+    correlated with those of the main component's amplitude and time (docs/algorithms.md H11).
+    """
+    shape = pulse_shape(system, spacing)
+    if not system.correlation and not shape.components:
+        return np.ones((len(width), 4))
+    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
+    return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
+
+
+@lru_cache(maxsize=8)
+def _factor_table(
+    shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Widths (k,) and the factors of errors there (k, 4)."""
+    alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
+    widths = np.geomspace(limits.low, limits.high, FACTOR_WIDTHS)
+    return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
+
+
+def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
+    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those of the main component."""
+    joint = _pulse_rows(shape, width)
+    main = np.linalg.solve(joint @ joint.T, joint)
+    # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
+    main = np.concatenate([main, main[:1] + main[2:]])
+    whole = main.copy()
+    if shape.components:
+        table = pulse_measures(shape, limits)
+        peak = np.interp(width, table.width, table.peak)
+        by_width = [np.interp(width, table.width, np.gradient(y, table.width)) for y in (table.peak, table.delay)]
+        whole[0] += by_width[0] / peak * main[2]
+        whole[1] += by_width[1] * main[2]
+    variance = np.einsum("is,is->i", whole @ correlation_matrix(correlation, joint.shape[1]), whole)
+    return np.sqrt(np.maximum(variance / np.sum(main * main, axis=1), LEAST_FACTOR))
 
 
 def describe_echoes(

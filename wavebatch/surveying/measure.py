@@ -82,6 +82,10 @@ SAME_NOISE = 1.1
 LEAST_QUIET = 0.15
 """Share of quiet samples below which noise comes from residuals of good fits."""
 
+GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
+"""Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
+class of heights: misfit of the pulse is taken off by lag and class."""
+
 MISFIT_QUANTILE = 0.8
 """Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
 
@@ -491,12 +495,32 @@ def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
     return np.minimum(leverage, 0.9)
 
 
+def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
+
+    That part is the pulse's misfit. It changes with the height where a receiver compresses, and would look like noise
+    that grows with the signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
+    """
+    height = model.max(axis=1)
+    classes = min(max(len(height) // GROWTH_CLASS, 1), 8)
+    of_height = np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
+    bins = int(2 * GROWTH_REACH / GROWTH_STEP)
+    place = np.clip(((lag[core] + GROWTH_REACH) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
+    place += bins * np.broadcast_to(of_height[:, None], lag.shape)[core]
+    values = residual[core].astype(np.float64)
+    middle, number = np.zeros(bins * classes), np.bincount(place, minlength=bins * classes)
+    order = np.argsort(place, kind="stable")
+    for cell, part in enumerate(np.split(values[order], np.cumsum(number)[:-1])):
+        middle[cell] = np.median(part) if len(part) else 0.0
+    return (values - middle[place]) * np.sqrt(number[place] / np.maximum(number[place] - 1, 1))
+
+
 def _noise_gain(
     residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
 ) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
-    core = np.abs(lag) < 1.5
-    signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
+    core = np.abs(lag) < GROWTH_REACH
+    signal, squared = model[core].astype(np.float64), _chance_part(residual, model, lag, core) ** 2
     squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
     if len(signal) < 2000:
         return 0.0

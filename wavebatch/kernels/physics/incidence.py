@@ -191,8 +191,11 @@ def angles_above(
             true_variance = variance_err * (threshold + np.where(beyond, over + true[-1] - _FARTHEST, place))
             bounds.append(angle_of_spread(np.sqrt(np.maximum(true_variance, 0.0)), distance, divergence))
     low, middle, high = bounds
+    # Just above the threshold all three may be 0: then nothing is known but that the surface may face the sensor.
+    facing = angle_of_spread(_radius(np.zeros(1), variance_err, np.zeros(1)), distance, divergence)
+    error = np.where(middle > 0, 0.5 * (high - low), np.maximum(high, facing))
     steep = middle > STEEPEST
-    return np.where(steep, np.nan, middle), np.where(steep, np.nan, 0.5 * (high - low))
+    return np.where(steep, np.nan, middle), np.where(steep, np.nan, error)
 
 
 _FARTHEST = 8.0

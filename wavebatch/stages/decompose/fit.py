@@ -253,10 +253,10 @@ def describe_solutions(
     flat = [_flatten(clusters, solution) for solution in solutions]
     waveform, parameters, errors, energy_err, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
+    factors = error_factors(system, block.spacing, parameters[:, 2])
+    errors *= factors[:, :3]
+    energy_err *= factors[:, 3]
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
-    *factors, energy_factor = error_factors(system, block.spacing)
-    errors *= factors
-    energy_err *= energy_factor
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1
