@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from wavebatch.kernels.physics.radiometry import (
+    attenuation_of_visibility,
     backscatter,
     backscatter_error,
     calibrate_echoes,
@@ -86,3 +87,12 @@ def test_errors_are_those_of_repeated_measurements():
     assert backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
         np.std(section) / np.mean(section), rel=0.02
     )
+
+
+@pytest.mark.parametrize(
+    ("visibility", "wavelength", "expected"),
+    # Koschmieder: 3.912 / V at 550 nm, 4.343 dB per unit; Kruse's exponents for haze, clear and very clear air.
+    [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
+)
+def test_attenuation_by_visibility(visibility, wavelength, expected):
+    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)

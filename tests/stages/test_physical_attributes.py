@@ -15,6 +15,7 @@ from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
+from wavebatch.kernels.physics.radar import receive_power
 from wavebatch.stages.attribute.light import echo_light
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import load_profile
@@ -424,3 +425,56 @@ def test_slopes_keep_the_energy_of_a_learned_pulse(degrees):
     pulse = evaluate_pulse(shape, at, np.array([20.0]), np.array([wide]))[0] * 100.0 / wide
     done = run(block, echoes, system, "energy").attributes
     assert done["energy"] == pytest.approx(pulse.sum() * 0.05, rel=2e-3)
+
+
+@pytest.mark.parametrize("reference", [400.0, 1000.0])
+def test_a_normalized_amplitude_is_that_at_the_reference_range(reference):
+    """Level targets at 500 and 900 m, by the lidar equation: the same height at the reference, with or without air."""
+    for attenuation in (0.0, 0.5):
+        system = replace(SYSTEM, calibration=None, attenuation=attenuation)
+        found = []
+        for height in (500.0, 900.0):
+            power = receive_power(np.ones(1), np.array([height]), transmitted=1e16, aperture=0.1, divergence=1e-3,
+                                  efficiency=1.0, attenuation=attenuation)  # fmt: skip
+            # A target that fills the beam: its cross section grows with the square of the range.
+            block, echoes, _ = make(np.zeros(40), snr=float(power[0]) * height**2, height=height)
+            echoes = replace(echoes, amplitude=np.full(40, float(power[0]) * height**2, np.float32))
+            given = {"reference_range": reference}
+            done = run(block, echoes, system, "amplitude_normalized", "amplitude_normalized_db",
+                       amplitude_normalized=given, amplitude_normalized_db=given).attributes  # fmt: skip
+            found.append(done["amplitude_normalized"])
+            assert done["amplitude_normalized_db"] == pytest.approx(10 * np.log10(found[-1]), rel=1e-5)
+            share = done["amplitude_normalized_err"] / found[-1]
+            assert done["amplitude_normalized_db_err"] == pytest.approx(10 / np.log(10) * share, rel=1e-4)
+        assert found[0] == pytest.approx(found[1], rel=1e-4)
+        at = receive_power(np.ones(1), np.array([reference]), transmitted=1e16, aperture=0.1, divergence=1e-3,
+                           efficiency=1.0, attenuation=attenuation)  # fmt: skip
+        assert found[0] == pytest.approx(at[0] * reference**2, rel=1e-4)
+
+
+def test_the_error_of_the_air_counts_over_the_way_to_the_reference():
+    block, echoes, _ = make(np.zeros(4), snr=1e6)
+    for reference, way in ((640.0, 0.0), (1640.0, 1000.0)):
+        system = replace(SYSTEM, attenuation_error=0.1)
+        done = run(block, echoes, system, "amplitude_normalized", amplitude_normalized={"reference_range": reference})
+        relative = done.attributes["amplitude_normalized_err"] / done.attributes["amplitude_normalized"]
+        assert relative == pytest.approx(2e-4 * way * 0.1 * np.log(10), rel=0.01, abs=1e-4)
+
+
+def test_the_energy_of_each_pulse_is_divided_out():
+    block, echoes, _ = make(np.full(40, 20.0), snr=1e5)
+    energy = np.linspace(0.7, 1.3, 40)
+    energy[3] = np.nan
+    brighter = replace(echoes, amplitude=(echoes.amplitude * np.nan_to_num(energy, nan=1.0)).astype(np.float32))
+    names = ("backscatter_coefficient", "amplitude_normalized")
+    plain = run(block, echoes, SYSTEM, *names).attributes
+    known = replace(SYSTEM, shot_error=0.2)
+    done = run(replace(block, pulse_energy=energy), brighter, known, *names)
+    for name in names:
+        values = done.attributes[name]
+        assert np.flatnonzero(np.isnan(values)).tolist() == [3]
+        assert reasons(done)[name] == {"KNOWN": 39, "NO_PULSE_ENERGY": 1}
+        there = np.isfinite(values)
+        assert values[there] == pytest.approx(plain[name][there], rel=1e-5)
+        # What is known of each shot is no scatter from shot to shot.
+        assert (done.attributes[f"{name}_err"][there] < 0.02 * values[there]).all()

@@ -66,6 +66,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
+            "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
             **flight,
         },
     }
@@ -82,8 +83,17 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
+        "air": _describe_air(prepared),
         **seen,
     }
+
+
+def _describe_air(prepared: Prepared) -> dict[str, Any]:
+    """Attenuation that the columns of light use, its error, and where it comes from."""
+    job, system = prepared.job, prepared.system
+    given = "the default, for which there is no source" if job.calibration is None else "the calibration"
+    source = given if job.attenuation is None else "--attenuation or --visibility"
+    return {"attenuation_db_km": system.attenuation, "error_db_km": system.attenuation_error, "from": source}
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:

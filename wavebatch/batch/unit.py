@@ -27,7 +27,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
+from wavebatch.surveying.calibration import Calibration, needs_sensor, with_columns, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
@@ -68,17 +68,26 @@ class StripJob:
     sensor: SensorRequest = SensorRequest()
     """Where the sensor's positions come from; used only if the chain needs them."""
     calibration: Calibration | None = None
+    attenuation: tuple[float, float] | None = None
+    """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
 
     def extend(self, chain: Chain) -> Chain:
-        """Return the chain with the physical stages that trajectory, calibration and divergence allow."""
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
+        columns that are asked for.
+        """
         sources = (self.calibration, self.request.system and self.request.system.survey.system)
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
-        return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        return with_columns(chain, self.options.columns)
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
-        """Return the system pulse with the job's calibration, if it has one."""
-        return system if self.calibration is None else self.calibration.apply(system)
+        """Return the system pulse with the job's calibration and air, if it has them."""
+        system = system if self.calibration is None else self.calibration.apply(system)
+        if self.attenuation is None:
+            return system
+        value, error = self.attenuation
+        return replace(system, attenuation=value, attenuation_error=error)
 
     def absolute(self) -> StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
@@ -137,6 +146,11 @@ def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
     """Columns that rows carry for a second pass, and the cloud does not get: those of late steps, then the rays."""
     hidden = (name for step in late for name in step.stage.makes if not COLUMNS[name].extra_bytes)
     return (*hidden, *RAY)
+
+
+def name_columns(wanted: str | None) -> tuple[str, ...]:
+    """List the columns that a value of --columns names, in order."""
+    return tuple(entry.strip().removeprefix("+") for entry in (wanted or "").split(",") if entry.strip(" +"))
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:

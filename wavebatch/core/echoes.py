@@ -78,6 +78,8 @@ class Column:
 
 _COLUMNS = (
     Column("amplitude", "f4", "DN", "peak of the echo above the baseline"),
+    Column("amplitude_normalized", "f4", "DN", "amplitude at the reference range"),
+    Column("amplitude_normalized_db", "f4", "dB", "amplitude at the reference range, over 1 DN"),
     Column("echo_time", "f4", "ns", "centre of the echo after the first sample of its packet"),
     Column("echo_width", "f4", "ns", "full width at half maximum"),
     Column("energy", "f4", "DN ns", "integral of the echo over time"),
@@ -93,6 +95,8 @@ _COLUMNS = (
     Column("incidence_angle_normals", "f4", "deg", "angle between ray and normal of the plane of the points around"),
     Column("range_err", "f4", "m", "one standard deviation of the echo along the ray, from the fit"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
+    Column("amplitude_normalized_err", "f4", "DN", "one standard deviation of amplitude_normalized"),
+    Column("amplitude_normalized_db_err", "f4", "dB", "one standard deviation of amplitude_normalized_db"),
     Column("energy_err", "f4", "DN ns", "one standard deviation of energy, from the fit"),
     Column("echo_width_err", "f4", "ns", "one standard deviation of echo_width, from the fit"),
     Column("incidence_angle_err", "f4", "deg", "one standard deviation of incidence_angle"),

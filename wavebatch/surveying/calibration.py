@@ -7,7 +7,7 @@ Before you change it: files of earlier versions must stay readable.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 
 NEEDS_SENSOR = (
     "range", "backscatter_coefficient", "cross_section", "reflectance", "level_reflectance", "incidence_angle",
-    "relative_backscatter", "relative_cross_section", "relative_reflectance",
+    "amplitude_normalized", "amplitude_normalized_db", "relative_backscatter", "relative_cross_section",
+    "relative_reflectance",
 )  # fmt: skip
 """Columns that need the sensor's position."""
 
@@ -128,6 +129,10 @@ class Calibration:
         }
 
 
+_CHOSEN: dict[str, dict[str, Any]] = {"attribute.incidence_angle_normals": {"radius": 0.0}}
+"""Parameters of stages that are added to a chain: the radius then follows the distance between the points."""
+
+
 def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:
     """Add the physical stages that the given inputs allow to the end of a chain.
 
@@ -153,9 +158,35 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
     have = {step.stage.name for step in chain.steps}
     if calibrated and "attribute.reflectance" not in have:
         names += ["attribute.level_reflectance", "attribute.incidence_angle_normals", "attribute.reflectance"]
-    chosen = {"attribute.incidence_angle_normals": {"radius": 0.0}}
-    added = tuple(Step(STAGES[name], chosen.get(name, {})) for name in names if name not in have)
+    added = tuple(Step(STAGES[name], _CHOSEN.get(name, {})) for name in names if name not in have)
     return replace(chain, steps=(*chain.steps, *added)) if added else chain
+
+
+_USUAL = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+"""Stages that a shipped chain has or leaves out on purpose; asking for their columns does not add them."""
+
+
+def with_columns(chain: Chain, wanted: Iterable[str]) -> Chain:
+    """Add the attribute stages that make wanted columns, with those that they need, to the end of a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+    wanted : iterable of str
+        Names of columns; those that no stage makes are left to others.
+
+    Returns
+    -------
+    Chain
+        The same object where nothing is missing.
+    """
+    for name in wanted:
+        makers = [stage for stage in STAGES.values() if name in stage.makes and stage.name not in _USUAL]
+        if name not in chain.makes and makers:
+            step = Step(makers[0], _CHOSEN.get(makers[0].name, {}))
+            chain = with_columns(chain, step.needs)
+            chain = replace(chain, steps=(*chain.steps, step))
+    return chain
 
 
 def needs_sensor(chain: Chain) -> bool:

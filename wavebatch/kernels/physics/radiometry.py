@@ -35,6 +35,30 @@ def transmit(distance: np.ndarray, attenuation: float) -> np.ndarray:
     return 10.0 ** (-2.0e-4 * attenuation * np.asarray(distance, np.float64))
 
 
+def attenuation_of_visibility(visibility: float, wavelength: float) -> float:
+    """Attenuation of hazy air by its meteorological visibility.
+
+    Parameters
+    ----------
+    visibility : float, km
+        Largest distance at which a dark object is seen (contrast 2 %).
+    wavelength : float, nm
+        Of the laser.
+
+    Returns
+    -------
+    float, dB/km
+        One way. Scattering by haze only: absorption, as that of water vapour near 940, 1130 and 1400 nm, is not in it.
+
+    References
+    ----------
+    Kruse, McGlauchlin, McQuistan (1962): 3.912 / V (wavelength / 550)^-q, q = 1.6 above 50 km, 1.3 above 6 km, else
+    0.585 V^(1/3); docs/algorithms.md 5.
+    """
+    exponent = 1.6 if visibility > 50.0 else 1.3 if visibility > 6.0 else 0.585 * visibility ** (1.0 / 3.0)
+    return 10.0 / math.log(10.0) * 3.912 / visibility * (wavelength / 550.0) ** -exponent
+
+
 def calibrate_echoes(
     reflectance: np.ndarray | float,
     incidence: np.ndarray | float,

@@ -174,13 +174,11 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     constant, constant_err = (values[echoes.waveform] for values in system.calibrate(block))
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
-    energy, shot_error = _emitted(block, system)
-    energy, shot_error = energy[echoes.waveform], shot_error[echoes.waveform]
+    energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
     light = np.where(guess | bound, np.nan, echo_light(block, system, echoes))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(constant, distance, light, 1.0, system.attenuation) / energy
-    fit = echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
-    away = np.hypot(system.sensor_error, fit)
+    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
     relative = radiometry.backscatter_error(
         np.hypot(light_error(echoes), shot_error), distance, away, constant_err, system.attenuation,
         power=power, attenuation_err=system.attenuation_error,
@@ -193,6 +191,52 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
         (NoData.UNSETTLED, bound),
     )
     return Light(distance, gamma, relative, cases)
+
+
+def normalize_amplitude(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, reference: float
+) -> tuple[np.ndarray, np.ndarray, Cases]:
+    """Compute the amplitudes that echoes would have at a reference range.
+
+    Parameters
+    ----------
+    block, system, echoes
+        As for `measure_light`.
+    reference : float
+        Range [m].
+
+    Returns
+    -------
+    value, relative : float64 array, shape (m,)
+        Amplitudes [count] and their relative errors.
+    cases : Cases
+        Why values may be missing.
+    """
+    distance = sensor_distance(block, echoes)
+    energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
+    guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
+    bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
+    amplitude = np.where(guess | bound, np.nan, echoes.amplitude.astype(np.float64))
+    air = radiometry.transmit(np.asarray(reference), system.attenuation)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, system.attenuation) / energy
+        fit = echoes.amplitude_err.astype(np.float64) / amplitude
+    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
+    relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
+    # An error of the attenuation counts over the way by which the range differs from the reference.
+    beyond = 2.0e-4 * np.log(10.0) * system.attenuation_error * np.abs(distance - reference)
+    cases = (
+        (NoData.NO_SENSOR, np.isnan(distance)),
+        (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
+        (NoData.SATURATED, guess),
+        (NoData.UNSETTLED, bound),
+    )
+    return value, np.hypot(relative, beyond), cases
+
+
+def _fit_range_error(echoes: EchoTable) -> np.ndarray:
+    """Error of the range by the fit [m], f8 (m,); 0 where no stage has computed it."""
+    return echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
 
 
 def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.ndarray]:
