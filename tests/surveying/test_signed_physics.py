@@ -182,3 +182,77 @@ def test_a_weak_beam_has_no_survivor_bias(tmp_path):
         off = value[there] - true["incidence"][rows][there]
         assert np.median(off) < 0.5
         assert np.mean(np.abs(off) <= error[there]) > 0.58
+
+
+@pytest.fixture(scope="module")
+def flickering(tmp_path_factory):
+    """A strip whose shots scatter by 8 %, with their energies as an extra byte and as a text file, and its truth."""
+    folder = tmp_path_factory.mktemp("shots")
+    flight = Flight(energy_spread=0.08, store_energy=True)
+    truth = write_strip(folder / "strip.las", [Plane()], flight, 6000)
+    lines = [f"{time:.9f},{energy:.9f}" for time, energy in zip(truth.gps_time, 7.5 * truth.energy, strict=True)]
+    (folder / "shots.csv").write_text("time,energy\n" + "\n".join(lines))
+    return folder, flight, truth
+
+
+@pytest.mark.parametrize("source", ["shot_energy", "shots.csv"])
+def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
+    folder, flight, truth = flickering
+    calibration = write_calibration(tmp_path / "cal.toml", flight, shot_energy=0.08)
+    given = folder / source if source.endswith(".csv") else source
+    options = ("--calibration", calibration, "--pulse-energy", given)
+    call("run", folder / "strip.las", "-o", tmp_path / "out", "-q", *options)
+    columns, true, report = read(tmp_path / "out", truth)
+    check(columns, "backscatter_coefficient", true["gamma"], np.ones(len(true["plane"]), bool))
+    assert np.nanmedian(columns["backscatter_coefficient_err"] / true["gamma"]) < 0.02
+    told = report["strip"]["pulse_energy"]
+    assert told["source"] == source and told["spread"] == pytest.approx(0.08, rel=0.05)
+    assert told["mean"] == pytest.approx(7.5, rel=0.01) and told["share_known"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: "shot_enrgy", "no extra byte and no file is called 'shot_enrgy'; did you mean 'shot_energy'"),
+        (lambda path: write(path, "time,power\n1,2\n"), "first line must name the columns time and energy"),
+        (lambda path: write(path, "time,energy\n1,2\n2,x\n"), "a row has no number for time or energy"),
+        (lambda path: write(path, "time,energy\n1,2\n2,3\n"), "knows 0 of 6000 pulses of the strip"),
+    ],
+)
+def test_energies_that_cannot_be_used_are_refused_in_one_line(tmp_path, flickering, make, message):
+    folder, flight, _ = flickering
+    options = ["--columns", "+amplitude_normalized", "--pulse-energy", str(make(tmp_path / "e.csv"))]
+    done = CliRunner().invoke(main, ["run", str(folder / "strip.las"), "-o", str(tmp_path / "out"), *options])
+    assert done.exit_code == 4 and message in done.stderr and "Traceback" not in done.stderr
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_columns_that_are_asked_for_get_their_stages(tmp_path, flickering):
+    folder, flight, truth = flickering
+    call("run", folder / "strip.las", "-o", tmp_path / "out", "-q", "--columns", "amplitude_normalized,reflectance")
+    columns, true, report = read(tmp_path / "out", truth)
+    assert set(columns) == {"amplitude_normalized", "reflectance", "shot_energy"}  # the last one is the input's
+    expected = flight.light * true["gamma"] / 4 / 1e6 * 10 ** (-2e-4 * 0.22 * 1000.0)
+    there = np.isfinite(columns["amplitude_normalized"])
+    # The flat ground widens the pulse by its slope to the rays, which lowers the peak by up to 3 %.
+    assert np.median((columns["amplitude_normalized"] / expected)[there]) == pytest.approx(1.0, abs=0.03)
+    assert report["counts"]["no_data"]["reflectance"].keys() == {"NOT_CALIBRATED"}
+    assert report["strip"]["air"]["from"].startswith("the default")
+
+
+def test_the_air_of_the_flight_replaces_that_of_the_calibration(tmp_path, flickering):
+    folder, flight, truth = flickering
+    calibration = write_calibration(tmp_path / "cal.toml", flight)
+    arguments = ("run", folder / "strip.las", "-q", "--calibration", calibration, "-o")
+    call(*arguments, tmp_path / "a", "--columns", "backscatter_coefficient")
+    call(*arguments, tmp_path / "b", "--columns", "backscatter_coefficient", "--visibility", 10, "--wavelength", 550)
+    a, b = (read(tmp_path / name, truth) for name in "ab")
+    extra = 4.342945 * 0.3912 - flight.air
+    ratio = b[0]["backscatter_coefficient"] / a[0]["backscatter_coefficient"]
+    assert np.nanmedian(ratio) == pytest.approx(10 ** (2e-4 * np.median(a[1]["range"]) * extra), rel=1e-3)
+    assert b[2]["strip"]["air"]["attenuation_db_km"] == pytest.approx(4.342945 * 0.3912, rel=1e-4)
+    assert a[2]["strip"]["air"]["from"] == "the calibration"

@@ -55,6 +55,9 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
+    energy = job.pulse_energy
+    if energy is not None and Path(energy).is_file():
+        energy = take_fingerprint(Path(energy))
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {
@@ -67,6 +70,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
             "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
+            "pulse_energy": energy,
             **flight,
         },
     }
@@ -84,6 +88,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
         "air": _describe_air(prepared),
+        "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
         **seen,
     }
 

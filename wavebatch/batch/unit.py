@@ -23,6 +23,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
@@ -71,6 +72,9 @@ class StripJob:
     attenuation: tuple[float, float] | None = None
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
 
+    pulse_energy: str | None = None
+    """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
+
     def extend(self, chain: Chain) -> Chain:
         """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
         columns that are asked for.
@@ -93,7 +97,10 @@ class StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
         file = self.sensor.trajectory
         sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        return replace(self, path=self.path.absolute(), sensor=sensor)
+        energy = self.pulse_energy
+        if energy is not None and Path(energy).is_file():
+            energy = str(Path(energy).absolute())
+        return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
 
     def open(self) -> StripReader:
         """Open the strip; raises InputError where it cannot be read."""
@@ -116,6 +123,7 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    pulse_energy: PulseEnergy | None = None
     doubts: tuple[str, ...] = ()
     """Sentences about inputs that the strip itself contradicts."""
 
@@ -252,13 +260,14 @@ def prepare_strip(job: StripJob) -> Prepared:
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
             choice, doubts = _see_level(reader, scan, job, choice, sensor)
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
+            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, doubts)
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, energy, doubts)
 
 
 def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
@@ -331,7 +340,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
         blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)
-        echoes = gather_echoes(unit, _run_blocks(prepared, _timed(blocks, timing, "read packets"), timing))
+        echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
     rows, report = assemble(unit, echoes, prepared.row_layout)
@@ -351,11 +360,14 @@ def _block_size(unit: Unit) -> int:
 
 
 def _run_blocks(
-    prepared: Prepared, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
+    prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
 ) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
     system = prepared.system
     for block, index in blocks:
-        yield block, index, prepared.job.chain.run(prepared.sensor.fill(block), system, timing)
+        placed = prepared.sensor.fill(block)
+        if prepared.pulse_energy is not None:
+            placed = prepared.pulse_energy.fill(placed, unit)
+        yield block, index, prepared.job.chain.run(placed, system, timing)
 
 
 def _timed(items: Iterator, timing: dict[str, float], name: str) -> Iterator:

@@ -90,6 +90,9 @@ air_options = together(
                  help="Meteorological visibility during the flight [km], in place of --attenuation."),
     click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), metavar="NM",
                  help="Wavelength of the laser [nm], for --visibility.  [default: 1064]"),
+    click.option("--pulse-energy", metavar="NAME|FILE",
+                 help="Energy of each emitted pulse: an extra byte of the strips, or a text file with columns time "
+                 "(GPS time of the points) and energy. Backscatter and normalized amplitudes are divided by it."),
     click.option("--attenuation-error", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
                  help="Standard deviation of the attenuation [dB/km]: goes into the errors.  [default: 0]"),
 )  # fmt: skip

@@ -146,8 +146,8 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
 
 
 _PASSED_ON = (
-    "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless", "scheduler", "memory",
-    "block_size", "overwrite", "resume",
+    "pulse_energy", "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless",
+    "scheduler", "memory", "block_size", "overwrite", "resume",
 )  # fmt: skip
 """Options that `plan_run` takes under the same names."""
 

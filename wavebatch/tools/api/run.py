@@ -40,6 +40,7 @@ def run(
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
+    pulse_energy: Path | str | None = None,
     columns: str | None = None,
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
@@ -83,6 +84,9 @@ def run(
     attenuation : float or (float, float), optional
         Of the air during the flight, one way, and its standard deviation [dB/km]; default: that of the calibration,
         else 0.22.
+    pulse_energy : path or str, optional
+        Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
+        text file with columns time and energy.
     columns : str, optional
         "a,b" writes these columns only, "+a,+b" adds them to the usual ones; a shipped chain gets their stages.
     points : {"echoes", "returns"}
@@ -126,9 +130,10 @@ def run(
     """
     plan = plan_run(
         strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
-        calibration=calibration, attenuation=attenuation, columns=columns, points=points, format=format,
-        point_format=point_format, names=names, keep_packets=keep_packets, direction=direction, headerless=headerless,
-        jobs=jobs, scheduler=scheduler, memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
+        calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, columns=columns, points=points,
+        format=format, point_format=point_format, names=names, keep_packets=keep_packets, direction=direction,
+        headerless=headerless, jobs=jobs, scheduler=scheduler, memory=memory, block_size=block_size,
+        overwrite=overwrite, resume=resume,
     )  # fmt: skip
     return run_batch(*plan, on_event)
 
@@ -144,6 +149,7 @@ def plan_run(
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
+    pulse_energy: Path | str | None = None,
     columns: str | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
@@ -157,7 +163,9 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, survey, sensor, calibration, attenuation, columns, jobs, scheduler, memory
+    strips, out, chain, tolerance, system, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
+        As for `run`.
+    scheduler, memory
         As for `run`.
     block_size, overwrite, resume
         As for `run`.
@@ -185,10 +193,11 @@ def plan_run(
     known = None if calibration is None else load_calibration(Path(calibration))
     air = None if attenuation is None else _read_air(attenuation)
     template = StripJob(Path(), found, RunOptions(columns=name_columns(columns)), request, sensor, known, air)
+    template = replace(template, pulse_energy=None if pulse_energy is None else str(pulse_energy))
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)
-    _check_use(found, sensor, known, air)
+    _check_use(found, sensor, known, air, pulse_energy)
     options = RunOptions(columns=choose_columns(found, columns), **output)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
@@ -245,12 +254,13 @@ def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
     return float(value), float(error)
 
 
-def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any) -> None:
+def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, energy: Any) -> None:
     """Raise ConfigError for files that the chain would ignore."""
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
-             "--attenuation": air}  # fmt: skip
+             "--attenuation": air, "--pulse-energy": energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
-        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized"}
+        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
+                  "--pulse-energy": "amplitude_normalized"}  # fmt: skip
         stage = f"attribute.{stages.get(option, 'range')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
