@@ -32,7 +32,7 @@ class EchoFlag(IntFlag):
     NEAR_EDGE = 4, "the echo is cut by the start or the end of the waveform"
     SATURATED = 8, "samples under the echo are at the digitizer's limit"
     OVERLAPPED = 16, "fitted together with at least one neighbouring echo"
-    WEAK = 32, "amplitude below 5 noise standard deviations"
+    WEAK = 32, "amplitude below 5 noise standard deviations: noise helps to find it, so the mean of such is too high"
     RINGING_SUSPECT = 64, "may be ringing or an after-pulse of a stronger echo before it"
     NARROW = 128, "narrower than the system pulse"
     NO_WAVEFORM = 256, "point has no waveform (descriptor index 0 or packet size 0); passed through"
