@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD, SQRT_PI
@@ -109,20 +109,20 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
     """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
 
-    first: width to begin with [samples], and to end with where too few echoes are isolated.
+    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
     """
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_block(block, FIRST_LOOK)
-    width, last = first, 0.0
+    width, last = first, first if known else 0.0
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
         system, last = _gaussian_system(few, width, saturation), width
         width = _isolated_width(few, system)
-    system = _gaussian_system(block, width, saturation)
+    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
     return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
 
 
@@ -515,6 +515,23 @@ def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core:
     return (values - middle[place]) * np.sqrt(number[place] / np.maximum(number[place] - 1, 1))
 
 
+def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...]) -> tuple[np.ndarray, float]:
+    """Least squares by some columns of the terms, with no negative factor: the factors of all, and the sum of squares.
+
+    The best of all subsets that need no bound. (scipy's nnls finds the same, but to import it takes as long as half a
+    survey.)
+    """
+    best, least = np.zeros(terms.shape[1]), float(values @ values)
+    for number in range(1, len(columns) + 1):
+        for part in combinations(columns, number):
+            factors = np.linalg.lstsq(terms[:, part], values, rcond=None)[0]
+            rest = values - terms[:, part] @ factors
+            if (factors >= 0).all() and rest @ rest < least:
+                best, least = np.zeros(terms.shape[1]), float(rest @ rest)
+                best[list(part)] = factors
+    return best, least
+
+
 def _noise_gain(
     residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
 ) -> float:
@@ -532,9 +549,9 @@ def _noise_gain(
     # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
     scale = np.hypot(variance, std**2)
     terms = np.stack([np.ones_like(level), level, level * level], axis=1) / scale[:, None]
-    fits = [scipy.optimize.nnls(terms[:, columns], variance / scale) for columns in ([0], [0, 1], [0, 2], [0, 1, 2])]
-    chance = max(fits[3][1] ** 2 / max(len(level) - 3, 1), 1e-4)
-    chi2 = [min(rest**2 / chance, 1e6) for _, rest in fits]
+    fits = [_fit_growth(terms, variance / scale, columns) for columns in ((0,), (0, 1), (0, 2), (0, 1, 2))]
+    chance = max(fits[3][1] / max(len(level) - 3, 1), 1e-4)
+    chi2 = [min(rest / chance, 1e6) for _, rest in fits]
     # The linear law alone, or both, as the data are likelier; and by degrees from 3 to 6 sigma: at a limit, tiles of
     # one strip would fall on either side.
     share = 1 / (1 + np.exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
@@ -21,9 +20,12 @@ GAIN = 0.10
 TRIAL_EVALUATIONS = 25
 """Evaluations after which the starts of one more component are compared."""
 
+MOST_EVALUATIONS = 200
+"""Evaluations after which a fit ends."""
+
 FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED = 10.0, 1e8, 1e-8
-"""Damping of the first step (less jumps into pairs of broad components that cancel), damping at which no step helps, and
-share by which the sum of squares falls in the last step."""
+"""Damping of the first step (less jumps into pairs of broad components that cancel), damping at which no step helps,
+and share by which the sum of squares falls in the last step."""
 
 DEEPEST = 0.3
 """Largest negative weight of a component: an undershoot. Deeper ones only cancel another component, and such a pair
@@ -121,15 +123,23 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
     # A tail is no skew: the main lobe decides, all of the stack says how well it fits.
     lobe = np.where(np.abs(stack.lag) < LOBE * width, weight, 0.0)
 
-    def misfit(p: np.ndarray, weight: np.ndarray = lobe) -> np.ndarray:
+    def evaluate(p: np.ndarray) -> tuple[np.ndarray, ...]:
         t, s = np.array([p[1]]), np.array([p[2]])
-        pulse = evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s)[0][:, 0]
-        return (p[0] * pulse - stack.value) * weight
+        return tuple(row[:, 0] for row in evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s))
 
-    low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
-    result = scipy.optimize.least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
-    amplitude, delay, sigma, kappa = result.x
-    rms = float(np.sqrt(np.mean(misfit(result.x, np.ones_like(weight)) ** 2)))
+    def misfit(p: np.ndarray) -> np.ndarray:
+        return (p[0] * evaluate(p)[0] - stack.value) * lobe
+
+    def slopes(p: np.ndarray) -> np.ndarray:
+        pulse, by_time, by_width = evaluate(p)
+        step = 1e-4 if p[3] < 0 else -1e-4
+        by_skew = (evaluate(p + [0, 0, 0, step])[0] - pulse) / step
+        return np.stack([pulse, p[0] * by_time, p[0] * by_width, p[0] * by_skew], axis=1) * lobe[:, None]
+
+    low, high = np.array([0.5, -3 * width, 0.3 * width, -0.6]), np.array([2.0, 3 * width, 3 * width, 0.6])
+    fitted = fit_bounded(misfit, slopes, np.array([1.0, 0.0, width, 0.02]), low, high, MOST_EVALUATIONS)
+    amplitude, delay, sigma, kappa = fitted
+    rms = float(np.sqrt(np.mean((amplitude * evaluate(fitted)[0] - stack.value) ** 2)))
     return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
 
 
@@ -153,33 +163,37 @@ def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
 
 
-def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200) -> np.ndarray:
+def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = MOST_EVALUATIONS) -> np.ndarray:
     """The sum of Gaussians fitted from a start, in at most `most` evaluations.
 
-    The parameters are weight, the delay's distance from the earliest that is allowed to its sigma, and sigma.
+    The parameters are weight, place and sigma; the place is the delay as a share of the way from the earliest that is
+    allowed to a component of this sigma to the end of the stack. Beyond the end nothing holds a component.
     """
-    width = abs(start[2])
+    width, end = abs(start[2]), stack.lag[-1]
     low = np.tile([-DEEPEST, 0.0, 0.35 * width], len(start) // 3)
-    high = np.tile([2.0, stack.lag[-1] + EARLIEST * width, 12.0 * width], len(start) // 3)
+    high = np.tile([2.0, 1.0, 12.0 * width], len(start) // 3)
 
     def earliest(sigma: np.ndarray) -> np.ndarray:
-        return np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width)
+        return np.minimum(np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width), end - width)
 
     def plain(p: np.ndarray) -> np.ndarray:
-        q = p.copy()
-        q[1::3] += earliest(p[2::3])
+        q, first = p.copy(), earliest(p[2::3])
+        q[1::3] = first + p[1::3] * (end - first)
         return q
 
     def slopes(p: np.ndarray) -> np.ndarray:
         jacobian = _slopes(plain(p), stack.lag)
-        jacobian[:, 2::3] += 2 * (2 * p[2::3] > (ONSET - EARLIEST) * width) * jacobian[:, 1::3]
+        first = earliest(p[2::3])
+        moves = (first > -EARLIEST * width) & (first < end - width)
+        jacobian[:, 2::3] += 2 * moves * (1 - p[1::3]) * jacobian[:, 1::3]
+        jacobian[:, 1::3] *= end - first
         return jacobian * weight[:, None]
 
     def misfit(p: np.ndarray) -> np.ndarray:
         return (_sum(plain(p), stack.lag) - stack.value) * weight
 
-    first = start.copy()
-    first[1::3] -= earliest(start[2::3])
+    first, begin = start.copy(), earliest(start[2::3])
+    first[1::3] = (start[1::3] - begin) / (end - begin)
     return plain(fit_bounded(misfit, slopes, np.clip(first, low, high), low, high, most))
 
 
