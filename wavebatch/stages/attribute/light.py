@@ -11,12 +11,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
+from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.physics import radiometry
-from wavebatch.stages.pulse_tables import describe_echoes, model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import BROADEST, describe_echoes, model_parameters, pulse_shape, shape_limits
 
 POSITION = ("x", "y", "z")
 
@@ -111,13 +113,36 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     component is proportional to amplitude times width of the main one, which is used here (docs/algorithms.md 5).
     """
     amplitude, sigma = echoes.amplitude.astype(np.float64), echoes.sigma.astype(np.float64)
-    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
+    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing, most=BROADEST)
     if not shape.components:
-        return amplitude * sigma
+        return amplitude * sigma * area_factor(system, echoes) / np.exp(0.5 * system.kappa**2)
     whole = np.stack([amplitude, np.zeros(len(sigma)), sigma / block.spacing], axis=1)
     height, _, width = model_parameters(shape, limits, whole).T
     facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)))
     return height * width * (facing[0, 0] * facing[0, 2] / limits.ref) * block.spacing
+
+
+def area_factor(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Area of each echo over that of a Gaussian of the same amplitude and sigma.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        With the pulse that was fitted, none that was learned.
+    echoes : EchoTable
+        m fitted echoes.
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        exp(kappa^2 / 2) of a skewed pulse, which may differ from echo to echo; of exp(-|z|^p / 2) by its exponent.
+    """
+    if "power" in echoes.attributes:
+        power = echoes.attributes["power"].astype(np.float64)
+        half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
+        return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width / SQRT_2PI
+    skew = np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
+    return np.broadcast_to(np.exp(0.5 * skew**2), len(echoes))
 
 
 def light_error(echoes: EchoTable) -> np.ndarray:
