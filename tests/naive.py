@@ -299,16 +299,6 @@ def crlb_joint(time, amplitude, sigma, noise_std, spacing, n_samples):
     return std[:k], std[k : 2 * k], std[2 * k :]
 
 
-def fit_slope(across, along, shared):
-    """Slope (2,) of `along` over places across (k, 2), and its covariance: points share an error within a scan line."""
-    table = np.column_stack([across, np.ones(len(across))])
-    solution, *_ = np.linalg.lstsq(table, along, rcond=None)
-    left = along - table @ solution
-    noise = left @ left / (len(along) - 3)
-    spread = np.cov(across.T, bias=True)
-    return solution[:2], np.linalg.inv(spread) * (noise / len(along) + shared**2 / 4)
-
-
 def compare_halves(xyz):
     """Smallest chance of two planes over six cuts of points around 0: (chance, gain in the sum of squares)."""
     centre = xyz.mean(axis=0)
@@ -328,3 +318,13 @@ def compare_halves(xyz):
             best = min(best, left(one) + left(~one))
     noise = best + len(r) * 1e-6
     return min(6 * f_distribution.sf((whole - best) / 3 / (noise / (len(r) - 6)), 3, len(r) - 6), 1.0), whole - best
+
+
+def fit_slope(across, along, shared):
+    """Slope (2,) of `along` over places across (k, 2), and its covariance: points share an error within a scan line."""
+    table = np.column_stack([across, np.ones(len(across))])
+    solution, *_ = np.linalg.lstsq(table, along, rcond=None)
+    left = along - table @ solution
+    noise = left @ left / (len(along) - 3)
+    spread = np.cov(across.T, bias=True)
+    return solution[:2], np.linalg.inv(spread) * (noise / len(along) + shared**2 / 4)

@@ -57,7 +57,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors, or
         that does not cover the strip.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *filter(None, [prepared.sensor.doubt()])]
+    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report)]
+    lines += filter(None, [prepared.sensor.doubt()])
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     for column, counts in sorted(report.no_data.items()):

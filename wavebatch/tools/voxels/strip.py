@@ -108,8 +108,6 @@ class VoxelSummary:
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
     """Waveforms with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
-    warnings: tuple[str, ...] = ()
-    """Why cross sections may be less sure than the calibration says."""
     reflectance_ratio: float = 1.0
     """Reflectance of canopy over that of ground, by which light is shared between them."""
     reflectance_ratio_err: float | None = None
@@ -120,6 +118,8 @@ class VoxelSummary:
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
+    warnings: tuple[str, ...] = ()
+    """Why cross sections may be less sure than the calibration says."""
 
 
 def voxelize_strip(
@@ -152,10 +152,9 @@ def voxelize_strip(
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
-        _refuse_empty(reader, scan)
-        middle = _find_middle(reader, scan, options)
         source = _seek_sensor(reader, scan) if calibration is None else _find_sensor(reader, scan, sensor)
         pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
+        middle = _find_middle(reader, scan, options)
         floor = Floor(middle)
         ceiling = find_ceiling(reader, scan, middle, options.size, floor)
         sample = (source.fill(block) for block in reader.sample_blocks(scan, SAMPLED))
@@ -190,10 +189,10 @@ def voxelize_strip(
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
                 noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
-                warnings=doubts,
                 reflectance_ratio=ratio.ratio,
                 reflectance_ratio_err=ratio.error,
                 reflectance_ratio_source=ratio.source,
+                warnings=doubts,
             )
 
 
@@ -212,11 +211,6 @@ def _write_both(
         raise
 
 
-def _refuse_empty(reader: StripReader, scan: StripScan) -> None:
-    if not scan.packets:
-        raise InputError(f"{reader.facts.path}: holds no waveform to put into voxels; see `wavebatch check`")
-
-
 def _find_pulse(
     reader: StripReader,
     scan: StripScan,
@@ -225,6 +219,9 @@ def _find_pulse(
     sensor: SensorSource,
 ) -> tuple[SystemPulse, tuple[str, ...]]:
     """The system pulse that `wavebatch run` would use, with the calibration of each channel, and warnings."""
+    path = reader.facts.path
+    if not scan.packets:
+        raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
     choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
     system = choice.survey.system
     if calibration is None:
