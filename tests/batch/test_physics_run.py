@@ -55,14 +55,16 @@ def report(folder):
 
 def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
     ranges, section, gamma, rho, angle = columns(
-        plain, "range", "cross_section", "backscatter_coefficient", "reflectance", "incidence_angle"
+        plain, "range", "cross_section", "backscatter_coefficient", "level_reflectance", "incidence_angle"
     )
     known = ranges != -9999
     assert 0.9 < known.mean() < 1.0
     assert (ranges[known] > 750).all() and (ranges[known] < 1000).all()
     square = np.pi / 4 * (1.1e-3 * ranges) ** 2
-    assert section[known] == pytest.approx((gamma * square)[known], rel=1e-4)
-    assert np.isin(section[~known], -9999).all()
+    lit = gamma != -9999  # widths at a bound give none
+    assert 0.9 < np.mean(lit[known]) <= 1.0
+    assert section[lit] == pytest.approx((gamma * square)[lit], rel=1e-4)
+    assert np.isin(section[~lit], -9999).all() and not lit[~known].any()
     assert 0.0 < (rho != -9999).mean() < known.mean()
     assert ((angle == -9999) | ((angle >= 0) & (angle <= 80))).all()
     told = report(plain)
@@ -86,15 +88,18 @@ def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, cal
 
 def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     strip, cal = tmp_path / "flat.las", tmp_path / "cal.toml"
-    simulate_strip("flat", strip, pulses=1500, seed=2)
+    simulate_strip("flat", strip, pulses=12_000, seed=2)
     cal.write_text(format_calibration(replace(FOUND, divergence=0.3)))
     done = run(strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", cal, "-v")
     assert done.exit_code == 0, done.output
     counts = report(tmp_path / "out")["counts"]
     angle = counts["no_data"]["incidence_angle"]
-    assert "KNOWN" not in angle and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
-    (remark,) = report(tmp_path / "out")["remarks"]
-    assert f"incidence_angle: none of {counts['echoes']} echoes has one" in remark
+    # An echo of ten thousand is widened by more than four errors.
+    known = angle.get("KNOWN", 0)
+    assert known <= 3 and angle["UNCERTAIN"] > 0.9 * counts["echoes"]
+    (remark,) = [line for line in report(tmp_path / "out")["remarks"] if line.startswith("incidence_angle:")]
+    share = f"{known} of {counts['echoes']} echoes have one" if known else f"none of {counts['echoes']} echoes has one"
+    assert f"incidence_angle: {share}" in remark
     for number in ("a beam of 0.3 mrad on a slope of 30 degrees", "widens the pulse from", "max_error is 10"):
         assert number in remark
     assert remark in done.stderr
@@ -191,7 +196,8 @@ def test_columns_that_are_not_written_have_a_reason_in_the_report(tmp_path, tiny
 def test_relative_columns_are_written_on_request_and_say_so_in_the_file(tmp_path, tiny_strip):
     chain = tmp_path / "c.toml"
     stages = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position", "attribute.range",
-              "attribute.relative_backscatter", "attribute.relative_cross_section", "attribute.relative_reflectance",
+              "attribute.relative_backscatter", "attribute.relative_cross_section",
+              "attribute.incidence_angle_normals", "attribute.relative_reflectance",
               "attribute.cross_section")  # fmt: skip
     chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
     done = run(tiny_strip, "-o", tmp_path / "out", "-c", chain, "--points", "returns")
@@ -227,7 +233,7 @@ def test_a_wrong_trajectory_fails_its_strip_in_one_line(tmp_path, tiny_strip):
     assert "do not overlap on any clock" in done.stderr
 
 
-@pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", "\x7f\"\\.las"])
+@pytest.mark.parametrize("name", ["Stra\u00dfe.las", "\U0001f6f0 strip.las", '\x7f"\\.las'])
 def test_a_calibration_of_a_strip_of_any_name_comes_back(name):
     assert parse_calibration(format_calibration(replace(FOUND, strip=name)), "cal").strip == name
 

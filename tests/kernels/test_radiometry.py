@@ -5,6 +5,7 @@ import pytest
 
 from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
 from wavebatch.kernels.physics.radiometry import (
+    attenuation_of_visibility,
     backscatter,
     backscatter_error,
     calibrate_echoes,
@@ -114,3 +115,12 @@ def test_light_that_is_shared_alike_tells_no_ratio(rng):
     assert estimate_canopy_ratio(np.zeros(0), np.zeros(0)) is None
     assert estimate_canopy_ratio(np.full(500, np.nan), ground) is None
     assert estimate_canopy_ratio(np.zeros(500), ground) is None
+
+
+@pytest.mark.parametrize(
+    ("visibility", "wavelength", "expected"),
+    # Koschmieder: 3.912 / V at 550 nm, 4.343 dB per unit; Kruse's exponents for haze, clear and very clear air.
+    [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
+)
+def test_attenuation_by_visibility(visibility, wavelength, expected):
+    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)

@@ -30,6 +30,7 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
     "backscatter_coefficient": (NoData.NOT_CALIBRATED,),
     "cross_section": (NoData.NOT_CALIBRATED, NoData.NO_DIVERGENCE),
     "reflectance": (NoData.NOT_CALIBRATED,),
+    "level_reflectance": (NoData.NOT_CALIBRATED,),
     _ANGLE: (NoData.NO_DIVERGENCE,),
 }
 """Physical columns, and what each needs besides the sensor's position."""

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 
-NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+NEEDS_SENSOR = (
+    "range", "backscatter_coefficient", "cross_section", "reflectance", "level_reflectance", "incidence_angle",
+    "amplitude_normalized", "amplitude_normalized_db", "relative_backscatter", "relative_cross_section",
+    "relative_reflectance",
+)  # fmt: skip
 """Columns that need the sensor's position."""
 
 _REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
@@ -157,6 +161,7 @@ class Calibration:
             calibration=self.constant,
             calibration_err=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
+            shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -182,6 +187,10 @@ class Calibration:
         return {"number": len(self.strips), "sha256": hashlib.sha256(text.encode(errors="replace")).hexdigest()}
 
 
+_CHOSEN: dict[str, dict[str, Any]] = {"attribute.incidence_angle_normals": {"radius": 0.0}}
+"""Parameters of stages that are added to a chain: the radius then follows the distance between the points."""
+
+
 def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:
     """Add the physical stages that the given inputs allow to the end of a chain.
 
@@ -204,10 +213,38 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
     names += ["attribute.incidence_angle"] if divergence else []
     names += ["attribute.backscatter_coefficient"] if calibrated else []
     names += ["attribute.cross_section"] if calibrated and divergence else []
-    names += ["attribute.reflectance"] if calibrated else []
     have = {step.stage.name for step in chain.steps}
-    added = tuple(Step(STAGES[name]) for name in names if name not in have)
+    if calibrated and "attribute.reflectance" not in have:
+        names += ["attribute.level_reflectance", "attribute.incidence_angle_normals", "attribute.reflectance"]
+    added = tuple(Step(STAGES[name], _CHOSEN.get(name, {})) for name in names if name not in have)
     return replace(chain, steps=(*chain.steps, *added)) if added else chain
+
+
+_USUAL = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+"""Stages that a shipped chain has or leaves out on purpose; asking for their columns does not add them."""
+
+
+def with_columns(chain: Chain, wanted: Iterable[str]) -> Chain:
+    """Add the attribute stages that make wanted columns, with those that they need, to the end of a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+    wanted : iterable of str
+        Names of columns; those that no stage makes are left to others.
+
+    Returns
+    -------
+    Chain
+        The same object where nothing is missing.
+    """
+    for name in wanted:
+        makers = [stage for stage in STAGES.values() if name in stage.makes and stage.name not in _USUAL]
+        if name not in chain.makes and makers:
+            step = Step(makers[0], _CHOSEN.get(makers[0].name, {}))
+            chain = with_columns(chain, step.needs)
+            chain = replace(chain, steps=(*chain.steps, step))
+    return chain
 
 
 def needs_sensor(chain: Chain) -> bool:
