@@ -85,6 +85,8 @@ def _packet_files(path: Path) -> list[Path]:
     if path.suffix.lower() not in (".las", ".laz"):
         return []
     try:
+        if not path.is_file():  # opening a pipe waits for ever
+            return []
         with open(path, "rb") as file:
             head = file.read(_FORMAT_BYTE + 1)
     except (OSError, ValueError):
