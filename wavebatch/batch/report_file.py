@@ -89,6 +89,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
         "sensor": prepared.sensor.describe(),
         "air": _describe_air(prepared),
         "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
 
@@ -156,7 +157,12 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "warnings": [
+            *facts.warnings,
+            *prepared.scan.warnings,
+            *prepared.doubts,
+            *(f"{name}: {why}" for name, why in lost.items()),
+        ],
         "timing": build_timing(report),
     }
 

@@ -28,6 +28,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
+from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_columns, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.flat_ground import choose_radius
@@ -125,7 +126,7 @@ class Prepared:
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
     pulse_energy: PulseEnergy | None = None
     doubts: tuple[str, ...] = ()
-    """Sentences about inputs that the strip itself contradicts."""
+    """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
 
     @property
     def system(self) -> SystemPulse:
@@ -258,7 +259,9 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
-            choice, doubts = _see_level(reader, scan, job, choice, sensor)
+            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
+            choice, more = _see_level(reader, scan, job, choice, sensor)
+            doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
             energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
@@ -286,6 +289,16 @@ def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
     if job.request.system is None or not job.request.flight:
         return ""
     return hold_strip(reader, scan, job.request.system.survey)
+
+
+def _fit_calibration(
+    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
+) -> tuple[StripJob, tuple[str, ...]]:
+    """The job with the calibration as it holds for this strip, and warnings; InputError where it does not fit."""
+    if job.calibration is None:
+        return job, ()
+    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain)
+    return replace(job, calibration=fitted.calibration), fitted.warnings
 
 
 def _see_level(
