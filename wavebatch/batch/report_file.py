@@ -87,9 +87,9 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
-        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         "air": _describe_air(prepared),
         "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
 

@@ -126,7 +126,7 @@ class Prepared:
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
     pulse_energy: PulseEnergy | None = None
     doubts: tuple[str, ...] = ()
-    """Warnings about inputs that do not quite fit the strip, such as its calibration or its beam."""
+    """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
 
     @property
     def system(self) -> SystemPulse:
@@ -259,9 +259,9 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
-            job, misfits = _fit_calibration(reader, scan, job, choice, sensor)
-            choice, doubts = _see_level(reader, scan, job, choice, sensor)
-            doubts = (*misfits, *doubts)
+            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
+            choice, more = _see_level(reader, scan, job, choice, sensor)
+            doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
             energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
