@@ -251,7 +251,18 @@ def test_provenance_is_json_that_keeps_the_history(tmp_path):
     assert json.dumps(json.loads(vlrs[0].payload), sort_keys=True, separators=(",", ":")).encode() == vlrs[0].payload
     assert read_provenance(path) == []
     with pytest.raises(ConfigError, match="account of the run takes .* a VLR holds at most 65535"):
-        CloudWriter(layout, tmp_path / "d.las", provenance={"long": "x" * 70000})
+        CloudWriter(layout, tmp_path / "d.las", provenance={f"k{i}": i for i in range(10_000)})
+
+
+def test_what_a_record_cannot_hold_is_left_out_and_named(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    provenance = {"long": list(range(20_000)), "table": {"longer": "x" * 90_000, "short": "y"}, "input": "a.las"}
+    write(layout, tmp_path / "b.las", layout.rows(points), provenance=provenance)
+    (account,) = read_provenance(tmp_path / "b.las")
+    assert account["input"] == "a.las" and account["long"] is None
+    assert account["table"] == {"longer": None, "short": "y"}
+    assert set(account["left_out"]["sha256"]) == {"long", "table.longer"}
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])

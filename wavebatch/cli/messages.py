@@ -169,6 +169,9 @@ def one_line(error: BaseException) -> str:
         return f"{place}{error.strerror}; check disk and permissions"
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
+    if isinstance(error, MemoryError):
+        needed = f" ({text[0].lower()}{text[1:]})" if text else ""
+        return f"not enough memory{needed}; close other programs, or use fewer --jobs or a smaller --block-size"
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
 
 
