@@ -163,7 +163,7 @@ def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, A
     if len(payload) > MOST_PAYLOAD:
         payload = _encode_json(_shorten(json.loads(payload)))
     if len(payload) > MOST_PAYLOAD:
-        raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds {MOST_PAYLOAD}")
+        raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}")
     return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
 
 
