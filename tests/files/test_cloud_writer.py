@@ -587,3 +587,18 @@ def test_every_format_and_suffix_in_hand_made_combinations(tmp_path):
         for backend in BACKENDS:
             assert read_raw(target, backend).tobytes() == rows.tobytes()
         check_truth(target, rows)
+
+
+def test_records_whose_ids_are_no_text_do_not_keep_laspy_from_opening_the_cloud(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4))
+    layout = plan_output(path, [])
+    layout.source.header.vlrs.append(Vlr(b"caf\xe9", 7, b"x", b"\xff\xfe text"))
+    layout.source.header.vlrs.append(Vlr("é".encode(), 8, b"y", b"fine\0\xff"))
+    cloud = write(layout, tmp_path / "b.las", layout.rows(points))
+    found = {vlr.record_id: vlr for vlr in read_header(tmp_path / "b.las").vlrs}
+    assert found[7].user_id.rstrip(b"\0") == b"caf?" and found[7].description.rstrip(b"\0") == b"?? text"
+    assert found[8].user_id.rstrip(b"\0") == "é".encode() and found[8].payload == b"y"
+    assert list(cloud.dropped) == ["VLR caf? 7"]
+    with laspy.open(tmp_path / "b.las") as reader:
+        assert len(reader.header.vlrs) >= 2

@@ -136,7 +136,7 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
     if as_json:
         print_json(document)
     else:
-        click.echo("\n".join(lines))
+        click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
 def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:

@@ -83,7 +83,10 @@ def load_targets(path: Path | str) -> list[Target]:
     """
     text = read_text(path, "target file", 1 << 30)
     lines = io.StringIO(text, newline=None)
-    rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+    try:
+        rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise ConfigError(f"{path}: target file is neither GeoJSON nor CSV ({error})") from error
     targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")

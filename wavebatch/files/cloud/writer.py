@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,8 @@ class CloudWriter(PointFile):
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         header = _build_header(layout, provenance, self._evlrs)
+        for name in _clean_ids(header.vlrs):
+            self.dropped[name] = "bytes of its id or description that are no UTF-8 text are question marks"
         with protecting(self._inputs):
             super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
@@ -71,7 +74,9 @@ class CloudWriter(PointFile):
             for evlr in self._evlrs:
                 start = evlr.start + EVLR_HEADER_SIZE
                 source.seek(evlr.start)
-                self.append_record(source.read(EVLR_HEADER_SIZE), source, start, start + evlr.length)
+                head = source.read(EVLR_HEADER_SIZE)
+                head = head[:2] + _as_text(head[2:18]) + head[18:28] + _as_text(head[28:])
+                self.append_record(head, source, start, start + evlr.length)
         packets = self._layout.packets
         if packets is None:
             return
@@ -140,6 +145,27 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
     )
 
 
+def _clean_ids(vlrs: list[Vlr]) -> list[str]:
+    """Make ids and descriptions UTF-8, in place, and name the records: laspy opens no file with others."""
+    changed = []
+    for place, vlr in enumerate(vlrs):
+        clean = replace(vlr, user_id=_as_text(vlr.user_id), description=_as_text(vlr.description))
+        if clean != vlr:
+            vlrs[place] = clean
+            changed.append(f"VLR {clean.user} {vlr.record_id}")
+    return changed
+
+
+def _as_text(field: bytes) -> bytes:
+    """The field, with question marks for bytes before its first NUL that are not UTF-8."""
+    text, end, rest = field.partition(b"\0")
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        return text.decode("ascii", "replace").replace("\ufffd", "?").encode() + end + rest
+    return field
+
+
 def _is_carried(vlr: Vlr, layout: OutputLayout) -> bool:
     if vlr.user == "copc":
         return False
@@ -163,7 +189,9 @@ def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, A
     if len(payload) > MOST_PAYLOAD:
         payload = _encode_json(_shorten(json.loads(payload)))
     if len(payload) > MOST_PAYLOAD:
-        raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}")
+        raise ConfigError(
+            f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
+        )
     return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
 
 
