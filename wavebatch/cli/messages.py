@@ -262,6 +262,8 @@ class Progress:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
+        elif kind == "worker":
+            self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
             self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 

@@ -112,8 +112,9 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
             corners = np.array(str(fields["vertices"]).split(), np.float64).reshape(-1, 2)
         else:
             angle = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
-            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) * float(fields["radius"])
-            corners = circle + [float(fields["x"]), float(fields["y"])]
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):
+                corners = float(fields["radius"]) * circle + [float(fields["x"]), float(fields["y"])]
     except KeyError as error:
         raise ConfigError(
             f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"
