@@ -172,7 +172,9 @@ def test_records_are_kept_to_the_byte(tmp_path):
         write(layout, tmp_path / f"out{suffix}", layout.rows(points))
         header = read_header(tmp_path / f"out{suffix}")
         assert (header.padding, header.project_id) == (b"\xdd\xcc", bytes(range(16)))
-        expected = [vlr.encode() for vlr in vlrs if vlr.record_id not in (100, 101) and vlr.user != "copc"]
+        # laspy opens no file with ids that are not UTF-8.
+        shown = [dataclasses.replace(vlr, user_id=vlr.user_id.replace(b"\xe9", b"?")) for vlr in vlrs]
+        expected = [vlr.encode() for vlr in shown if vlr.record_id not in (100, 101) and vlr.user != "copc"]
         assert [vlr.encode() for vlr in header.vlrs][: len(expected)] == expected
         users = [vlr.user for vlr in header.vlrs[len(expected) :]]
         assert users == ["wavebatch", "LASF_Spec", "laszip encoded"][: 3 if suffix == ".laz" else 2]
@@ -261,8 +263,7 @@ def test_what_a_record_cannot_hold_is_left_out_and_named(tmp_path):
     write(layout, tmp_path / "b.las", layout.rows(points), provenance=provenance)
     (account,) = read_provenance(tmp_path / "b.las")
     assert account["input"] == "a.las" and account["long"] is None
-    assert account["table"] == {"longer": None, "short": "y"}
-    assert set(account["left_out"]["sha256"]) == {"long", "table.longer"}
+    assert account["table"] is None and set(account["left_out"]["sha256"]) == {"long", "table"}
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
