@@ -110,12 +110,12 @@ def build_inputs(base: Path) -> None:
     (x0, y0, _), (x1, y1, _) = cloud.header.mins, cloud.header.maxs
     corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
     shape = {"type": "Polygon", "coordinates": [corners]}
-    feature = {"type": "Feature", "properties": {"reflectance": 0.3, "name": "all"}, "geometry": shape}
+    feature = {"type": "Feature", "properties": {"reflectance": 0.3, "name": "all", "incidence": 20}, "geometry": shape}
     document = json.dumps({"type": "FeatureCollection", "features": [feature]})
     (base / "targets.geojson").write_text(document)
     (base / "polygons.geojson").write_text(document)
     radius = x1 - x0 + y1 - y0
-    (base / "targets.csv").write_text(f"name,reflectance,x,y,radius\nall,0.3,{x0:.2f},{y0:.2f},{radius:.2f}\n")
+    (base / "targets.csv").write_text(f"name,reflectance,incidence,x,y,radius\nall,0.3,20,{x0:.2f},{y0:.2f},{radius:.2f}\n")
     times = [float(cloud.gps_time.min()) + k for k in range(-2, 4)]
     ray = laspy.read(base / "strip.las")
     toward = np.stack([ray["x_t"], ray["y_t"], ray["z_t"]], axis=1).astype(float)

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # not from typing: Ctrl-C must find this import done (core/interrupts.py)
 if TYPE_CHECKING:
-    from typing import Any
-
     from wavebatch.batch.run import BatchResult, Outcome
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
     from wavebatch.core.errors import ConfigError, InputError, StageError
@@ -83,7 +81,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name when it is first used."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
