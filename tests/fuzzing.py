@@ -108,6 +108,7 @@ def build_inputs(base: Path) -> None:
 
     cloud = laspy.read(base / "cloud.laz")
     (x0, y0, _), (x1, y1, _) = cloud.header.mins, cloud.header.maxs
+    x0, x1, y0, y1 = x0 - 5, x1 + 5, y0 - 5, y1 + 5  # footprints lie wholly inside
     corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
     shape = {"type": "Polygon", "coordinates": [corners]}
     feature = {"type": "Feature", "properties": {"reflectance": 0.3, "name": "all", "incidence": 20}, "geometry": shape}
@@ -115,7 +116,8 @@ def build_inputs(base: Path) -> None:
     (base / "targets.geojson").write_text(document)
     (base / "polygons.geojson").write_text(document)
     radius = x1 - x0 + y1 - y0
-    (base / "targets.csv").write_text(f"name,reflectance,incidence,x,y,radius\nall,0.3,20,{x0:.2f},{y0:.2f},{radius:.2f}\n")
+    heading = "name,reflectance,incidence,x,y,radius"
+    (base / "targets.csv").write_text(f"{heading}\nall,0.3,20,{x0:.2f},{y0:.2f},{radius:.2f}\n")
     times = [float(cloud.gps_time.min()) + k for k in range(-2, 4)]
     ray = laspy.read(base / "strip.las")
     toward = np.stack([ray["x_t"], ray["y_t"], ray["z_t"]], axis=1).astype(float)
