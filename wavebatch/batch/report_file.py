@@ -26,6 +26,8 @@ from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.system_file import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
+MOST_REPORT = 64 << 20
+"""Most bytes of a report that are read; 255 digitizers take less than one."""
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
@@ -138,7 +140,7 @@ def build_document(
     facts, layout = prepared.facts, prepared.layout
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
     lost = {**layout.dropped, **dropped}
-    return {
+    found = {
         "schema": STRIP_SCHEMA,
         **described,
         **describe_chain(prepared),
@@ -163,8 +165,14 @@ def build_document(
             *prepared.doubts,
             *(f"{name}: {why}" for name, why in lost.items()),
         ],
-        "timing": build_timing(report),
     }
+    return {**found, "checksum": _sum_up(found), "timing": build_timing(report)}
+
+
+def _sum_up(document: Mapping[str, Any]) -> str:
+    """The checksum of a report without its timing: --resume believes no figure that was altered."""
+    figures = {key: value for key, value in document.items() if key not in ("timing", "checksum")}
+    return hashlib.sha256(format_json(json.loads(json.dumps(figures))).encode()).hexdigest()
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:
@@ -203,8 +211,13 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
     RunReport or None
         None where the cloud must be made.
     """
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        document = json.loads(report_path(job, folder).read_text("utf-8"))
+    # Whatever is wrong with a report, the cloud is made anew.
+    wrong = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+    with contextlib.suppress(*wrong):
+        with open(report_path(job, folder), "rb") as file:
+            document = json.loads(file.read(MOST_REPORT))
+        if document["checksum"] != _sum_up(document):
+            return None
         cloud = cloud_path(job, folder)
         same = document["schema"] == STRIP_SCHEMA and all(
             document[key] == json.loads(json.dumps(value)) for key, value in described.items()

@@ -38,6 +38,9 @@ from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, fin
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
 
+USUAL_SAMPLES = 256
+"""Waveforms of more samples than this count several times where --block-size is given."""
+
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
 
@@ -352,7 +355,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
-        blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)
+        blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
@@ -367,9 +370,11 @@ def unpack(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
-def _block_size(unit: Unit) -> int:
+def _block_size(unit: Unit, wanted: int | None) -> int:
+    """Waveforms of a block: as many as wanted, but fewer long ones, so that memory stays bounded."""
     longest = int(unit.packets.n_samples.max(initial=1))
-    return int(np.clip(BLOCK_SAMPLES // longest, 64, 65536))
+    most = max(min(BLOCK_SAMPLES // longest, 65536), 1)
+    return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
 
 
 def _run_blocks(

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, print_result
+from wavebatch.cli.messages import count, print_json, print_result, printable
 from wavebatch.cli.options import common_options, strip_argument, strip_options
 from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file, describe_strip
@@ -80,11 +80,11 @@ def check(
         if as_json:
             continue
         for line in found.problems:
-            click.echo(f"{found.file}: {line}")
+            click.echo(printable(f"{found.file}: {line}"))
         for line in found.notes:
-            click.echo(f"{found.file}: note: {line}")
+            click.echo(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
-            click.echo(f"{found.file}: ok ({found.summary})")
+            click.echo(printable(f"{found.file}: ok ({found.summary})"))
     if as_json:
         print_json(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)

@@ -14,7 +14,17 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, format_json, one_line, print_safely, talk
+from wavebatch.cli.messages import (
+    EXIT_USAGE,
+    Interrupted,
+    Progress,
+    count,
+    format_json,
+    one_line,
+    print_safely,
+    printable,
+    talk,
+)
 from wavebatch.cli.options import (
     OutputPath,
     air_options,
@@ -235,11 +245,12 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             failed += 1
             talk(f"error: {one_line(error)}")
             continue
-        click.echo(
+        line = (
             f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
+        click.echo(printable(line))
     by = jobs[0].request.describe(jobs[0].chain)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)

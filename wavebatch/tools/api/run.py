@@ -185,6 +185,8 @@ def plan_run(
     ConfigError
         For whatever is wrong with the options.
     """
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")
     found, request = find_request(chain, tolerance=tolerance, system=system)
     if survey == "flight":
         if system is not None:
