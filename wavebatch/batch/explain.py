@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from wavebatch.batch.counts import AMPLITUDE_BINS, RunReport
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
+from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.sensor import SensorSource
 
@@ -54,6 +55,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
     """
     lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -64,6 +66,16 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
                 remedy = REASONS[NoData.UNCERTAIN][1]
                 lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
     return tuple(lines)
+
+
+def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """Extra bytes of the input that added echoes share with the nearest return."""
+    added = report.count("added_echoes")
+    if added and prepared.layout.copied:
+        yield (
+            f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
+            "their packet, because no value is free for no-data"
+        )
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:

@@ -121,7 +121,6 @@ def build_document(
     """
     facts, layout = prepared.facts, prepared.layout
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
-    lost = {**layout.dropped, **dropped}
     return {
         "schema": STRIP_SCHEMA,
         **described,
@@ -136,12 +135,15 @@ def build_document(
         "output": {
             "file": cloud.name,
             "size": size,
+            "las_version": "{}.{}".format(*layout.version),
             "point_format": layout.point_format,
+            "kept_extra_bytes": [carried.record.name for carried in layout.carried],
+            "copied_to_added_echoes": dict.fromkeys(layout.copied, report.count("added_echoes")),
             "columns": {written.column: written.record.name for written in layout.written},
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in dropped.items())],
         "timing": build_timing(report),
     }
 

@@ -48,7 +48,10 @@ class RunOptions:
     points: str = "echoes"
     format: str = "laz"
     point_format: int | None = None
+    las_version: str = "1.4"
     names: str = "wavebatch"
+    no_data: str = "-9999"
+    strict: bool = False
     columns: tuple[str, ...] = ()
     """Columns to write, in order; see `choose_columns`."""
     keep_packets: bool = False
@@ -177,9 +180,12 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
         facts,
         options.columns,
         point_format=options.point_format,
+        las_version=options.las_version,
         packets=facts if options.keep_packets else None,
         names=options.names,
+        no_data=options.no_data,
         points=options.points,
+        strict=options.strict,
     )
 
 

@@ -43,6 +43,9 @@ def run(
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
     point_format: int | None = None,
+    las_version: Literal["1.4", "1.3", "keep"] = "1.4",
+    no_data: Literal["-9999", "nan"] = "-9999",
+    strict: bool = False,
     names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = "wavebatch",
     keep_packets: bool = False,
     direction: Literal["auto", "toward", "away"] = "auto",
@@ -86,7 +89,13 @@ def run(
     format : {"laz", "las"}
         Of the clouds.
     point_format : int, optional
-        LAS point format of the clouds; default: that of the strip without waveforms.
+        LAS point format of the clouds; default: 6, or 7 or 8 where the strip has colours.
+    las_version : {"1.4", "1.3", "keep"}
+        LAS version of the clouds; "keep": that of the strip, with its point format.
+    no_data : {"-9999", "nan"}
+        What floating-point columns hold where an echo has no value.
+    strict : bool
+        Fail where extra bytes of a strip have no free value to mark added echoes.
     names : {"wavebatch", "asprs", "riegl", "pdal", "opals"}
         Names and units of the extra bytes.
     keep_packets : bool
@@ -122,7 +131,8 @@ def run(
     """
     plan = plan_run(
         strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
-        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format, names=names,
+        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format,
+        las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
         memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
     )  # fmt: skip
