@@ -68,6 +68,31 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
+    """Find what makes results of a strip wrong; these lines are printed with --quiet too.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    report : RunReport
+        Of the whole strip.
+
+    Returns
+    -------
+    tuple of str
+        One line each: a chain that does not fit the strip's pulse.
+    """
+    choice, echoes = prepared.choice, report.count("echoes")
+    if not choice.doubted or not echoes:
+        return ()
+    share, (_, best) = choice.false_share, choice.predictions
+    return (
+        f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
+        f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the learned "
+        f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto",
+    )
+
+
 def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
     """Extra bytes of the input that added echoes share with the nearest return."""
     added = report.count("added_echoes")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,7 @@ def build_document(
     cloud: Path,
     size: int,
     dropped: Mapping[str, str],
+    serious: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the report of a strip whose cloud is complete.
 
@@ -113,6 +114,8 @@ def build_document(
         Of the cloud [bytes].
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
+    serious : sequence of str
+        Warnings about wrong results, which come first.
 
     Returns
     -------
@@ -143,7 +146,7 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in dropped.items())],
+        "warnings": [*serious, *facts.warnings, *prepared.scan.warnings, *map(": ".join, dropped.items())],
         "timing": build_timing(report),
     }
 

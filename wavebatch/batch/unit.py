@@ -28,7 +28,7 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 
@@ -218,7 +218,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             stranger = _hold(reader, scan, job)
             if stranger:
                 job = replace(job, request=replace(job.request, system=None))
-            choice = make_choice(reader, scan, job.chain, job.request)
+            choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
             if job.request.describe(job.chain) is not None:
                 choice = replace(choice, chain=job.extend(choice.chain))
             columns = without_columns(job.options.columns, job.chain, choice.chain)

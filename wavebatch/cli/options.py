@@ -99,7 +99,8 @@ sensor_options = together(
 _COMMON = {
     "overwrite": click.option("--overwrite", is_flag=True, help="Replace existing files."),
     "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
-    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no messages, only errors."),
+    "quiet": click.option("-q", "--quiet", is_flag=True,
+                          help="Print no progress and no messages, only errors and warnings of wrong results."),
     "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
 }
 
