@@ -21,7 +21,7 @@ INSIDE = {
     "surveying": [
         {"measure"}, {"learn_pulse", "flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"targets", "angle_limits", "flight"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"targets"},
     ],
 }
 """The same within packages whose modules do one thing after another."""

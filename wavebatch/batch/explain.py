@@ -80,17 +80,21 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        One line each: a chain that does not fit the strip's pulse.
+        One line each: a forced survey of another sensor, a chain that does not fit the strip's pulse.
     """
     choice, echoes = prepared.choice, report.count("echoes")
+    lines = []
+    if prepared.forced:
+        lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
     if not choice.doubted or not echoes:
-        return ()
+        return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
-    return (
+    lines.append(
         f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
         f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the learned "
-        f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto",
+        f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
     )
+    return tuple(lines)
 
 
 def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:

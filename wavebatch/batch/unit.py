@@ -31,6 +31,7 @@ from wavebatch.surveying.calibration import Calibration, needs_sensor, with_phys
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
@@ -109,6 +110,8 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    forced: str = ""
+    """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
 
     @property
     def system(self) -> SystemPulse:
@@ -215,7 +218,7 @@ def prepare_strip(job: StripJob) -> Prepared:
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
-            stranger = _hold(reader, scan, job)
+            stranger, forced = _hold(reader, scan, job)
             if stranger:
                 job = replace(job, request=replace(job.request, system=None))
             choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
@@ -234,14 +237,17 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger)
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, forced)
 
 
-def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
-    """Why the strip does not belong to the flight whose survey the job has; empty where it does."""
-    if job.request.system is None or not job.request.flight:
-        return ""
-    return hold_strip(reader, scan, job.request.system.survey)
+def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:
+    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a forced survey."""
+    request = job.request
+    if request.system is None:
+        return "", ""
+    if request.flight:
+        return hold_strip(reader, scan, request.system.survey), ""
+    return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:

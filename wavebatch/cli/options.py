@@ -75,9 +75,12 @@ strip_options = together(
     direction_option,
     click.option("--headerless", is_flag=True, help="Read a .wdp file that lacks its 60-byte header."),
 )
-system_option = file_option(
-    "--system", "system_file", text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."
-)
+system_option = together(
+    file_option("--system", "system_file",
+                text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."),
+    click.option("--force", is_flag=True, help="Use the survey of --system also where bits, noise or echo width of the "
+                 "strip contradict it."),
+)  # fmt: skip
 calibration_option = file_option(
     "--calibration", "calibration_file",
     text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",

@@ -165,6 +165,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         chain=options["chain_file"] or options["profile"],
         tolerance=_read_tolerance(options["tolerance"]),
         system=options["system_file"],
+        force=options["force"],
         survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],

@@ -44,6 +44,8 @@ class Request:
     """A saved survey; None: the strip is surveyed."""
     flight: bool = False
     """The saved survey is that of the strip's flight, or will be made before the run: the strip is held against it."""
+    force: bool = False
+    """Use the saved survey also where the strip contradicts it."""
 
     def describe(self, chain: Chain) -> str | None:
         """Return what chooses the chain, for reports; None where the user gave `chain` itself."""

@@ -36,6 +36,7 @@ def run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -74,7 +75,10 @@ def run(
     tolerance : float, optional
         Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
     system : Survey, path or str, optional
-        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip.
+        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip. A strip whose
+        samples contradict it fails.
+    force : bool
+        Use the survey of `system` also for strips that contradict it.
     survey : {"each", "flight"}
         Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
         again by later runs into it. A strip that does not fit it gets one of its own.
@@ -130,7 +134,7 @@ def run(
         For wrong options, before anything starts.
     """
     plan = plan_run(
-        strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
+        strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
         calibration=calibration, columns=columns, points=points, format=format, point_format=point_format,
         las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
@@ -146,6 +150,7 @@ def plan_run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -162,7 +167,7 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, survey, sensor, calibration, columns, jobs, scheduler, memory
+    strips, out, chain, tolerance, system, force, survey, sensor, calibration, columns, jobs, scheduler, memory
         As for `run`.
     block_size, overwrite, resume
         As for `run`.
@@ -182,6 +187,9 @@ def plan_run(
         For whatever is wrong with the options.
     """
     found, request = find_request(chain, tolerance=tolerance, system=system)
+    if force and system is None:
+        raise ConfigError("--force is of no use without --system; leave it out")
+    request = replace(request, force=force)
     if survey == "flight":
         if system is not None:
             raise ConfigError("--system and --survey flight exclude each other; give one of them")
