@@ -88,4 +88,6 @@ def _name(crs: str) -> dict[str, Any]:
     """The member `crs` of GeoJSON 2008, which GDAL and QGIS read: an EPSG code, or else the WKT."""
     found = re.search(r'(?:AUTHORITY\["EPSG","|ID\["EPSG",)(\d+)"?\]\s*\]\s*$', crs) or re.fullmatch(r"EPSG:(\d+)", crs)
     code = int(found[1]) if found else 0
-    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}" if code else crs}}
+    # RIEGL writes code 0, which GDAL would look up.
+    plain = re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", crs)
+    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}" if code else plain}}
