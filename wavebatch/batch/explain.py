@@ -55,6 +55,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
     """
     lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines += _name_height(prepared)
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -95,6 +96,15 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
     )
     return tuple(lines)
+
+
+def _name_height(prepared: Prepared) -> Iterator[str]:
+    """A flight height that was not needed."""
+    height, sensor = prepared.job.sensor.height, prepared.sensor
+    if height is not None and sensor.height is None:
+        seen = dict(sensor.facts).get("height_m")
+        where = f": {seen:.0f} m above the points" if seen else ""
+        yield f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}"
 
 
 def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:

@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
@@ -27,7 +27,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
+from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics, with_stages
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
@@ -35,6 +35,9 @@ from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
+
+LARGEST_HEIGHT_ERROR = 0.3
+"""Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
 
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
@@ -71,13 +74,18 @@ class StripJob:
     sensor: SensorRequest = SensorRequest()
     """Where the sensor's positions come from; used only if the chain needs them."""
     calibration: Calibration | None = None
+    added: tuple[str, ...] = ()
+    """Stages that make columns of --columns which no shipped chain computes."""
 
     def extend(self, chain: Chain) -> Chain:
-        """Return the chain with the physical stages that trajectory, calibration and divergence allow."""
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and `added`."""
         sources = (self.calibration, self.request.system and self.request.system.survey.system)
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
-        return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        calibrated = self.calibration is not None
+        return with_stages(
+            with_physics(chain, sensor=given, calibrated=calibrated, divergence=divergence), self.added
+        )
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration, if it has one."""
@@ -130,6 +138,11 @@ class Prepared:
         return self.layout if self.second_step is None else self.layout.extended(RAY)
 
 
+def split_columns(wanted: str | None) -> list[str]:
+    """Return the entries of --columns, with their `+`."""
+    return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+
+
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     """Choose the columns to write.
 
@@ -156,7 +169,7 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
         )
     computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
     default = [*computed, "echo_flags"]
-    entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+    entries = split_columns(wanted)
     added = [entry[1:] for entry in entries if entry.startswith("+")]
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:
@@ -230,6 +243,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
+            _hold_height(reader, job.sensor, sensor)
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
@@ -238,6 +252,19 @@ def prepare_strip(job: StripJob) -> Prepared:
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
     return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, forced)
+
+
+def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
+    """Refuse a flight height that contradicts the packet vectors, which are more exact and are used in its place."""
+    seen = dict(sensor.facts).get("height_m")
+    if request.height is None or sensor.height is not None or not seen:
+        return
+    if abs(np.log(request.height / max(seen, 1e-9))) > LARGEST_HEIGHT_ERROR:
+        where = f"by its {sensor.kind} the sensor flew {seen:.0f} m above the points"
+        raise InputError(
+            f"{reader.facts.path}: --flight-height {request.height:g} m contradicts the strip: {where}; leave "
+            "--flight-height out"
+        )
 
 
 def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:

@@ -62,7 +62,9 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 @strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
-@click.option("--columns", metavar="LIST", help="a,b writes only these columns; +a,+b adds them to the usual ones.")
+@click.option("--columns", metavar="LIST",
+              help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
+              "shipped ones get the stages that make them.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
               show_default=True, help="Naming scheme for names and units of the extra bytes.")
 @click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,

@@ -14,12 +14,12 @@ from typing import Any, Literal
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, split_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.calibration import load_calibration, needs_sensor
+from wavebatch.surveying.calibration import find_makers, load_calibration, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -87,7 +87,8 @@ def run(
     calibration : path or str, optional
         A file of `wavebatch calibrate`.
     columns : str, optional
-        "a,b" writes these columns only, "+a,+b" adds them to the usual ones.
+        "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
+        them.
     points : {"echoes", "returns"}
         One point per echo found, or the points of the input with new columns.
     format : {"laz", "las"}
@@ -200,12 +201,15 @@ def plan_run(
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)
+        extra = find_makers(found, [entry.lstrip("+") for entry in split_columns(columns)])
+        template = replace(template, added=extra)
+        found = template.extend(found)
     _check_use(found, sensor, known)
     options = RunOptions(columns=choose_columns(found, columns), **output)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
     batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
-    plan = [StripJob(path, found, options, request, sensor, known) for path in paths]
+    plan = [replace(template, path=path, chain=found, options=options) for path in paths]
     check_outputs(plan, batch_options)
     return plan, batch_options
 
@@ -250,7 +254,9 @@ def find_request(
 
 
 def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any) -> None:
-    """Raise ConfigError for files that the chain would ignore."""
+    """Raise ConfigError for files that the chain, or another option, would ignore."""
+    if sensor.trajectory is not None and sensor.height is not None:
+        raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration}
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
