@@ -121,6 +121,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 
 @plot.command()
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", required=True, help="Extra dimension or standard field; echo_flags counts flags.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
@@ -140,7 +141,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     """  # fmt: skip
     from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     check_picture(output, overwrite=options["overwrite"])
     selection = _select(column, options)
     how = {"log": options["log"], "overwrite": options["overwrite"]}
@@ -176,6 +177,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 @plot.command(name="map")
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
@@ -195,7 +197,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     """  # fmt: skip
     from wavebatch.tools.plots.raster import grid_values
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
