@@ -8,6 +8,7 @@ from helpers_scenes import make_scene
 from strips import cut_strip
 
 from wavebatch.cli import main
+from wavebatch.cli.survey import NOISE_KINDS
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.stages.chain_file import load_chain
 from wavebatch.surveying.auto_chain import chain_text, decide
@@ -45,7 +46,8 @@ def test_the_text_has_every_measure_and_every_decision(flat_strip, surveyed):
         assert any(line.startswith(name) for line in lines), name
     found = load_survey(folder / "SYSTEM.toml").survey
     for kind, value in found.system.noise_by_kind.items():
-        assert any(line.split() == [*kind.split("_"), f"{value:.3f}", "DN"] for line in lines), kind
+        end = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
+        assert any(line.startswith(f"  {NOISE_KINDS[kind]} ") and line.endswith(end) for line in lines), kind
     for decision in decide(found):
         word = "needed" if decision.needed else "left out"
         assert any(line.startswith(f"  {word}") and decision.part in line and decision.reason in line for line in lines)

@@ -221,6 +221,7 @@ def name_outputs(paths: Sequence[Path], output: Path, suffixes: Sequence[str], k
     if is_file or (len(paths) == 1 and not output.is_dir()):
         if len(paths) > 1:
             raise ConfigError(f"{output}: one file for {len(paths)} strips; give a folder, which gets a file for each")
+        refuse_input(output)
         return {paths[0]: output}
     named = {path: output / f"{path.stem}{kind}" for path in paths}
     if len(set(named.values())) < len(named):

@@ -40,7 +40,7 @@ _SURVEYED = 2000
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
-              help="plane: slices are vertical planes; time: rows are pulses, columns times; flat surfaces bend.")
+              help="plane: slices are vertical planes; time: rows are pulses, columns times on one axis.")
 @click.option("--std", default=2.0, show_default=True, metavar="STD",
               help="Search samples above this many standard deviations of the slice.")
 @click.option("--sigma", type=float, metavar="NS",

@@ -174,7 +174,7 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield _line("surveyed", count(saved.survey.waveforms, "waveform"))
     samples = f"{figures['n_samples']:.0f} of {figures['bits']:.0f} bits, {figures['spacing_ns']:g} ns apart"
     yield _line("samples", samples)
-    yield _line("ADC range", f"counts {figures['least_count']:.0f} to {figures['largest_count']:.0f}")
+    yield _line("ADC range", f"counts {round(figures['least_count'])} to {round(figures['largest_count'])}")
     if "direction" in facts:
         yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")
     yield from _noise_lines(saved)
@@ -200,12 +200,25 @@ def _line(name: str, text: str) -> str:
     return f"{name:18}{text}"
 
 
+NOISE_KINDS = {
+    "quiet": "quiet samples",
+    "quiet_smoothed": "quiet samples, filtered 1 2 1",
+    "quiet_pulse": "quiet samples, as a pulse sees it",
+    "outside": "outside of echoes",
+    "outside_pulse": "outside, as a pulse sees it",
+    "core": "left by fits in strong echoes",
+    "weak_echoes": "left by fits in weak echoes",
+}
+"""Names of the ways in which noise is measured; as a pulse sees it: noise of its amplitude, as that of one sample."""
+
+
 def _noise_lines(saved: SavedSurvey) -> Iterator[str]:
     system, figures = saved.survey.system, saved.survey.figures
     yield _line("baseline", f"{system.baseline:.3f} DN, +-{system.baseline_spread:.3f} DN between waveforms")
     yield _line("noise", f"{system.noise_std:.3f} DN for thresholds and errors, chosen from")
     for kind, value in system.noise_by_kind.items():
-        yield f"  {kind.replace('_', ' '):18}{value:.3f} DN"
+        known = f"{value:.3f} DN" if value > 0 else "not known: too few samples"
+        yield f"  {NOISE_KINDS.get(kind, kind.replace('_', ' ')):34}{known}"
     strong = figures["amplitude_99"]
     grown = f"{system.noise_gain * strong:.2f} DN2 at {strong:.0f} DN"
     text = f"variance grows by {system.noise_gain:.4f} DN2 per DN, {grown}"

@@ -15,6 +15,8 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, counting, print_json, talk
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import refuse_input
 from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
@@ -43,6 +45,9 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
               help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
               "from the highest return near it]")
+@click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
+              help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
+              "time.")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
 @shared.system_option
 @shared.calibration_option
@@ -68,7 +73,11 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
     (without --all-crossed) was seen to be empty.
 
     An .npz file holds index (n, 3), one array per value, origin, size, crs and meta; voxel i lies between origin + i
-    size and origin + (i + 1) size. Memory does not grow with the strip; large strips need room in TMPDIR. The options
+    size and origin + (i + 1) size. --profiles writes an .npz with the arrays point, gps_time, start, step, spacing,
+    anchored, clipped, first, count (one value per pulse with signal) and time, energy, cross_section (one per sample
+    with signal); the samples of pulse p are first[p] to first[p] + count[p] - 1, at start + time step.
+
+    Memory does not grow with the strip; large strips need room in TMPDIR. The options
     for the sensor position are for cross sections only.
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
@@ -78,10 +87,14 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
 
     _check_options(options)
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
-    more: dict[str, Any] = {name: options[name] for name in ("direction", "headerless", "overwrite", "force")}
+    names = ("direction", "headerless", "overwrite", "force", "profiles")
+    more: dict[str, Any] = {"sensor": shared.read_sensor(options), **{name: options[name] for name in names}}
     more |= {"system": shared.read_system(options), "calibration": shared.read_calibration(options)}
-    more["sensor"] = shared.read_sensor(options)
     paths = find_files(strips, recursive=options["recursive"])
+    if options["profiles"] is not None:
+        refuse_input(options["profiles"])
+    if len(paths) > 1 and options["profiles"] is not None:
+        raise ConfigError(f"--profiles {options['profiles']}: one file for {len(paths)} strips; make them one by one")
     targets = shared.name_outputs(paths, output, (".npz", ".las", ".laz"), ".npz")
 
     def work(strip: Path) -> VoxelSummary:
@@ -116,6 +129,8 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
         f"{summary.output}: {count(summary.voxels, 'voxel')} of {summary.size:g} m in {x} x {y} x {z}, "
         f"{summary.energy:.6g} DN ns from {summary.with_signal} of {count(summary.waveforms, 'waveform')}"
     )
+    if summary.profiles is not None:
+        yield f"{summary.profiles}: {count(summary.profile_samples, 'sample')} of {summary.with_signal} pulses"
     notes = {
         "without a return at the signal; placed by the raw return location": summary.with_signal - summary.anchored,
         "saturated; the energy is too low": summary.clipped,

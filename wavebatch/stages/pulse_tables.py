@@ -20,7 +20,7 @@ from wavebatch.kernels.fit.pulse_shape import (
     evaluate_pulse,
     measure_pulse,
 )
-from wavebatch.kernels.signal.noise import colour_factors
+from wavebatch.kernels.signal.noise import LEAST_FACTOR, colour_factors, correlation_matrix
 
 
 def pulse_shape(system: SystemPulse, spacing: float) -> PulseShape:
@@ -68,33 +68,6 @@ def clip_level(block: WaveformBlock, system: SystemPulse) -> float:
     return float(block.digitizer.max_count) if system.saturation is None else system.saturation
 
 
-@lru_cache(maxsize=8)
-def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
-
-    To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
-    """
-    if not correlation:
-        return np.ones(4)
-    reach = int(np.ceil(5 * width)) + 1
-    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
-    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
-    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
-    return np.array(colour_factors(correlation, *(np.asarray(row)[:, 0] for row in rows)))
-
-
-def error_factors(system: SystemPulse, spacing: float) -> np.ndarray:
-    """Errors of amplitude, time and width (3,) in coloured noise, over those that a fit says with `noise_std`.
-
-    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less of noise that changes slowly.
-    """
-    if not system.correlation:
-        return np.ones(3)
-    shape = pulse_shape(system, spacing)
-    alone, *fitted = noise_factors(shape, shape_limits(system, spacing).ref, system.correlation)
-    return np.array(fitted) / max(alone, 1.0)
-
-
 class ShapeLimits(NamedTuple):
     """Width of the system pulse and limits of fitted widths, of a pulse model's main component [samples]."""
 
@@ -103,8 +76,17 @@ class ShapeLimits(NamedTuple):
     high: float
 
 
-def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
-    """Return the allowed widths: 0.7 to 4 times the system's, and positive for every component of a learned pulse.
+LEAST_WIDTH, MOST_WIDTH = 0.7, 4.0
+"""Widths that fits allow where a chain says nothing [widths of the system pulse] (docs/algorithms.md H3)."""
+
+BROADEST = 100.0
+"""Largest width that tables of learned pulses hold [widths of the system pulse]."""
+
+
+def shape_limits(
+    system: SystemPulse, spacing: float, least: float = LEAST_WIDTH, most: float = MOST_WIDTH
+) -> ShapeLimits:
+    """Return the allowed widths, positive for every component of a learned pulse.
 
     Parameters
     ----------
@@ -112,6 +94,8 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
         Result of the survey.
     spacing : float
         Time between two samples [ns].
+    least, most : float
+        Smallest and largest width [widths of the system pulse].
 
     Returns
     -------
@@ -125,10 +109,11 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
     shape = pulse_shape(system, spacing)
     ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
     narrowest = min((extra for _, _, extra in shape.components), default=0.0)
-    return ShapeLimits(ref, max(0.7 * ref, float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))), 4.0 * ref)
+    positive = float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
+    return ShapeLimits(ref, max(least * ref, positive), max(most * ref, positive))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
     """Tabulate peak, delay and full width at half maximum by fitted width; cached, since each block needs it.
 
@@ -145,6 +130,98 @@ def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
         The table.
     """
     return measure_pulse(shape, limits.low, limits.high)
+
+
+def _near_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of the usual widths."""
+    return pulse_measures(shape, limits._replace(high=min(limits.high, _usual(limits))))
+
+
+def _wide_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of all widths above: one of both would be too coarse for the usual ones."""
+    usual = _usual(limits)
+    return pulse_measures(shape, ShapeLimits(limits.ref, usual, max(BROADEST * limits.ref, 1.01 * usual)))
+
+
+def _usual(limits: ShapeLimits) -> float:
+    return max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
+
+
+@lru_cache(maxsize=8)
+def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...]) -> np.ndarray:
+    """What coloured noise does to a pulse of this width [samples], over white noise of the same variance (4,).
+
+    To the amplitude of a pulse of known time and width, and to amplitude, time and width of a fit.
+    """
+    return np.array(colour_factors(correlation, *_pulse_rows(shape, width)))
+
+
+def _pulse_rows(shape: PulseShape, width: float) -> np.ndarray:
+    """A pulse of amplitude 1 and its derivatives by time and width, at every sample where it is more than noise."""
+    reach = int(np.ceil(5 * width)) + 1
+    tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
+    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
+    rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
+    return np.stack([np.asarray(row)[:, 0] for row in rows])
+
+
+FACTOR_WIDTHS = 12
+"""Widths at which the factors of errors are tabulated."""
+
+
+def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
+    """Errors of lone echoes over those that a fit in white noise gives to the main component of the pulse.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    width : float array, shape (m,)
+        Fitted widths [samples].
+
+    Returns
+    -------
+    float64 array, shape (m, 3)
+        Of amplitude, time and sigma as `describe_echoes` gives them; 1 for a Gaussian in white noise.
+
+    Notes
+    -----
+    Two things make them differ from 1. `noise_std` is what coloured noise does to amplitudes; times and widths suffer
+    less from noise that changes slowly. And peak and delay of a learned pulse change with its width, whose error is
+    correlated with those of the main component's amplitude and time (docs/algorithms.md H11).
+    """
+    shape = pulse_shape(system, spacing)
+    if not system.correlation and not shape.components:
+        return np.ones((len(width), 3))
+    widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
+    return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
+
+
+@lru_cache(maxsize=8)
+def _factor_table(
+    shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Widths (k,) and the factors of errors there (k, 3)."""
+    alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
+    widths = np.geomspace(limits.low, limits.high, FACTOR_WIDTHS)
+    return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
+
+
+def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
+    """Errors of amplitude, time and width (3,) in noise of this correlation, over those of the main component."""
+    joint = _pulse_rows(shape, width)
+    main = np.linalg.solve(joint @ joint.T, joint)
+    whole = main.copy()
+    if shape.components:
+        table = pulse_measures(shape, limits)
+        peak = np.interp(width, table.width, table.peak)
+        by_width = [np.interp(width, table.width, np.gradient(y, table.width)) for y in (table.peak, table.delay)]
+        whole[0] += by_width[0] / peak * main[2]
+        whole[1] += by_width[1] * main[2]
+    variance = np.einsum("is,is->i", whole @ correlation_matrix(correlation, joint.shape[1]), whole)
+    return np.sqrt(np.maximum(variance / np.sum(main * main, axis=1), LEAST_FACTOR))
 
 
 def describe_echoes(
@@ -171,7 +248,18 @@ def describe_echoes(
     """
     if not shape.components:
         return parameters, errors
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    whole = _describe(near, parameters, errors)
+    beyond = parameters[:, 2] > near.width[-1]
+    if beyond.any():
+        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond])
+        for values, others in zip(whole, wide, strict=True):
+            values[beyond] = others
+    return whole
+
+
+def _describe(table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As describe_echoes, with one table."""
     amplitude, time, width = parameters.T
     peak = np.interp(width, table.width, table.peak)
     sigma = table.half_width / FWHM_PER_SIGMA
@@ -199,7 +287,16 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
     """
     if not shape.components:
         return echoes
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    inner = _invert(near, echoes)
+    beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
+    if limits.high > near.width[-1] and beyond.any():
+        inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+    return inner
+
+
+def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
+    """As model_parameters, with one table."""
     amplitude, time, sigma = echoes.T
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
     delay = np.interp(width, table.width, table.delay)

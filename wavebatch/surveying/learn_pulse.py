@@ -35,6 +35,9 @@ BEFORE, AFTER = 9.0, 40.0
 NARROWEST = 0.06
 """How far the width of an echo that teaches the pulse may be from the lower edge, as a share of it."""
 
+FAR_FROM_LIMIT = 0.75
+"""Amplitude, over the largest count, up to which no receiver compresses an echo much."""
+
 SEPARATE = 5.0
 """Widths of the pulse to the next echo from which its error does not matter to a stack."""
 
@@ -63,12 +66,13 @@ BETTER = 0.97
 """Misfit of widened echoes, over that of a simpler pulse, at which the other one is taken."""
 
 
-def find_isolated(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """Echoes to learn from: the strongest by ten to one of their waveform, unsaturated, as narrow as the pulse (R2).
+def find_isolated(block: WaveformBlock, system: SystemPulse, clear: EchoTable) -> EchoTable:
+    """Echoes to learn from: of the clear ones those far from the limit that are as narrow as the pulse (R2).
 
     The half of them nearest to the lower edge of the widths: flat targets, whose echoes slopes do not widen.
     """
-    return _nearest_to_edge(_find_clear(block, system))
+    top = system.saturation or float(block.samples.max())
+    return _nearest_to_edge(clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top)))
 
 
 def _nearest_to_edge(echoes: EchoTable) -> EchoTable:
@@ -120,7 +124,8 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     """Rows of clear echoes whose neighbours are at least SEPARATE widths away, or a tenth as high."""
     top = system.saturation or float(block.samples.max())
     good = (echoes.amplitude > MIN_SNR * system.noise_std) & (echoes.amplitude > 0.08 * top)
-    good &= (echoes.amplitude < 0.75 * top) & ((echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0)
+    good &= echoes.amplitude < FAR_FROM_LIMIT * top
+    good &= (echoes.flags & np.uint16(UNCLEAN & ~int(EchoFlag.OVERLAPPED))) == 0
     gap = np.diff(echoes.time) / system.sigma_ref
     close = (np.diff(echoes.waveform) == 0) & (gap < SEPARATE)
     good[1:] &= ~(close & (echoes.amplitude[:-1] > ALONE * echoes.amplitude[1:]))
@@ -128,9 +133,8 @@ def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable)
     return np.flatnonzero(good)
 
 
-def find_strong(block: WaveformBlock, system: SystemPulse) -> EchoTable:
-    """The strongest fifth of the isolated echoes that are neither clipped nor widened by their target."""
-    echoes = _find_clear(block, system, most=1.0)
+def find_strong(echoes: EchoTable) -> EchoTable:
+    """The strongest fifth of the clear echoes that their target has not widened."""
     if len(echoes) < FEW:
         return echoes
     narrow = echoes.sigma < WIDENED * find_edge(echoes.sigma)
@@ -138,11 +142,8 @@ def find_strong(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     return echoes.take(strong[:: max(len(strong) // MOST_STRONG, 1)])
 
 
-def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -> EchoTable:
-    """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped.
-
-    most: largest amplitude, as a share of the largest count.
-    """
+def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
+    """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped."""
     n = len(block)
     noise = pooled_noise(block, system)
     echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
@@ -150,7 +151,7 @@ def _find_clear(block: WaveformBlock, system: SystemPulse, most: float = 0.75) -
     echoes = echoes.take(strongest)
     top = system.saturation or float(block.samples.max())
     good = echoes.amplitude > MIN_SNR * system.noise_std
-    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < most * top)
+    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < top)
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
     return echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second)))
 
@@ -204,7 +205,9 @@ def _fit_wide_best(block: WaveformBlock, system: SystemPulse, pulses: tuple[Syst
     A skewed pulse is stretched as a whole where a target widens it, a sum of Gaussians grows round: which of them is
     right only the strongest echoes of slopes and plants say.
     """
-    clear = _find_clear(block, system)
+    clear = find_clear(block, system)
+    top = system.saturation or float(block.samples.max())
+    clear = clear.take(np.flatnonzero(clear.amplitude < FAR_FROM_LIMIT * top))
     clear = clear.take(np.flatnonzero(clear.sigma > WIDENED * find_edge(clear.sigma)))
     clear = clear.take(np.sort(np.argsort(-clear.amplitude, kind="stable")[:MOST_WIDENED]))
     if len(clear) < FEW:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD, SQRT_PI
@@ -26,6 +26,9 @@ from wavebatch.stages.pulse_tables import clip_level, model_parameters, noise_fa
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+
+FAR_OFF = 0.1
+"""Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
 
 SETTLED = 0.01
 """Change of the width, as a share of it, below which it stays."""
@@ -82,6 +85,10 @@ SAME_NOISE = 1.1
 LEAST_QUIET = 0.15
 """Share of quiet samples below which noise comes from residuals of good fits."""
 
+GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
+"""Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
+class of heights: misfit of the pulse is taken off by lag and class."""
+
 MISFIT_QUANTILE = 0.8
 """Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
 
@@ -105,21 +112,24 @@ LEAST_TAIL = 0.002
 """Share of an echo below which its tail is as the pulse says."""
 
 
-def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH) -> SystemPulse:
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
     """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
 
-    first: width to begin with [samples], and to end with where too few echoes are isolated.
+    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
     """
     saturation = find_saturation(block.samples, block.digitizer.max_count)
     few = thin_block(block, FIRST_LOOK)
-    width, last = first, 0.0
+    width, last = first, first if known else 0.0
     for _ in range(MOST_ROUNDS):
         if abs(width - last) <= SETTLED * width:
             break
         system, last = _gaussian_system(few, width, saturation), width
         width = _isolated_width(few, system)
-    system = _gaussian_system(block, width, saturation)
-    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
+    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+    last, width = width, _isolated_width(block, system)
+    if known and abs(width / last - 1) > FAR_OFF:
+        return measure_gaussian(block, width)
+    return replace(system, sigma_ref=width * block.spacing)
 
 
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
@@ -491,12 +501,49 @@ def _taken_by_fit(lag: np.ndarray, width: np.ndarray) -> np.ndarray:
     return np.minimum(leverage, 0.9)
 
 
+def _chance_part(residual: np.ndarray, model: np.ndarray, lag: np.ndarray, core: np.ndarray) -> np.ndarray:
+    """Residuals at `core` (mask) less what all echoes of about one height leave at one lag (k,).
+
+    That part is the pulse's misfit. It changes with the height where a receiver compresses, and would look like noise
+    that grows with the signal: one of 0.05 DN2/DN on a strip of Leica, whose noise does not grow.
+    """
+    height = model.max(axis=1)
+    classes = min(max(len(height) // GROWTH_CLASS, 1), 8)
+    of_height = np.searchsorted(np.quantile(height, np.linspace(0, 1, classes + 1)[1:-1]), height)
+    bins = int(2 * GROWTH_REACH / GROWTH_STEP)
+    place = np.clip(((lag[core] + GROWTH_REACH) / GROWTH_STEP).astype(np.int64), 0, bins - 1)
+    place += bins * np.broadcast_to(of_height[:, None], lag.shape)[core]
+    values = residual[core].astype(np.float64)
+    middle, number = np.zeros(bins * classes), np.bincount(place, minlength=bins * classes)
+    order = np.argsort(place, kind="stable")
+    for cell, part in enumerate(np.split(values[order], np.cumsum(number)[:-1])):
+        middle[cell] = np.median(part) if len(part) else 0.0
+    return (values - middle[place]) * np.sqrt(number[place] / np.maximum(number[place] - 1, 1))
+
+
+def _fit_growth(terms: np.ndarray, values: np.ndarray, columns: tuple[int, ...]) -> tuple[np.ndarray, float]:
+    """Least squares by some columns of the terms, with no negative factor: the factors of all, and the sum of squares.
+
+    The best of all subsets that need no bound. (scipy's nnls finds the same, but to import it takes as long as half a
+    survey.)
+    """
+    best, least = np.zeros(terms.shape[1]), float(values @ values)
+    for number in range(1, len(columns) + 1):
+        for part in combinations(columns, number):
+            factors = np.linalg.lstsq(terms[:, part], values, rcond=None)[0]
+            rest = values - terms[:, part] @ factors
+            if (factors >= 0).all() and rest @ rest < least:
+                best, least = np.zeros(terms.shape[1]), float(rest @ rest)
+                best[list(part)] = factors
+    return best, least
+
+
 def _noise_gain(
     residual: np.ndarray, model: np.ndarray, lag: np.ndarray, width: np.ndarray, std: float, coloured: bool
 ) -> float:
     """Growth of the variance per count of signal, 0 where it cannot be told from none (H12)."""
-    core = np.abs(lag) < 1.5
-    signal, squared = model[core].astype(np.float64), residual[core].astype(np.float64) ** 2
+    core = np.abs(lag) < GROWTH_REACH
+    signal, squared = model[core].astype(np.float64), _chance_part(residual, model, lag, core) ** 2
     squared /= 1 - _taken_by_fit(lag[core], np.broadcast_to(width[:, None], lag.shape)[core])
     if len(signal) < 2000:
         return 0.0
@@ -508,9 +555,9 @@ def _noise_gain(
     # A pulse that misses its echoes leaves what grows with the square of the signal: only the linear part is noise.
     scale = np.hypot(variance, std**2)
     terms = np.stack([np.ones_like(level), level, level * level], axis=1) / scale[:, None]
-    fits = [scipy.optimize.nnls(terms[:, columns], variance / scale) for columns in ([0], [0, 1], [0, 2], [0, 1, 2])]
-    chance = max(fits[3][1] ** 2 / max(len(level) - 3, 1), 1e-4)
-    chi2 = [min(rest**2 / chance, 1e6) for _, rest in fits]
+    fits = [_fit_growth(terms, variance / scale, columns) for columns in ((0,), (0, 1), (0, 2), (0, 1, 2))]
+    chance = max(fits[3][1] / max(len(level) - 3, 1), 1e-4)
+    chi2 = [min(rest / chance, 1e6) for _, rest in fits]
     # The linear law alone, or both, as the data are likelier; and by degrees from 3 to 6 sigma: at a limit, tiles of
     # one strip would fall on either side.
     share = 1 / (1 + np.exp(np.clip(0.5 * (chi2[1] - chi2[2]), -50, 50)))

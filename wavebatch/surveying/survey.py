@@ -16,7 +16,7 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.learn_pulse import find_isolated, find_strong, learn_pulse, refine_pulse
+from wavebatch.surveying.learn_pulse import find_clear, find_isolated, find_strong, learn_pulse, refine_pulse
 from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
     FEW,
@@ -32,6 +32,7 @@ from wavebatch.surveying.measure import (
     thin_block,
 )
 from wavebatch.surveying.systems.known_systems import find_source, take_pulse
+from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -44,6 +45,9 @@ LEAST_QUIET_SAMPLES = 4
 
 LEAST_LEVELS = 5
 """Waveforms of a descriptor from which its level can be told from that of others."""
+
+SAME_THRESHOLD = 1.03
+"""Ratio of two noises up to which the sample is not decomposed again."""
 
 STRANGE, STRANGE_NOISE = 6.0, 1.3
 """Standard errors, and ratio of the noise, from which a descriptor is a digitizer of its own."""
@@ -331,14 +335,14 @@ def clean_sample(block: WaveformBlock, system: SystemPulse) -> tuple[WaveformBlo
         return block, system
     block = clean_block(block, found)
     kept = {name: getattr(found, name) for name in ("pattern", "slope_spread", "spikes", "transient")}
-    return block, replace(measure_gaussian(block, system.sigma_ref / block.spacing), **kept)
+    return block, replace(measure_gaussian(block, system.sigma_ref / block.spacing, known=True), **kept)
 
 
 def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey:
     """As survey_block, from noise and width as `measure_gaussian` finds them."""
     figures: dict[str, float] = {}
     if learn:
-        main = find_isolated(block, system)
+        main = find_isolated(block, system, find_clear(block, system))
         figures["isolated_echoes"] = len(main)
         if len(main) >= ENOUGH_TO_LEARN:
             system = learn_pulse(block, system, main, figures)
@@ -352,14 +356,26 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
             system, chosen = refine_pulse(part, system, decompose_sample(part, system), figures)
             if len(chosen) < ENOUGH_TO_LEARN or abs(system.sigma_ref / last - 1) < SETTLED:
                 break
-        system = measure_residuals(part, system, decompose_sample(part, system))
-        system = measure_misfit(block, system, find_strong(block, system))
-    part = thin_block(block, RESIDUAL_LOOK)
-    echoes = decompose_sample(part, system)
+        before, echoes = system, decompose_sample(part, system)
+        system = measure_residuals(part, system, echoes)
+        system = measure_misfit(block, system, find_strong(find_clear(block, system)))
+        if not _finds_alike(before, system):
+            echoes = decompose_sample(part, system)
+    else:
+        part = thin_block(block, RESIDUAL_LOOK)
+        echoes = decompose_sample(part, system)
     system = replace(system, width_scatter=_measure_scatter(part, system, echoes))
+    system = measure_skew(part, system, echoes) if learn else system
     figures.update(_describe(part, system, echoes))
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))
     return Survey(system, len(block), figures, decisions)
+
+
+def _finds_alike(one: SystemPulse, other: SystemPulse) -> bool:
+    """Whether two surveys with one pulse find the same echoes, near enough for the shares of a scene."""
+    ratio = other.noise_std / one.noise_std
+    alike = one.noise_gain == other.noise_gain and one.misfit == other.misfit
+    return alike and max(ratio, 1 / ratio) < SAME_THRESHOLD
 
 
 def _measure_scatter(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> float:

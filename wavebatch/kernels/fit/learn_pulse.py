@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
@@ -19,6 +19,13 @@ GAIN = 0.10
 
 TRIAL_EVALUATIONS = 25
 """Evaluations after which the starts of one more component are compared."""
+
+MOST_EVALUATIONS = 200
+"""Evaluations after which a fit ends."""
+
+FIRST_DAMPING, MOST_DAMPING, FIT_SETTLED = 10.0, 1e8, 1e-8
+"""Damping of the first step (less jumps into pairs of broad components that cancel), damping at which no step helps,
+and share by which the sum of squares falls in the last step."""
 
 DEEPEST = 0.3
 """Largest negative weight of a component: an undershoot. Deeper ones only cancel another component, and such a pair
@@ -90,19 +97,23 @@ class PulseFit(NamedTuple):
 
 
 def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> list[PulseFit]:
-    """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more."""
+    """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
+
+    One that gains less is kept where the next one after it makes up for both.
+    """
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
     fits: list[PulseFit] = []
+    worth = 0
     while True:
         parameters = _refine(stack, weight, parameters)
         residual = stack.value - _sum(parameters, stack.lag)
-        fit = _as_fit(parameters, float(np.sqrt(np.mean(residual**2))))
-        if fits and fit.rms > (1 - GAIN) * fits[-1].rms:
-            return fits
-        fits.append(fit)
-        if len(fits) == most:
-            return fits
+        fits.append(_as_fit(parameters, float(np.sqrt(np.mean(residual**2)))))
+        last = len(fits) - 1
+        if fits[last].rms <= (1 - GAIN) ** (last - worth) * fits[worth].rms:
+            worth = last
+        if len(fits) == most or last - worth == 2:
+            return fits[: worth + 1]
         parameters = _add_component(stack, weight, parameters, residual)
 
 
@@ -112,15 +123,23 @@ def fit_skewed(stack: Stack, width: float) -> PulseFit:
     # A tail is no skew: the main lobe decides, all of the stack says how well it fits.
     lobe = np.where(np.abs(stack.lag) < LOBE * width, weight, 0.0)
 
-    def misfit(p: np.ndarray, weight: np.ndarray = lobe) -> np.ndarray:
+    def evaluate(p: np.ndarray) -> tuple[np.ndarray, ...]:
         t, s = np.array([p[1]]), np.array([p[2]])
-        pulse = evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s)[0][:, 0]
-        return (p[0] * pulse - stack.value) * weight
+        return tuple(row[:, 0] for row in evaluate_pulse(PulseShape(kappa=float(p[3])), stack.lag[:, None], t, s))
 
-    low, high = [0.5, -3 * width, 0.3 * width, -0.6], [2.0, 3 * width, 3 * width, 0.6]
-    result = scipy.optimize.least_squares(misfit, [1.0, 0.0, width, 0.02], bounds=(low, high))
-    amplitude, delay, sigma, kappa = result.x
-    rms = float(np.sqrt(np.mean(misfit(result.x, np.ones_like(weight)) ** 2)))
+    def misfit(p: np.ndarray) -> np.ndarray:
+        return (p[0] * evaluate(p)[0] - stack.value) * lobe
+
+    def slopes(p: np.ndarray) -> np.ndarray:
+        pulse, by_time, by_width = evaluate(p)
+        step = 1e-4 if p[3] < 0 else -1e-4
+        by_skew = (evaluate(p + [0, 0, 0, step])[0] - pulse) / step
+        return np.stack([pulse, p[0] * by_time, p[0] * by_width, p[0] * by_skew], axis=1) * lobe[:, None]
+
+    low, high = np.array([0.5, -3 * width, 0.3 * width, -0.6]), np.array([2.0, 3 * width, 3 * width, 0.6])
+    fitted = fit_bounded(misfit, slopes, np.array([1.0, 0.0, width, 0.02]), low, high, MOST_EVALUATIONS)
+    amplitude, delay, sigma, kappa = fitted
+    rms = float(np.sqrt(np.mean((amplitude * evaluate(fitted)[0] - stack.value) ** 2)))
     return PulseFit(np.array([[1.0, 0.0, sigma]]), float(kappa), rms / amplitude, float(delay))
 
 
@@ -144,53 +163,113 @@ def _slopes(parameters: np.ndarray, lag: np.ndarray) -> np.ndarray:
     return np.stack([bell, steep, steep * z], axis=2).reshape(len(lag), -1)
 
 
-def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = 200) -> np.ndarray:
+def _refine(stack: Stack, weight: np.ndarray, start: np.ndarray, most: int = MOST_EVALUATIONS) -> np.ndarray:
     """The sum of Gaussians fitted from a start, in at most `most` evaluations.
 
-    The parameters are weight, the delay's distance from the earliest that is allowed to its sigma, and sigma.
+    The parameters are weight, place and sigma; the place is the delay as a share of the way from the earliest that is
+    allowed to a component of this sigma to the end of the stack. Beyond the end nothing holds a component.
     """
-    width = abs(start[2])
+    width, end = abs(start[2]), stack.lag[-1]
     low = np.tile([-DEEPEST, 0.0, 0.35 * width], len(start) // 3)
-    high = np.tile([2.0, stack.lag[-1] + EARLIEST * width, 12.0 * width], len(start) // 3)
+    high = np.tile([2.0, 1.0, 12.0 * width], len(start) // 3)
 
     def earliest(sigma: np.ndarray) -> np.ndarray:
-        return np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width)
+        return np.minimum(np.maximum(-EARLIEST * width, 2 * sigma - ONSET * width), end - width)
 
     def plain(p: np.ndarray) -> np.ndarray:
-        q = p.copy()
-        q[1::3] += earliest(p[2::3])
+        q, first = p.copy(), earliest(p[2::3])
+        q[1::3] = first + p[1::3] * (end - first)
         return q
 
     def slopes(p: np.ndarray) -> np.ndarray:
         jacobian = _slopes(plain(p), stack.lag)
-        jacobian[:, 2::3] += 2 * (2 * p[2::3] > (ONSET - EARLIEST) * width) * jacobian[:, 1::3]
+        first = earliest(p[2::3])
+        moves = (first > -EARLIEST * width) & (first < end - width)
+        jacobian[:, 2::3] += 2 * moves * (1 - p[1::3]) * jacobian[:, 1::3]
+        jacobian[:, 1::3] *= end - first
         return jacobian * weight[:, None]
 
-    first = start.copy()
-    first[1::3] -= earliest(start[2::3])
-    result = scipy.optimize.least_squares(
-        lambda p: (_sum(plain(p), stack.lag) - stack.value) * weight,
-        np.clip(first, low, high),
-        jac=slopes,
-        bounds=(low, high),
-        max_nfev=most,
-    )
-    return plain(result.x)
+    def misfit(p: np.ndarray) -> np.ndarray:
+        return (_sum(plain(p), stack.lag) - stack.value) * weight
+
+    first, begin = start.copy(), earliest(start[2::3])
+    first[1::3] = (start[1::3] - begin) / (end - begin)
+    return plain(fit_bounded(misfit, slopes, np.clip(first, low, high), low, high, most))
+
+
+def fit_bounded(
+    misfit: Callable[[np.ndarray], np.ndarray],
+    slopes: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    most: int,
+) -> np.ndarray:
+    """Least squares between bounds, in at most `most` evaluations, from a start that lies between them.
+
+    Parameters
+    ----------
+    misfit, slopes : callable
+        Residuals (b,) of parameters (p,), and their derivatives (b, p).
+    start, low, high : float64 (p,)
+    most : int
+
+    Returns
+    -------
+    float64 (p,)
+
+    Notes
+    -----
+    Levenberg and Marquardt's steps, cut off at the bounds; a parameter that would leave its bounds is held there. For a
+    few hundred samples and 15 parameters it takes a third of the time of scipy's `least_squares`, whose steps cost more
+    than the model.
+    """
+    at, rest = start, misfit(start)
+    cost, damping = float(rest @ rest), FIRST_DAMPING
+    jacobian = slopes(at)
+    for _ in range(most - 1):
+        downhill = -(jacobian.T @ rest)
+        free = ~(((at <= low) & (downhill < 0)) | ((at >= high) & (downhill > 0)))
+        part = jacobian[:, free]
+        normal = part.T @ part
+        scale = np.maximum(normal.diagonal(), 1e-12 * max(float(normal.diagonal().max(initial=0)), 1e-300))
+        step = np.zeros_like(at)
+        step[free] = np.linalg.solve(normal + np.diag(damping * scale), downhill[free])
+        there = np.clip(at + step, low, high)
+        new = misfit(there)
+        new_cost = float(new @ new)
+        if new_cost < cost:
+            small = cost - new_cost < FIT_SETTLED * cost
+            at, rest, cost, damping = there, new, new_cost, max(damping / 5, 1e-9)
+            if small:
+                break
+            jacobian = slopes(at)
+        elif damping > MOST_DAMPING:
+            break
+        else:
+            damping *= 4
+    return at
 
 
 def _add_component(stack: Stack, weight: np.ndarray, parameters: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """The best of several starts with one more Gaussian, on its way to where it will settle."""
+    """The best of several starts with one more Gaussian, on its way to where it will settle.
+
+    At the largest and the smallest residual, and at the peak: a shape that is sharper or flatter than a Gaussian leaves
+    small residuals of both signs around it, and a strip of RIEGL learned it or not by the half that was looked at. The
+    fit is weighted by errors; what is compared is the plain misfit, as everywhere else: by weights, the exact tail wins
+    over a core that strong echoes miss three times as much.
+    """
     width = parameters[2]
-    best, best_cost = parameters, np.inf
     smooth = np.convolve(residual, np.ones(5) / 5, mode="same")
-    for place in {int(np.argmax(smooth)), int(np.argmin(smooth))}:
-        for factor in (0.7, 1.5, 4.0):
-            start = np.r_[parameters, smooth[place], stack.lag[place], factor * width]
-            tried = _refine(stack, weight, start, TRIAL_EVALUATIONS)
-            cost = float(np.sum(((_sum(tried, stack.lag) - stack.value) * weight) ** 2))
-            if cost < best_cost:
-                best, best_cost = tried, cost
-    return best
+    starts = [
+        np.r_[parameters, smooth[place], stack.lag[place], factor * width]
+        for place in sorted({int(np.argmax(smooth)), int(np.argmin(smooth))})
+        for factor in (0.7, 1.5, 4.0)
+    ]
+    sharper = np.r_[parameters, -0.2, parameters[1], 1.3 * width]
+    sharper[0] += 0.2
+    tried = [_refine(stack, weight, start, TRIAL_EVALUATIONS) for start in (*starts, sharper)]
+    return min(tried, key=lambda p: float(np.sum((_sum(p, stack.lag) - stack.value) ** 2)))
 
 
 def _as_fit(parameters: np.ndarray, rms: float) -> PulseFit:

@@ -427,6 +427,10 @@ def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> 
     return float(np.sqrt(variance)), np.array(found) / max(variance, 1e-12)
 
 
+LEAST_FACTOR = 0.05
+"""Least variance in coloured noise, over that in white noise: an estimated correlation may be none that can be."""
+
+
 def colour_factors(
     correlation: tuple[float, ...] | np.ndarray, pulse: np.ndarray, by_time: np.ndarray, by_width: np.ndarray
 ) -> tuple[float, float, float, float]:
@@ -450,13 +454,28 @@ def colour_factors(
     A least-squares fit with white weights has the covariance (J'J)^-1 J'RJ (J'J)^-1; J holds the derivatives of the
     pulse, R the correlation matrix (docs/algorithms.md H11).
     """
-    rho = np.asarray(correlation, np.float64)
-    if not len(rho):
+    if not len(correlation):
         return 1.0, 1.0, 1.0, 1.0
     joint = np.stack([pulse, by_time, by_width], axis=1).astype(np.float64)
     weights = np.linalg.solve(joint.T @ joint, joint.T)
-    lag = np.abs(np.subtract.outer(np.arange(len(joint)), np.arange(len(joint))))
-    matrix = np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
+    matrix = correlation_matrix(correlation, len(joint))
     rows = (joint[:, 0], *weights)
-    least = 0.05
-    return tuple(float(np.sqrt(max((row @ matrix @ row) / (row @ row), least))) for row in rows)
+    return tuple(float(np.sqrt(max((row @ matrix @ row) / (row @ row), LEAST_FACTOR))) for row in rows)
+
+
+def correlation_matrix(correlation: tuple[float, ...] | np.ndarray, size: int) -> np.ndarray:
+    """Correlation of noise between any two of `size` samples.
+
+    Parameters
+    ----------
+    correlation : (k,)
+        At lags 1, 2, ... [samples]; beyond them 0.
+    size : int
+
+    Returns
+    -------
+    float64 (size, size)
+    """
+    rho = np.asarray(correlation, np.float64)
+    lag = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    return np.r_[1.0, rho, 0.0][np.minimum(lag, len(rho) + 1)]
