@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from wavebatch.cli.messages import one_line, report_errors, talk
 from wavebatch.core.errors import ConfigError, InputError
@@ -63,9 +64,23 @@ def together(*options: Callable) -> Callable:
 
 
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
+
+
+def _complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Lets the shell complete file names; `@` of a list is none of theirs."""
+    return [CompletionItem(incomplete, type="file")]
+
+
+def _complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    from wavebatch.stages.chain_file import list_profiles
+
+    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
+
+
 recursive_option = click.option("--recursive", is_flag=True, help="Also take the files in subfolders of folders.")
 strips_argument = together(
-    click.argument("strips", nargs=-1, required=True, metavar="STRIP..."), recursive_option
+    click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=_complete_files),
+    recursive_option,
 )
 clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
 
@@ -92,8 +107,8 @@ calibration_option = file_option(
 )  # fmt: skip
 chain_options = together(
     file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
-    click.option("--profile", metavar="auto|fast|balanced|accurate", help="Run a shipped chain; auto surveys the strip "
-                 "and chooses the cheapest chain that suits it.  [default: auto]"),
+    click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=_complete_profiles,
+                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  [default: auto]"),
 )  # fmt: skip
 sensor_options = together(
     file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
