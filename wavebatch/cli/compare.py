@@ -87,8 +87,8 @@ def _tolerance(options: dict) -> dict[str, float]:
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
-    for name in ("system_file", "limit"):
-        if options[name] is not None:
+    for name in ("system_file", "force", "limit"):
+        if options[name] not in (None, False):
             raise click.UsageError(f"--{name.removesuffix('_file')} is for chains; give --strip STRIP too")
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
@@ -212,7 +212,7 @@ def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
     from wavebatch.tools.compare.angles import compare_angles
 
     for name, value in options.items():
-        if value is not None and name not in ("tolerance", "debug"):
+        if value not in (None, False) and name not in ("tolerance", "debug"):
             raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with --angles")
     return compare_angles(a, b, **_tolerance(options))
 

@@ -108,7 +108,8 @@ calibration_option = file_option(
 chain_options = together(
     file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
     click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=_complete_profiles,
-                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  [default: auto]"),
+                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  "
+                 "[default: auto]"),
 )  # fmt: skip
 sensor_options = together(
     file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
