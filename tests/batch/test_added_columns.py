@@ -15,6 +15,10 @@ MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" fo
 @pytest.mark.parametrize("column", [name for name in MADE if COLUMNS[name].extra_bytes])
 def test_every_column_that_a_stage_makes_can_be_asked_for(column):
     chain = load_profile("fast")
+    if column.startswith("skew"):  # of decomposers that no shipped chain has
+        with pytest.raises(wb.ConfigError, match="fits no skew per echo; use decompose"):
+            with_stages(chain, find_makers(chain, [column]))
+        return
     full = with_stages(chain, find_makers(chain, [column]))
     assert column in full.makes  # and Chain has checked that what its stages need comes before them
     assert find_makers(full, [column]) == ()

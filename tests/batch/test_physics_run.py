@@ -14,11 +14,9 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 from wavebatch.surveying.calibration import (
     Calibration,
-    format_calibration,
-    load_calibration,
-    parse_calibration,
     with_physics,
 )
 from wavebatch.tools.simulate import simulate_strip
@@ -279,3 +277,29 @@ def test_chains_get_what_is_known_and_nothing_twice():
     assert with_physics(full, sensor=True, calibrated=True, divergence=True) is full
     assert set(full.makes) - set(chain.makes) >= {"range", "cross_section", "reflectance", "incidence_angle"}
     assert "cross_section" not in with_physics(chain, sensor=True, calibrated=True, divergence=False).makes
+
+
+@pytest.mark.parametrize(("first", "last", "share"), [(-1.0, 0.25, 55), (0.1, 3.0, 18), (-1.0, 0.7, 0)])
+def test_a_trajectory_that_does_not_cover_the_strip_is_told_with_counts(tmp_path, wide_strip, first, last, share):
+    time = START_TIME + np.arange(first, last + 1e-9, 0.0005)
+    rays = trace_rays(Flight(), "flat", (time - START_TIME) * Flight().pulse_rate)
+    sensor = rays.ground - rays.direction / HALF_C / 0.9997 * rays.distance[:, None]
+    rows = np.column_stack([time, sensor])
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    (tmp_path / "t.csv").write_text("\n".join(["time,x,y,z", *lines]))
+    out = tmp_path / "out"
+    done = run(wide_strip, "-o", out, "--profile", "fast", "--trajectory", tmp_path / "t.csv")
+    assert done.exit_code == 0, done.output
+    lines = [line for line in done.stderr.splitlines() if "has no position" in line]
+    (ranges,) = columns(out, "range")
+    if not share:
+        assert not lines
+        return
+    (line,) = lines
+    counts = report(out)["counts"]["no_data"]["range"]
+    assert sum(counts.values()) - counts["NO_SENSOR"] == np.count_nonzero(ranges != -9999)
+    assert 100 * counts["NO_SENSOR"] / sum(counts.values()) == pytest.approx(share, abs=2)
+    assert f"{counts['NO_SENSOR']} of {sum(counts.values())} echoes" in line and "t.csv" in line
+    told = float(line.split("there (")[1].split(" %")[0])
+    assert told == pytest.approx(share, abs=2)
+    assert f"{START_TIME + last:.2f} to" in line or f"to {START_TIME + first:.2f} s" in line

@@ -82,6 +82,7 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
 
@@ -146,7 +147,13 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*serious, *facts.warnings, *prepared.scan.warnings, *map(": ".join, dropped.items())],
+        "warnings": [
+            *serious,
+            *facts.warnings,
+            *prepared.scan.warnings,
+            *prepared.doubts,
+            *map(": ".join, dropped.items()),
+        ],
         "timing": build_timing(report),
     }
 

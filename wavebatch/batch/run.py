@@ -289,5 +289,5 @@ class _Batch:
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             more["serious"] = list(strip.serious)
             if strip.prepared is not None:
-                more["sensor"] = strip.prepared.sensor.describe()
+                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": list(strip.prepared.doubts)}
             self._tell({**event, **more})

@@ -27,6 +27,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
+from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics, with_stages
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flight import hold_strip
@@ -118,6 +119,8 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    doubts: tuple[str, ...] = ()
+    """Warnings about inputs that do not quite fit the strip, such as its calibration."""
     forced: str = ""
     """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
 
@@ -243,6 +246,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
+            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
             _hold_height(reader, job.sensor, sensor)
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
@@ -251,7 +255,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, forced)
+    prepared = Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, doubts)
+    return replace(prepared, forced=forced)
 
 
 def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
@@ -275,6 +280,16 @@ def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str
     if request.flight:
         return hold_strip(reader, scan, request.system.survey), ""
     return "", check_saved(reader, scan, request.system.survey, force=request.force)
+
+
+def _fit_calibration(
+    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
+) -> tuple[StripJob, tuple[str, ...]]:
+    """The job with the calibration as it holds for this strip, and warnings; InputError where it does not fit."""
+    if job.calibration is None:
+        return job, ()
+    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain)
+    return replace(job, calibration=fitted.calibration), fitted.warnings
 
 
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:

@@ -273,7 +273,8 @@ class Progress:
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "written":
-            for line in event["serious"]:
+            # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
+            for line in (*event["serious"], *event["doubts"]):
                 self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))

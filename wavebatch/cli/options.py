@@ -255,7 +255,7 @@ def read_system(options: Mapping[str, Any]) -> SavedSurvey | None:
 
 def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
     """The calibration of --calibration, None without it."""
-    from wavebatch.surveying.calibration import load_calibration
+    from wavebatch.surveying.calibrating.calibration_file import load_calibration
 
     return load_calibration(options["calibration_file"]) if options["calibration_file"] else None
 

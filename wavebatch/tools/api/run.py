@@ -19,7 +19,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.calibration import find_makers, load_calibration, needs_sensor
+from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibration import find_makers, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
