@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, print_result, row, talk
-from wavebatch.cli.options import common_options, file_option, read_system, system_option
+from wavebatch.cli.options import common_options, file_option, read_system, system_option, where_option
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
               help="Compare incidence angles from echo widths with those from normals: both of A, or of A and B.")
 @click.option("--overlap", is_flag=True,
               help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
+@where_option("Compare two clouds at the points of both")
 @click.option("--tolerance", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
 @click.option("--min-completeness", **_SHARE, help="Least share of B's echoes that A has.")
@@ -114,8 +115,11 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
             raise click.UsageError(f"{side} is a chain; give the strip to run it on with --strip STRIP")
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
-    run, other = (compare_truth, truth) if truth else (compare_clouds, b)
-    return run(a, other, **_tolerance(options))
+    if truth:
+        if options["where"] is not None:
+            raise click.UsageError("--where is for two clouds; a truth has no such columns")
+        return compare_truth(a, truth, **_tolerance(options))
+    return compare_clouds(a, b, **_tolerance(options), where=options["where"])
 
 
 def _is_chain(side: Path) -> bool:
@@ -131,6 +135,8 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
 
     if truth is not None:
         raise click.UsageError("--truth is for a cloud; `wavebatch bench` compares chains with a truth")
+    if options["where"] is not None:
+        raise click.UsageError("--where is for two clouds; leave --strip out")
     saved = read_system(options)
     sides = [None if side is None else find_contender(str(side)) for side in (a, b)]
     for side in sides:
@@ -167,6 +173,8 @@ def _list_lines(result: Comparison) -> Iterator[str]:
     """The tables of every comparison of echoes."""
     a, b = result.correctness, result.completeness
     yield from (f"A {result.a}", f"B {result.b}", f"matched by {result.matched_by}, within {result.tolerance_ns:g} ns")
+    if result.left_out_a or result.left_out_b:
+        yield f"left out      A {result.left_out_a:>12}   B {result.left_out_b:>12}   by --where"
     yield from ("", f"echoes        A {result.echoes_a:>12}   B {result.echoes_b:>12}")
     yield f"identical     {result.matched:>14}   missed {result.missed}   extra {result.extra}"
     yield f"completeness  {b:>14.4f}   correctness {a:.4f}"

@@ -23,6 +23,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
 if TYPE_CHECKING:
+    from wavebatch.core.condition import Condition
     from wavebatch.surveying.calibration import Calibration
     from wavebatch.surveying.sensor import SensorRequest
     from wavebatch.surveying.system_file import SavedSurvey
@@ -61,6 +62,22 @@ def together(*options: Callable) -> Callable:
         return command
 
     return decorate
+
+
+def _read_where(context: click.Context, parameter: click.Parameter, text: str | None) -> Condition | None:
+    from wavebatch.core.condition import parse_condition
+
+    try:
+        return None if text is None else parse_condition(text)
+    except ConfigError as error:
+        raise click.UsageError(str(error), context) from error
+
+
+def where_option(text: str) -> Callable:
+    """`--where`; text: what is done with the points that meet the condition."""
+    more = "that meet this, e.g. \"number_of_returns == 2 and not (classification == 7 or echo_width >= 8)\"; points"
+    more += " without data in a column meet nothing on it."
+    return click.option("--where", callback=_read_where, metavar="CONDITION", help=f"{text} {more}")
 
 
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))

@@ -23,6 +23,7 @@ _flags = shared.together(
     click.option("--flags-with", multiple=True, metavar="NAMES",
                  help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
     click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
+    shared.where_option("Use only points"),
 )  # fmt: skip
 
 
@@ -152,13 +153,14 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
 
         draw_flags(counted, output, names=tuple(path.name for path in clouds), **how)
         text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
+        text += f", {counted.total.left_out} left out" * bool(options["where"])
     else:
         found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each")})
         from wavebatch.tools.plots.draw_cloud import draw_histogram
 
         draw_histogram(found, output, **how)
         total = found.total
-        text = f"{count(total.values, 'value')}, {total.no_data} without data, {total.left_out} left out by flags"
+        text = f"{count(total.values, 'value')}, {total.no_data} without data, {total.left_out} left out"
     if not options["quiet"]:
         talk(f"{output}: {text}")
 
@@ -166,7 +168,8 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
 def _select(column: str | None, options: dict[str, Any]) -> Any:
     from wavebatch.tools.plots.values import Selection, read_flags
 
-    return Selection(column, read_flags(options["flags_with"]), read_flags(options["flags_without"]))
+    flags = read_flags(options["flags_with"]), read_flags(options["flags_without"])
+    return Selection(column, *flags, where=options["where"])
 
 
 def _refuse_for_flags(options: dict[str, Any]) -> None:
@@ -210,4 +213,5 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     if not options["quiet"]:
         grid, total = found.grid, found.total
         points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
+        points += f", {total.left_out} left out" * bool(total.left_out)
         talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} m")

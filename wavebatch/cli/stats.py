@@ -17,7 +17,15 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import count, print_json, printable, row, talk
-from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option, recursive_option
+from wavebatch.cli.options import (
+    clouds_argument,
+    common_options,
+    file_option,
+    output_option,
+    recursive_option,
+    where_option,
+)
+from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
@@ -40,11 +48,12 @@ SHOWN = 20
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
 @file_option("--polygons", text="Also count in the polygons of this GeoJSON file; where polygons overlap, the first "
              "one counts.")
+@where_option("Count only points")
 @output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
 @common_options("overwrite", "json")
 def stats(
     clouds: tuple[Path, ...], size: float | None, polygons: Path | None, output: Path | None, overwrite: bool,
-    as_json: bool, debug: bool, recursive: bool,
+    as_json: bool, debug: bool, recursive: bool, where: Condition | None,
 ) -> None:
     """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
 
@@ -67,7 +76,7 @@ def stats(
         failed.append(error)
         talk(f"error: {error}")
 
-    each, total = count_returns(files, skip, divisions=divisions)
+    each, total = count_returns(files, skip, divisions=divisions, where=where)
     if output is not None and failed:
         talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
     elif output is not None:

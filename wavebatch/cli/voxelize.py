@@ -49,6 +49,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
               help="Signal up to this height above the lowest returns is the ground's [m].")
 @click.option("--reflectance-ratio", type=float, metavar="RATIO",
               help="Reflectance of the canopy over that of the ground.  [default: estimated from the strip]")
+@shared.where_option("Use only waveforms with a return (a point of the strip)")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
@@ -142,6 +143,7 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     if summary.profiles is not None:
         yield f"{summary.profiles}: {count(summary.profile_samples, 'sample')} of {summary.with_signal} pulses"
     notes = {
+        "left out by --where: none of their returns meets it": summary.left_out,
         "without a return at the signal; placed by the raw return location": summary.with_signal - summary.anchored,
         "saturated; the energy is too low": summary.clipped,
         "left out: the position is not a number or far outside": summary.outside,

@@ -15,6 +15,7 @@ import laspy
 import numpy as np
 from laspy.point.dims import DimensionInfo
 
+from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
@@ -84,6 +85,13 @@ class ColumnReader(CloudReader):
         standard = [one.name for one in dimensions if one.is_standard and one.name not in ("X", "Y", "Z")]
         return [*extra, "x", "y", "z", *standard]
 
+    def find_value(self, column: str) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the function from raw records (n,) to the values of a column (n,), NaN for no data.
+
+        It also works after the file is closed. Raises ConfigError if there is no such column.
+        """
+        return self._find(column)[1]
+
     def _find(
         self, column: str | None, *, stored: bool = False
     ) -> tuple[ColumnFacts, Callable[[np.ndarray], np.ndarray]]:
@@ -147,6 +155,27 @@ class ColumnReader(CloudReader):
         if self.has_flags:
             rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
         return rows
+
+
+def find_keep(path: Path, condition: Condition) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function from raw records (n,) of a cloud or strip to whether they meet a condition, bool (n,).
+
+    Raises ConfigError, with the place in the text, if the file has no such column.
+    """
+    values: dict[str, Callable[[np.ndarray], np.ndarray]] = {}
+    with ColumnReader(path, None) as reader:
+        for column in condition.columns:
+            try:
+                values[column] = reader.find_value(column)
+            except ConfigError as error:
+                raise condition.complain(column, str(error)) from error
+    return lambda raw: condition.choose({column: read(raw) for column, read in values.items()})
+
+
+def select_points(reader: CloudReader, condition: Condition | None) -> None:
+    """Let a reader give only the points that meet a condition (None: all); raises ConfigError as `find_keep` does."""
+    if condition is not None:
+        reader.keep = find_keep(reader.path, condition)
 
 
 def check_alike(readers: Iterable[tuple[Path, ColumnFacts]]) -> ColumnFacts:

@@ -6,7 +6,7 @@ come from any program: laspy only describes the fields, the bytes are read and c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import laspy
@@ -67,6 +67,10 @@ class CloudReader(Closing):
         """The file's name of each wavebatch column, by the account of the run; empty without one."""
         self._sources = self._find_ours(extra, (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
+        self.keep: Callable[[np.ndarray], np.ndarray] | None = None
+        """Which raw records (n,) are read, bool (n,); None: all. `column_reader.select_points` sets it."""
+        self.left_out = 0
+        """Points that `keep` has left out so far."""
         self._points = open_points(checked)
 
     def close(self) -> None:
@@ -80,7 +84,12 @@ class CloudReader(Closing):
         """
         size = max(min(size, _PIECE_BYTES // self._format.size), 1)
         for start in range(0, self.point_count, size):
-            yield self._convert(self._points.read(start, min(start + size, self.point_count)))
+            raw = self._points.read(start, min(start + size, self.point_count))
+            if self.keep is not None:
+                chosen = np.asarray(raw)[self.keep(raw)]
+                self.left_out += len(raw) - len(chosen)
+                raw = chosen
+            yield self._convert(raw)
 
     def _find_ours(
         self, extra: list[DimensionInfo], columns: Iterable[str], *, decibel: bool = False

@@ -8,12 +8,15 @@ that memory does not grow with the clouds.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import PASSED_THROUGH
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, sort_by_time
 from wavebatch.files.disk.closing import Closing
@@ -26,19 +29,24 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 """A pulse that counts even if neither side has an echo in it."""
 
 
-def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0) -> Comparison:
+def compare_clouds(
+    a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condition | None = None
+) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
-    without an echo are ignored. Memory is bounded; large clouds need room in TMPDIR.
-    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance.
+    without an echo are ignored. where: only points that meet it are compared, in both clouds. Memory is bounded; large
+    clouds need room in TMPDIR.
+    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance or an unknown column.
     """
     with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
         for reader, side in ((first, 0), (second, 1)):
+            select_points(reader, where)
             for rows in read_echoes(reader):
                 task.add(side, rows)
-        return task.finish(str(a), str(b))
+        found = task.finish(str(a), str(b))
+    return replace(found, left_out_a=first.left_out, left_out_b=second.left_out)
 
 
 def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:

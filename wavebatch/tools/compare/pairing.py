@@ -63,6 +63,9 @@ class Comparison:
     An echo counts for each of its flags. Intensity is used if b has no amplitudes."""
     extra_by: dict[str, Table] = field(default_factory=dict)
     """Extra echoes, as `missed_by`."""
+    left_out_a: int = 0
+    """Points of a that do not meet the condition of --where; they are not compared."""
+    left_out_b: int = 0
 
     @property
     def identical(self) -> float:

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
-from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike
+from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -33,6 +34,8 @@ class Selection:
     """Points must have one of these EchoFlag bits; 0: any point."""
     flags_without: int = 0
     """Points must have none of these EchoFlag bits."""
+    where: Condition | None = None
+    """Points must meet this."""
 
     def choose(self, rows: np.ndarray) -> np.ndarray:
         """The rows (VALUE_DTYPE) with the right flags."""
@@ -50,7 +53,7 @@ class Tally:
 
     points: int = 0
     left_out: int = 0
-    """Points that were left out because of their flags."""
+    """Points that were left out because of their flags or by --where."""
     no_data: int = 0
     """Points without a value in the column."""
     values: int = 0
@@ -82,6 +85,7 @@ class Clouds:
         for path in self.paths:
             with ColumnReader(path, selection.column) as reader:
                 found.append((path, reader.facts))
+                select_points(reader, selection.where)  # its columns exist
                 if (selection.flags_with or selection.flags_without) and not reader.has_flags:
                     raise ConfigError(f"{path}: has no column echo_flags to select points by")
         self.facts: ColumnFacts = check_alike(found)
@@ -90,10 +94,14 @@ class Clouds:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
         for number, path in enumerate(self.paths):
             with ColumnReader(path, self.selection.column) as reader:
+                select_points(reader, self.selection.where)
+                seen = 0
                 for rows in reader.read_pieces():
                     chosen = self.selection.choose(rows)
+                    more, seen = reader.left_out - seen, reader.left_out
                     good = chosen[~np.isnan(chosen["value"])]
-                    yield number, good, Tally(len(rows), len(rows) - len(chosen), len(chosen) - len(good), len(good))
+                    left = len(rows) + more - len(chosen)
+                    yield number, good, Tally(len(rows) + more, left, len(chosen) - len(good), len(good))
 
     def complain(self, tally: Tally) -> InputError:
         """The error that says why nothing can be drawn."""
@@ -102,7 +110,8 @@ class Clouds:
             return InputError(f"{where}: holds no points: nothing to draw")
         reasons = []
         if tally.left_out:
-            reasons.append(f"{tally.left_out} of {tally.points} points are left out by their flags")
+            by = "by --where" if self.selection.where is not None else "by their flags"
+            reasons.append(f"{tally.left_out} of {tally.points} points are left out {by}")
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")

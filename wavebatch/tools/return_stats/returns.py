@@ -13,9 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.condition import Condition
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import HALF_C
+from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
@@ -75,6 +77,8 @@ class ReturnStats:
     warnings: tuple[str, ...]
     areas: tuple[AreaStats, ...] = ()
     """Areas with a pulse, if divisions are given; together they hold all points and pulses."""
+    left_out: int = 0
+    """Points that do not meet the condition of --where; `points` are the others."""
 
     @property
     def returns_per_pulse(self) -> float:
@@ -83,19 +87,23 @@ class ReturnStats:
 
 
 def count_returns(
-    clouds: Sequence[Path], skip: Callable[[InputError], None] | None = None, *, divisions: Sequence[Division] = ()
+    clouds: Sequence[Path],
+    skip: Callable[[InputError], None] | None = None,
+    *,
+    divisions: Sequence[Division] = (),
+    where: Condition | None = None,
 ) -> tuple[list[ReturnStats], ReturnStats]:
     """Statistics of each cloud and of all together, for points in any order.
 
     A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
-    divisions: count also by areas; a pulse belongs, with all its returns, to the area of its first return. skip: called
+    where: count only points that meet it. divisions: count also by areas; a pulse belongs, with all its returns, to the area of its first return. skip: called
     with the InputError of a cloud that cannot be read, which is then left out; without it, the error is raised.
     Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
     """
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0
     for path in clouds:
         try:
-            tally = _tally_cloud(Path(path), divisions)
+            tally = _tally_cloud(Path(path), divisions, where)
         except InputError as error:
             if skip is None:
                 raise
@@ -117,9 +125,10 @@ def pulses_told_apart(reader: ReturnReader | CloudReader) -> bool:
     return rows is None or tell_pulses_apart(rows["gps_time"])
 
 
-def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
+def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | None) -> _Tally:
     with ReturnReader(path) as reader:
-        by_time = pulses_told_apart(reader)
+        by_time = pulses_told_apart(reader)  # by all points
+        select_points(reader, where)
         areas = [AreaTally(division) for division in divisions]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
         if reader.has_flags:
@@ -133,6 +142,7 @@ def _tally_cloud(path: Path, divisions: Sequence[Division]) -> _Tally:
                 buckets.add(shaped, lambda part: (np.arange(len(part)), spread_keys(part["key"], number)))
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
+        tally.left_out = reader.left_out
     return tally
 
 
@@ -168,6 +178,7 @@ class _Tally:
     """Sums of one cloud; tallies of several clouds can be merged."""
 
     points: int = 0
+    left_out: int = 0
     incomplete: int = 0
     methods: set[str] = field(default_factory=set)
     by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
@@ -212,7 +223,7 @@ class _Tally:
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
         self.methods |= other.methods
-        for name in ("points", "incomplete", "by_number", "by_count", "bins", "pairs", "sums"):
+        for name in ("points", "left_out", "incomplete", "by_number", "by_count", "bins", "pairs", "sums"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.least = np.minimum(self.least, other.least)
         for area, more in zip(self.areas, other.areas, strict=True):
@@ -241,6 +252,7 @@ class _Tally:
             flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
             warnings=tuple(self._warn(zone, hidden, pulses)),
             areas=tuple(stats for area in self.areas for stats in area.finish()),
+            left_out=self.left_out,
         )
 
     def _list_separations(self) -> dict[str, Separation]:
@@ -259,6 +271,11 @@ class _Tally:
 
     def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
         lines = []
+        if self.left_out:
+            lines.append(
+                f"--where: {self.left_out} of {self.points + self.left_out} points are left out; pulses and distances "
+                "are those of the points that are left"
+            )
         if zone >= 0.05 and hidden > 0.001:
             lines.append(
                 f"dead zone: almost no returns of a pulse lie closer together than {zone:.2f} m ({zone / HALF_C:.1f} "

@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.cloud.column_reader import find_keep
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
-from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
 from wavebatch.surveying.auto_chain import widest_chain
@@ -65,6 +67,8 @@ class VoxelOptions:
     """Signal up to this height above the ground is the ground's [m]."""
     reflectance_ratio: float | None = None
     """Reflectance of canopy over that of ground; None: estimated from the strip."""
+    where: Condition | None = None
+    """Use only waveforms of which a return meets this, with all of their signal."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= _LARGEST:
@@ -119,6 +123,8 @@ class VoxelSummary:
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
+    left_out: int = 0
+    """Waveforms of which no return meets the condition of --where; `waveforms` are the others."""
     warnings: tuple[str, ...] = ()
     """Why cross sections may be less sure than the calibration says."""
 
@@ -150,6 +156,7 @@ def voxelize_strip(
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
+    keep = None if options.where is None else find_keep(strip, options.where)
     refuse_existing(target, overwrite)
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
@@ -167,9 +174,12 @@ def voxelize_strip(
             _open_grid(reader, middle, options, calibration is not None, held) as grid,
             open_profiles(profiles, strip, calibration is not None, overwrite) as writer,
         ):
-            counts: Counter[str] = Counter()
-            for block in _read_blocks(reader, scan, block_size):
-                _add_block(grid, counts, source.fill(block), pulse, options, ceiling, rule, writer)
+            counts: Counter[str] = Counter(waveforms=0, with_signal=0, anchored=0, clipped=0)
+            for block, chosen in _read_blocks(reader, scan, block_size, keep):
+                used = block if chosen is None else block.rows(chosen)
+                counts["left_out"] += len(block) - len(used)
+                if len(used):
+                    _add_block(grid, counts, source.fill(used), pulse, options, ceiling, rule, writer)
                 if progress is not None:
                     progress(len(block), scan.packets)
             meta = _describe(strip, options, pulse, calibration) | {"reflectance_ratio": asdict(ratio)}
@@ -293,12 +303,24 @@ def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, s
     )
 
 
-def _read_blocks(reader: StripReader, scan: StripScan, size: int | None) -> Iterator[WaveformBlock]:
-    """Every packet of the strip once."""
+def _read_blocks(
+    reader: StripReader, scan: StripScan, size: int | None, keep: Callable[[np.ndarray], np.ndarray] | None
+) -> Iterator[tuple[WaveformBlock, np.ndarray | None]]:
+    """Every packet of the strip once, and which of them have a return that is kept, bool (n,); None: all."""
     for unit in reader.read_units(scan):
         longest = int(unit.packets.n_samples.max(initial=1))
-        for block, _ in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
-            yield block
+        chosen = None if keep is None else _choose_packets(unit, keep)
+        for block, index in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
+            yield block, None if chosen is None else chosen[index]
+
+
+def _choose_packets(unit: Unit, keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Whether a point of each packet of the unit is kept, bool (packets,)."""
+    chosen = np.zeros(len(unit.packets.owned) + 1, bool)
+    chosen[unit.packet_of_point[keep(unit.points)]] = True
+    if len(unit.context):
+        chosen[unit.packet_of_context[keep(unit.context)]] = True
+    return chosen[:-1]  # the last one is that of points without a packet, -1
 
 
 def _add_block(
@@ -342,6 +364,7 @@ def _describe(
         "headroom_m": options.headroom,
         "all_crossed": options.all_crossed,
         "ground_height_m": options.ground_height,
+        "where": None if options.where is None else options.where.text,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),

@@ -1,0 +1,136 @@
+"""--where of stats, plot, compare and voxelize: the same points as a selection by hand, and all of them counted."""
+
+import json
+
+import laspy
+import numpy as np
+import pytest
+from batch_tools import run_one
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.core.condition import parse_condition
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.cloud.column_reader import ColumnReader, select_points
+from wavebatch.tools.compare.clouds import compare_clouds
+from wavebatch.tools.plots.histogram import count_values
+from wavebatch.tools.plots.values import Selection
+from wavebatch.tools.return_stats.returns import count_returns
+from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
+
+TEXT = "number_of_returns >= 2 and echo_width < 5"
+
+
+@pytest.fixture(scope="module")
+def cloud(riegl, tmp_path_factory):
+    """A cloud with columns, of a real strip."""
+    folder = tmp_path_factory.mktemp("cloud")
+    assert run_one(riegl, folder, profile="balanced").error is None
+    return folder / f"{riegl.stem}.laz"
+
+
+@pytest.fixture(scope="module")
+def split(cloud, tmp_path_factory):
+    """The points that meet TEXT as a file of their own, and how many points there are."""
+    las = laspy.read(cloud)
+    width = np.asarray(las["echo_width"])
+    las.points = las.points[(np.asarray(las.number_of_returns) >= 2) & (width < 5) & (width != -9999)]
+    path = tmp_path_factory.mktemp("split") / "part.las"
+    las.write(path)
+    return path, len(las.points), laspy.read(cloud).header.point_count
+
+
+def test_readers_give_the_points_that_meet_it(cloud, split):
+    path, number, total = split
+    assert 50 < number < total - 50
+    with ColumnReader(cloud, "z") as some, ColumnReader(path, "z") as other:
+        select_points(some, parse_condition(TEXT))
+        rows = np.concatenate(list(some.read_pieces(999)))
+        np.testing.assert_array_equal(rows, np.concatenate(list(other.read_pieces())))
+        assert some.left_out == total - number
+
+
+def test_stats_counts_them_and_what_is_left_out(cloud, split):
+    path, number, total = split
+    (found,), _ = count_returns([cloud], where=parse_condition(TEXT))
+    (wanted,), _ = count_returns([path])
+    assert (found.points, found.left_out) == (number, total - number)
+    assert (found.by_number, found.separations, found.flags) == (wanted.by_number, wanted.separations, wanted.flags)
+    assert any(line.startswith(f"--where: {total - number} of {total} points") for line in found.warnings)
+
+
+def test_histograms_count_them(cloud, split):
+    path, number, total = split
+    found = count_values([cloud], Selection("amplitude", where=parse_condition(TEXT)), bins=20)
+    wanted = count_values([path], Selection("amplitude"), bins=20)
+    assert (found.total.points, found.total.left_out) == (total, total - number)
+    assert found.total.values == wanted.total.values
+    np.testing.assert_array_equal(found.counts, wanted.counts)
+
+
+def test_clouds_are_compared_at_them(cloud, split):
+    path, number, total = split
+    found = compare_clouds(cloud, path, where=parse_condition(TEXT))
+    assert (found.matched, found.missed, found.extra) == (number, 0, 0)
+    assert (found.left_out_a, found.left_out_b) == (total - number, 0)
+
+
+def test_voxels_are_of_waveforms_with_such_a_return(riegl, tmp_path):
+    all_, some, rest = (
+        voxelize_strip(riegl, tmp_path / f"{number}.npz", VoxelOptions(2.0, where=where))
+        for number, where in enumerate(
+            [None, parse_condition("number_of_returns >= 2"), parse_condition("not number_of_returns >= 2")]
+        )
+    )
+    assert 0 < some.waveforms < all_.waveforms == some.waveforms + some.left_out
+    # Returns of a pulse have one number of returns: both parts make the whole.
+    assert some.waveforms + rest.waveforms == all_.waveforms
+    assert some.energy + rest.energy == pytest.approx(all_.energy, rel=1e-6)
+
+
+def test_voxels_may_lack_any_waveform(riegl, tmp_path):
+    found = voxelize_strip(riegl, tmp_path / "x.npz", VoxelOptions(2.0, where=parse_condition("z > 1e6")))
+    assert (found.waveforms, found.voxels) == (0, 0) and found.left_out > 0
+
+
+def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
+    for work in (lambda where: count_returns([cloud], where=where), lambda where: compare_clouds(cloud, cloud, where=where)):
+        with pytest.raises(ConfigError, match=r"^--where: character 12: .*no column 'ecko_width'; did you mean 'echo_width'"):
+            work(parse_condition("z > 0 and (ecko_width < 5)"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ("stats CLOUD --where", "--where: character 3: write == for '='"),
+        ("plot histogram CLOUD --column z -o OUT.png --where", "--where: character 3"),
+        ("plot map CLOUD --column z -o OUT.png --where", "--where: character 3"),
+        ("compare CLOUD CLOUD --where", "--where: character 3"),
+        ("voxelize CLOUD --size 1 -o OUT.npz --where", "--where: character 3"),
+    ],
+)
+def test_every_command_says_where_the_text_is_wrong(cloud, tmp_path, arguments, text):
+    words = [str(cloud) if word == "CLOUD" else word.replace("OUT", str(tmp_path / "x")) for word in arguments.split()]
+    result = CliRunner().invoke(main, [*words, "z = 5"])
+    assert result.exit_code == 2 and result.output.startswith("error: ") and text in result.output
+    assert len(result.output.splitlines()) == 1
+
+
+def test_modes_of_compare_without_two_clouds_refuse_it(cloud, riegl):
+    for mode in (["--angles"], ["--strip", str(riegl)]):
+        first = "fast" if "--strip" in mode else str(cloud)
+        result = CliRunner().invoke(main, ["compare", first, *mode, "--where", "z > 0"])
+        assert result.exit_code == 2 and "--where" in result.output
+
+
+def test_plots_and_stats_take_it_on_the_command_line(cloud, split, tmp_path):
+    _, number, total = split
+    result = CliRunner().invoke(main, ["stats", str(cloud), "--where", TEXT, "--json"])
+    assert json.loads(result.stdout)["files"][0]["points"] == number
+    for kind in ("histogram", "map"):
+        words = ["plot", kind, str(cloud), "--column", "z", "--where", TEXT, "-o", str(tmp_path / f"{kind}.png")]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 0 and f"{total - number} left out" in result.output
+    words = ["plot", "map", str(cloud), "--column", "z", "--where", "z > 1e6", "-o", str(tmp_path / "none.png")]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 1 and f"{total} of {total} points are left out by --where" in result.output
