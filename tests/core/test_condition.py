@@ -108,4 +108,4 @@ def test_any_text_is_a_condition_or_one_line(text):
     except ConfigError as error:
         assert "\n" not in str(error)
     else:
-        assert condition.choose({name: VALUES["a"] for name in condition.columns}).shape == (5,)
+        assert condition.choose(dict.fromkeys(condition.columns, VALUES["a"])).shape == (5,)

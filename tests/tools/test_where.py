@@ -94,8 +94,13 @@ def test_voxels_may_lack_any_waveform(riegl, tmp_path):
 
 
 def test_an_unknown_column_is_named_with_its_place_and_the_nearest(cloud):
-    for work in (lambda where: count_returns([cloud], where=where), lambda where: compare_clouds(cloud, cloud, where=where)):
-        with pytest.raises(ConfigError, match=r"^--where: character 12: .*no column 'ecko_width'; did you mean 'echo_width'"):
+    for work in (
+        lambda where: count_returns([cloud], where=where),
+        lambda where: compare_clouds(cloud, cloud, where=where),
+    ):
+        with pytest.raises(
+            ConfigError, match=r"^--where: character 12: .*no column 'ecko_width'; did you mean 'echo_width'"
+        ):
             work(parse_condition("z > 0 and (ecko_width < 5)"))
 
 

@@ -31,6 +31,15 @@ COUNTS: dict[str, str] = {
 }
 """Every count of a report and its meaning."""
 
+LEFT_OUT: dict[str, str] = {
+    "drop_flags": "have a flag of --drop-flags",
+    "classes": "are of no class of --classes",
+    "bbox": "lie outside --bbox",
+    "polygon": "lie outside --polygon",
+    "where": "do not meet --where",
+}
+"""Why rows are not written, in the order in which they are asked: a row counts for the first reason."""
+
 OVERFLOW = 16
 """Waveforms with this many echoes or more are counted together."""
 
@@ -80,7 +89,9 @@ class RunReport:
     counts: Mapping[str, int] = field(default_factory=dict)
     """By name in COUNTS; a missing one is 0."""
     passed_through: Mapping[str, int] = field(default_factory=dict)
-    """Points written without attributes, by the flag with the reason."""
+    """Points without attributes, by the flag with the reason; a selection may leave some of them out."""
+    left_out: Mapping[str, int] = field(default_factory=dict)
+    """Points that a selection leaves out, by reason in LEFT_OUT."""
     flags: Mapping[str, int] = field(default_factory=dict)
     """Points written per flag."""
     no_data: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
@@ -147,7 +158,9 @@ class RunReport:
             "points_broken": passed.get("BROKEN_PACKET", 0),
             "no_echo_returns": passed.get("NO_ECHO", 0) - get("unmatched_returns"),
             "echoes": get("matched_returns") + get("added_echoes"),
-            "points_out": get("echoes" if points == "echoes" else "matched_returns") + sum(passed.values()),
+            "points_out": get("echoes" if points == "echoes" else "matched_returns")
+            + sum(passed.values())
+            - sum(self.left_out.values()),
             "waveforms": int(self.echoes_per_waveform.sum()),
         }
         by_reason = [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
@@ -165,6 +178,7 @@ class RunReport:
             "counts": {
                 **{name: self.count(name) for name in COUNTS},
                 "passed_through": {name: self.passed_through.get(name, 0) for name in _PASSED},
+                "left_out": {name: self.left_out.get(name, 0) for name in LEFT_OUT},
                 "flags": {flag.name: self.flags.get(flag.name, 0) for flag in EchoFlag},
                 "no_data": {
                     column: {name: number for name, number in reasons.items() if number}
@@ -186,6 +200,7 @@ class RunReport:
         return cls(
             counts={name: int(counts[name]) for name in COUNTS},
             passed_through={name: int(n) for name, n in counts["passed_through"].items()},
+            left_out={name: int(n) for name, n in counts["left_out"].items()},
             flags={name: int(n) for name, n in counts["flags"].items()},
             no_data={
                 column: {name: int(n) for name, n in reasons.items()} for column, reasons in counts["no_data"].items()

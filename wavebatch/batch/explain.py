@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from wavebatch.batch.counts import AMPLITUDE_BINS, RunReport
+from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
+from wavebatch.batch.selection import describe_extent
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.files.cloud.column_names import describe_roundings
@@ -89,12 +90,14 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        One line each: a forced survey of another sensor, a chain that does not fit the strip's pulse.
+        One line each: a forced survey of another sensor, a selection that leaves nothing, a chain that does not fit
+        the strip's pulse.
     """
     choice, echoes = prepared.choice, report.count("echoes")
     lines = []
     if prepared.forced:
         lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
+    lines += _miss_all(prepared, report)
     if not choice.doubted or not echoes:
         return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
@@ -104,6 +107,15 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
     )
     return tuple(lines)
+
+
+def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A selection that leaves no point."""
+    number = sum(report.left_out.values())
+    if number and not report.count("points_out"):
+        reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
+        place = describe_extent(prepared.layout, prepared.job.selection)
+        yield f"no point is written: of {number}, {reasons}{place and '; ' + place}"
 
 
 def _name_height(prepared: Prepared) -> Iterator[str]:

@@ -14,7 +14,7 @@ import functools
 import itertools
 import pickle
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -190,17 +190,16 @@ class SecondPass:
 
     def _complete(self, rows: np.ndarray, values: dict[str, np.ndarray]) -> None:
         """Fill the columns of late steps into the rows; values: the columns of the second pass."""
-        layout, fields = self._carrying, {}
+        layout, fields = self._carrying, defaultdict(list)
         for field, column in zip(layout.extra_fields[len(layout.carried) :], layout.written, strict=True):
-            fields[column.column] = (field, column)
+            fields[column.column].append((field, column))  # twice where a selection needs it too
         for step in self._late:
-            needed = {name: fields[name][0] for name in step.stage.makes if not COLUMNS[name].extra_bytes}
+            needed = {name: fields[name][0][0] for name in step.stage.makes if not COLUMNS[name].extra_bytes}
             carried = {name: _decode(name, rows[field]) for name, field in needed.items()}
             for name, found in step.stage.complete({**values, **carried}).items():
                 if name in self._completed:
                     self._completed[name] += int(np.count_nonzero(np.isfinite(found)))
-                if name in fields:
-                    field, column = fields[name]
+                for field, column in fields.get(name, ()):
                     rows[field] = column.encode(found)
 
     def _place(self, rows: np.ndarray) -> np.ndarray:

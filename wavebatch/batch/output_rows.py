@@ -129,7 +129,9 @@ def gather_echoes(unit: Unit, results: Iterable[tuple[WaveformBlock, np.ndarray,
     return UnitEchoes(table, near, times_read > 0, direction)
 
 
-def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tuple[np.ndarray, RunReport]:
+def assemble_echoes(
+    unit: Unit, echoes: UnitEchoes, layout: OutputLayout, dropped: int = 0
+) -> tuple[np.ndarray, RunReport]:
     """Make a row per echo, and a row per point that no echo matches.
 
     Parameters
@@ -138,6 +140,8 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
     echoes : UnitEchoes
         Of the packets that the unit owns, and of no others.
     layout : OutputLayout
+    dropped : int, optional
+        EchoFlag bits of rows that will not be written: return numbers are counted without them.
 
     Returns
     -------
@@ -169,8 +173,9 @@ def assemble_echoes(unit: Unit, echoes: UnitEchoes, layout: OutputLayout) -> tup
     packet = np.where(rows.echo >= 0, np.append(table.waveform, -1)[rows.echo], members.packet[rows.source])
     direction = np.append(echoes.direction, np.zeros((1, 3)), axis=0)[packet]
     places = np.where(np.isnan(xyz), locate(records, layout.source.header), xyz)
-    number, total = _number_rows(find_pulses(unit.points["gps_time"])[rows.owner], places, direction, records)
     flags = np.append(table.flags, np.uint16(0))[rows.echo] | rows.reason
+    pulse = find_pulses(unit.points["gps_time"])[rows.owner]
+    number, total = _number_rows(pulse, places, direction, records, (flags & np.uint16(dropped)) == 0)
     flags |= np.where(number > layout.max_return, np.uint16(EchoFlag.RETURN_LIMIT), np.uint16(0))
 
     output = layout.rows(
@@ -263,12 +268,14 @@ def _place_rows(
 
 
 def _number_rows(
-    pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray
+    pulse: np.ndarray, xyz: np.ndarray, direction: np.ndarray, records: np.ndarray, counted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return number and number of returns; pulses without any waveform keep those of the input."""
-    number, total, known = number_returns(pulse, xyz, direction)
-    given = split_numbers(records)
-    return np.where(known, number, given[0]), np.where(known, total, given[1])
+    """Return number and number of returns; pulses without any waveform, and rows not counted, keep the input's."""
+    number, total = (given.astype(np.int64) for given in split_numbers(records))
+    found, count, known = number_returns(pulse[counted], xyz[counted], direction[counted])
+    number[counted] = np.where(known, found, number[counted])
+    total[counted] = np.where(known, count, total[counted])
+    return number, total
 
 
 def _locations(records: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.report_file import cloud_path, report_path
+from wavebatch.batch.selection import RowSelector
 from wavebatch.batch.strip_task import BatchOptions, StripTask
 from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
@@ -71,8 +72,10 @@ def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
 
 def find_inputs(jobs: Sequence[StripJob]) -> list[Path]:
     """Return the files that the jobs read."""
-    files = {path for job in jobs for path in (job.path, job.sensor.trajectory) if path is not None}
-    return sorted(map(Path, files))
+    files = {
+        path for job in jobs for path in (job.path, job.sensor.trajectory, job.selection.polygon) if path is not None
+    }
+    return sorted({Path(path) for path in files})
 
 
 def find_outputs(job: StripJob, folder: Path) -> list[Path]:
@@ -119,9 +122,7 @@ def load_flight(jobs: Sequence[StripJob], options: BatchOptions) -> SavedSurvey 
 
 def with_flight(jobs: Sequence[StripJob], saved: SavedSurvey | None) -> list[StripJob]:
     """Return the jobs with the survey of their flight."""
-    return [
-        replace(job, request=replace(job.request, system=saved)) if job.request.flight else job for job in jobs
-    ]
+    return [replace(job, request=replace(job.request, system=saved)) if job.request.flight else job for job in jobs]
 
 
 def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
@@ -147,6 +148,7 @@ def plan_strip(job: StripJob, options: BatchOptions) -> dict[str, Any]:
     done = task.start() is not None
     facts = task.facts
     layout, is_laz = plan_layout(job, facts), job.options.format == "laz"
+    RowSelector(job.selection, job.chain, layout).check()
     return {
         "action": "skip" if done else "write",
         "strip": str(job.path),

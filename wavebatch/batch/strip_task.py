@@ -173,13 +173,17 @@ class StripTask:
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
-            self._second = SecondPass(prepared.second_step, prepared.layout, cloud, late=prepared.late_steps)
+            layout = prepared.selector.carrying
+            self._second = SecondPass(prepared.second_step, layout, cloud, late=prepared.late_steps)
 
     def _fill(self) -> None:
         """Write the rows that waited for the second pass."""
         start = time.perf_counter()
+        selector = self.prepared.selector
         for rows in self._second.rows():
-            self._writer.write(rows)
+            chosen, left = selector.select(rows)
+            self._report += left
+            self._writer.write(chosen)
         self._second.close()
         no_data = self._second.count_reasons(self._report.count("echoes"))
         self._report += RunReport(no_data=no_data, timing={"write": time.perf_counter() - start})

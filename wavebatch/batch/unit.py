@@ -18,6 +18,7 @@ import numpy as np
 
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.selection import RowSelector, Selection
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
@@ -85,6 +86,8 @@ class StripJob:
 
     pulse_energy: str | None = None
     """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
+    selection: Selection = Selection()
+    """What is written."""
 
     def extend(self, chain: Chain) -> Chain:
         """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
@@ -94,7 +97,7 @@ class StripJob:
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
         chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
-        return with_columns(chain, self.options.columns)
+        return with_columns(chain, (*self.options.columns, *self.selection.list_wanted()))
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration and air, if it has them."""
@@ -148,19 +151,30 @@ class Prepared:
     @property
     def second_step(self) -> Step | None:
         """The step whose columns need a second pass over the strip's points; None where none of them is written."""
-        step, wanted = self.job.chain.second_step, set(self.job.options.columns)
+        step, wanted = self.job.chain.second_step, self._wanted
         return step if step is not None and (self.late_steps or set(step.stage.makes) & wanted) else None
 
     @property
     def late_steps(self) -> tuple[Step, ...]:
         """Steps that complete written columns from those of the second pass."""
-        wanted = set(self.job.options.columns)
+        wanted = self._wanted
         return tuple(step for step in self.job.chain.late_steps if set(step.stage.makes) & wanted)
 
     @property
     def row_layout(self) -> OutputLayout:
-        """The layout of a unit's rows: that of the cloud, then the columns that a second pass needs."""
-        return self.layout if self.second_step is None else self.layout.extended(list_carried(self.late_steps))
+        """The layout of a unit's rows: that of the cloud, then the columns of the selection and of a second pass."""
+        layout = self.selector.carrying
+        return layout if self.second_step is None else layout.extended(list_carried(self.late_steps))
+
+    @property
+    def selector(self) -> RowSelector:
+        """Chooses the rows that are written."""
+        return RowSelector(self.job.selection, self.job.chain, self.layout)
+
+    @property
+    def _wanted(self) -> set[str]:
+        """Columns that are written, or that decide what is written."""
+        return {*self.job.options.columns, *self.selector.needed}
 
 
 def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
@@ -263,7 +277,7 @@ def prepare_strip(job: StripJob) -> Prepared:
     start = time.perf_counter()
     with job.open() as reader:
         facts = reader.facts
-        plan_layout(job, facts)
+        RowSelector(job.selection, job.chain, plan_layout(job, facts)).check()
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
@@ -286,6 +300,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
             energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
+            RowSelector(job.selection, job.chain, layout).check()
             units = reader.unit_count()
         except BaseException:
             scan.close()
@@ -382,7 +397,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     Returns
     -------
     rows : structured array (m,)
-        In the strip's `row_layout`.
+        In the strip's `row_layout`; without a second pass those that are written, in the cloud's `layout`.
     report : RunReport
     """
     prepared: Prepared = unpack(blob)
@@ -395,8 +410,14 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
         blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
-    assemble = assemble_echoes if echoes_mode else assemble_returns
-    rows, report = assemble(unit, echoes, prepared.row_layout)
+    layout = prepared.row_layout
+    if echoes_mode:
+        rows, report = assemble_echoes(unit, echoes, layout, prepared.job.selection.drop_flags)
+    else:
+        rows, report = assemble_returns(unit, echoes, layout)
+    if prepared.second_step is None:
+        rows, left = prepared.selector.select(rows)
+        report += left
     timing["assemble"] = time.perf_counter() - start
     return rows, replace(report, timing=timing)
 

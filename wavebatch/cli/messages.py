@@ -346,6 +346,10 @@ def _summary(event: dict[str, Any], long: bool) -> str:
     passed = sum(counts["passed_through"].values())
     parts = [count(counts[key], name) for key, name in _COUNTED.items()]
     line = f"{event['strip']}: {', '.join(parts)}, {passed} passed through -> {count(counts['points_out'], 'point')}"
+    left = {name: number for name, number in counts["left_out"].items() if number}
+    if left:
+        by = ", ".join(f"{number} by --{name.replace('_', '-')}" for name, number in left.items())
+        line = f"{line}; left out: {by}"
     if not long:
         return line
     reasons, flags = (

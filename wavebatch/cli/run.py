@@ -31,13 +31,16 @@ from wavebatch.cli.options import (
     calibration_option,
     chain_options,
     common_options,
+    file_option,
     output_option,
+    parse_floats,
     read_air,
     read_sensor,
     sensor_options,
     strip_options,
     strips_argument,
     system_option,
+    where_option,
 )
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
@@ -59,6 +62,19 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
     return size
 
 
+def _read_classes(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[int, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is no list of numbers such as 2,6") from None
+
+
+def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else parse_floats(text, "WEST,SOUTH,EAST,NORTH")
+
+
 @click.command()
 @strips_argument
 @output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
@@ -76,6 +92,15 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 @strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
+@where_option("Write only points")
+@click.option("--drop-flags", metavar="NAMES",
+              help="Leave out points with one of these flags, e.g. RINGING_SUSPECT,WEAK; return numbers are counted "
+              "without them.")
+@click.option("--classes", callback=_read_classes, metavar="LIST", help="Write only points of these classes, e.g. 2,6.")
+@click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
+              help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
+@file_option("--polygon", metavar="FILE.geojson",
+             text="Write only points inside these polygons, in the coordinates of the strips.")
 @click.option("--columns", metavar="LIST",
               help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
               "shipped ones get the stages that make them.")
@@ -166,7 +191,8 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
 
 _PASSED_ON = (
     "pulse_energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
-    "direction", "headerless", "scheduler", "memory", "block_size", "overwrite", "resume",
+    "direction", "headerless", "scheduler", "memory", "block_size", "overwrite", "resume", "where", "drop_flags",
+    "classes", "bbox", "polygon",
 )  # fmt: skip
 """Options that `plan_run` takes under the same names."""
 

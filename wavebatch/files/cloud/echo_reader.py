@@ -19,6 +19,7 @@ from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.read_points import open_points
 
@@ -129,26 +130,33 @@ class CloudReader(Closing):
 
     def _read_column(self, raw: np.ndarray, dimension: DimensionInfo | None) -> np.ndarray | float:
         """Physical values with NaN for no data; NaN if the cloud has no such dimension."""
-        if dimension is None:
-            return np.nan
-        values = widen(raw[dimension.name])
-        with np.errstate(over="ignore", invalid="ignore"):
-            if dimension.scales is not None:
-                values = values * dimension.scales[0] + dimension.offsets[0]
-            if dimension.no_data is not None:
-                values[raw[dimension.name] == dimension.no_data[0]] = np.nan
-            return np.where(np.abs(values) <= _LARGEST, values, np.nan)
+        return np.nan if dimension is None else read_dimension(raw, dimension)
 
 
 def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
     """Return laspy's point format with the extra dimensions of the checked records, under the names of the fields."""
     point_format = laspy.PointFormat(checked.header.point_format)
     for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
-        dtype, scaling = record.dtype, record.scaling
-        scales, offsets = (None, None) if scaling is None else np.array(scaling)[:, None]
-        dimension = DimensionInfo.from_dtype(field, dtype, False, record.description, offsets, scales)
-        point_format.dimensions.append(dimension._replace(no_data=record.no_data))
+        point_format.dimensions.append(describe_dimension(field, record))
     return point_format
+
+
+def describe_dimension(field: str, record: ExtraRecord) -> DimensionInfo:
+    """Return laspy's description of an extra dimension under the name of its field."""
+    scales, offsets = (None, None) if record.scaling is None else np.array(record.scaling)[:, None]
+    dimension = DimensionInfo.from_dtype(field, record.dtype, False, record.description, offsets, scales)
+    return dimension._replace(no_data=record.no_data)
+
+
+def read_dimension(raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
+    """Return the physical values (n,) of a dimension of raw records, with NaN for no data."""
+    values = widen(raw[dimension.name])
+    with np.errstate(over="ignore", invalid="ignore"):
+        if dimension.scales is not None:
+            values = values * dimension.scales[0] + dimension.offsets[0]
+        if dimension.no_data is not None:
+            values[raw[dimension.name] == dimension.no_data[0]] = np.nan
+        return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:

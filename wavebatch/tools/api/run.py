@@ -6,15 +6,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
+from wavebatch.batch.selection import build_selection
 from wavebatch.batch.strip_task import BatchOptions
 from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, name_columns
+from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
@@ -43,6 +45,11 @@ def run(
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
     pulse_energy: Path | str | None = None,
+    where: Condition | str | None = None,
+    drop_flags: str | None = None,
+    classes: Sequence[int] | None = None,
+    bbox: Sequence[float] | None = None,
+    polygon: Path | str | None = None,
     columns: str | None = None,
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
@@ -96,6 +103,16 @@ def run(
     pulse_energy : path or str, optional
         Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
         text file with columns time and energy.
+    where : str, optional
+        Write only points that meet this, e.g. "classification == 2 and echo_width < 8"; see docs/selection.md.
+    drop_flags : str, optional
+        Leave out points with one of these flags, e.g. "RINGING_SUSPECT,WEAK"; return numbers are counted without them.
+    classes : sequence of int, optional
+        Write only points of these classes.
+    bbox : (float, float, float, float), optional
+        Write only points from west, south to east, north, in the coordinates of the strips.
+    polygon : path or str, optional
+        Write only points inside the polygons of this GeoJSON file, in the coordinates of the strips.
     columns : str, optional
         "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
         them.
@@ -148,7 +165,8 @@ def run(
     """
     plan = plan_run(
         strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
-        calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, columns=columns, points=points,
+        calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, where=where, drop_flags=drop_flags,
+        classes=classes, bbox=bbox, polygon=polygon, columns=columns, points=points,
         format=format, point_format=point_format, las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
         memory=memory, block_size=block_size, overwrite=overwrite, resume=resume, recursive=recursive,
@@ -169,6 +187,11 @@ def plan_run(
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
     pulse_energy: Path | str | None = None,
+    where: Condition | str | None = None,
+    drop_flags: str | None = None,
+    classes: Sequence[int] | None = None,
+    bbox: Sequence[float] | None = None,
+    polygon: Path | str | None = None,
     columns: str | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
@@ -184,6 +207,8 @@ def plan_run(
     Parameters
     ----------
     strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
+        As for `run`.
+    where, drop_flags, classes, bbox, polygon
         As for `run`.
     scheduler, memory
         As for `run`.
@@ -218,7 +243,8 @@ def plan_run(
     known = None if calibration is None else load_calibration(Path(calibration))
     air = None if attenuation is None else _read_air(attenuation)
     template = StripJob(Path(), found, RunOptions(columns=name_columns(columns)), request, sensor, known, air)
-    template = replace(template, pulse_energy=None if pulse_energy is None else str(pulse_energy))
+    chosen = build_selection(where=where, drop_flags=drop_flags, classes=classes, bbox=bbox, polygon=polygon)
+    template = replace(template, pulse_energy=None if pulse_energy is None else str(pulse_energy), selection=chosen)
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)

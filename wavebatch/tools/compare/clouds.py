@@ -29,9 +29,7 @@ PACKET_DTYPE = np.dtype([("gps_time", "<f8")])
 """A pulse that counts even if neither side has an echo in it."""
 
 
-def compare_clouds(
-    a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condition | None = None
-) -> Comparison:
+def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condition | None = None) -> Comparison:
     """Compares the echoes of two clouds of one strip; b may be the strip itself, with the vendor's returns.
 
     Echoes of a pulse (equal GPS time) are the same if they are at most `tolerance_ns` apart along the ray, one to one,

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.condition import Condition
-from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.flag_names import read_flags
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
+
+__all__ = ["Clouds", "Selection", "Tally", "read_flags", "robust_limits"]
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -61,16 +62,6 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
-
-
-def read_flags(names: Sequence[str]) -> int:
-    """The bits of flags given by names, also several separated by commas; ConfigError for an unknown name."""
-    bits = 0
-    for name in (part.strip().upper() for text in names for part in text.split(",")):
-        if name not in EchoFlag.__members__:
-            raise ConfigError(f"flag {name!r} does not exist; {nearest(name, EchoFlag.__members__)}")
-        bits |= int(EchoFlag[name])
-    return bits
 
 
 class Clouds:

@@ -96,8 +96,9 @@ def count_returns(
     """Statistics of each cloud and of all together, for points in any order.
 
     A pulse is the points of equal GPS time in a cloud; if times do not separate pulses, a run of rising return numbers.
-    where: count only points that meet it. divisions: count also by areas; a pulse belongs, with all its returns, to the area of its first return. skip: called
-    with the InputError of a cloud that cannot be read, which is then left out; without it, the error is raised.
+    where: count only points that meet it. divisions: count also by areas; a pulse belongs, with all its returns, to the
+    area of its first return. skip: called with the InputError of a cloud that cannot be read, which is then left out;
+    without it, the error is raised.
     Memory does not grow with the clouds; large clouds need room in TMPDIR. Raises ConfigError for too many areas.
     """
     each, total, number = [], _Tally(areas=[AreaTally(one) for one in divisions]), 0

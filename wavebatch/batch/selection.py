@@ -1,0 +1,283 @@
+"""Which rows of a strip are written: --drop-flags, --classes, --bbox, --polygon and --where of `wavebatch run`.
+
+`cli.run` and the public API build a `Selection`; `unit.process_unit` applies it to the rows of a unit, or `strip_task`
+does once a second pass has filled them. Every row that is left out is counted by the first reason, in the order above.
+Before you change it: a row's values and its neighbours must not depend on what is written, only its return numbers do.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
+from wavebatch.core.condition import Condition, parse_condition
+from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.flag_names import read_flags
+from wavebatch.core.suggest import nearest
+from wavebatch.files.cloud.column_names import normalise
+from wavebatch.files.cloud.echo_reader import describe_dimension, read_dimension
+from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.geojson import Polygon, find_inside, load_polygons
+from wavebatch.files.las.point_formats import ANGLE_UNIT
+from wavebatch.stages.chain import STAGES, Chain
+
+_WITHOUT_STAGE = ("echo_time", "echo_flags")
+"""Columns that need no attribute stage."""
+
+_FLAGS = "echo_flags"
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What is written of a strip; picklable. By default everything."""
+
+    drop_flags: int = 0
+    """EchoFlag bits: rows with one of them are no echoes of their pulse, whose return numbers are counted without them.
+    """
+    classes: tuple[int, ...] = ()
+    """Classes that are written; empty: all."""
+    bbox: tuple[float, float, float, float] | None = None
+    """West, south, east, north of the part that is written, in the coordinates of the strip; the border belongs to it.
+    """
+    polygon: str | None = None
+    """The file of `polygons`."""
+    polygons: tuple[Polygon, ...] = ()
+    """Rows must lie in one of them."""
+    where: Condition | None = None
+    """Rows must meet this."""
+
+    def __bool__(self) -> bool:
+        return self != Selection()
+
+    def describe(self) -> dict[str, Any]:
+        """Return plain values for the report and for --resume, with the polygons' corners as a hash."""
+        rings = [ring for polygon in self.polygons for ring in polygon.rings]
+        corners = hashlib.sha256(b"".join(ring.tobytes() + b"|" for ring in rings)).hexdigest() if rings else None
+        return {
+            "drop_flags": [flag.name for flag in EchoFlag if self.drop_flags & flag],
+            "classes": list(self.classes),
+            "bbox": None if self.bbox is None else list(self.bbox),
+            "polygon": None if self.polygon is None else {"file": Path(self.polygon).name, "corners_sha256": corners},
+            "where": None if self.where is None else self.where.text,
+        }
+
+    def list_wanted(self) -> tuple[str, ...]:
+        """Return the wavebatch columns that --where names exactly, so that the chain gets their stages."""
+        named = () if self.where is None else self.where.columns
+        return tuple(name for name in named if name in COLUMNS and COLUMNS[name].extra_bytes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RowSelector:
+    """A selection on the rows of one strip.
+
+    Parameters
+    ----------
+    selection : Selection
+    chain : Chain
+        That makes the rows.
+    layout : OutputLayout
+        Of the cloud. Rows have `carrying`: this layout and the columns that the selection needs, at its end.
+    """
+
+    selection: Selection
+    chain: Chain
+    layout: OutputLayout
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """The columns that rows carry for the selection, as they were computed, whatever the cloud's names and units.
+
+        echo_flags is always one of them: the flags of rows that are left out are not counted as written.
+        """
+        if not self.selection:
+            return ()
+        named = () if self.selection.where is None else self.selection.where.columns
+        found = [self._find(name) for name in named]
+        return tuple(dict.fromkeys([_FLAGS, *(name for kind, name in found if kind == "computed")]))
+
+    @property
+    def carrying(self) -> OutputLayout:
+        """The layout of the rows that are given to `select`."""
+        return self.layout.extended(self.needed) if self.needed else self.layout
+
+    def check(self) -> None:
+        """Raise ConfigError where --where names a column that the strip's rows do not have."""
+        where = self.selection.where
+        for name in () if where is None else where.columns:
+            if not self._find(name)[0]:
+                makers = [stage.name for stage in STAGES.values() if name in stage.makes and name in COLUMNS]
+                remedy = nearest(name, [known for names in self._names().values() for known in names])
+                if makers:
+                    remedy = f"chain {self.chain.name} does not compute it; add stage {' or '.join(makers)} to it"
+                raise where.complain(name, f"{self.layout.source.path}: there is no column {name!r}; {remedy}")
+
+    def select(self, rows: np.ndarray) -> tuple[np.ndarray, RunReport]:
+        """Choose the rows that are written.
+
+        Parameters
+        ----------
+        rows : structured array (m,)
+            In the layout `carrying`.
+
+        Returns
+        -------
+        rows : structured array (k,)
+            In the cloud's layout.
+        report : RunReport
+            What changes in the counts: rows left out by reason, fewer points and flags that are written.
+        """
+        if not self.selection:
+            return rows, RunReport()
+        left = np.zeros(len(rows), np.int64)
+        for number, reason in enumerate(LEFT_OUT, 1):
+            meets = self._test(reason, rows)
+            if meets is not None:
+                left = np.where((left == 0) & ~meets, number, left)
+        out = left > 0
+        numbers = np.bincount(left, minlength=len(LEFT_OUT) + 1)[1:].tolist()
+        report = RunReport(
+            counts={"points_out": -int(np.count_nonzero(out))},
+            left_out={name: number for name, number in zip(LEFT_OUT, numbers, strict=True) if number},
+            flags={name: -number for name, number in count_flags(self._read(_FLAGS, rows[out])).items()},
+        )
+        final = self.layout.dtype
+        plain = rows[~out].view(np.uint8).reshape(-1, rows.dtype.itemsize)[:, : final.itemsize]
+        return np.ascontiguousarray(plain).view(final).reshape(-1), report
+
+    def _test(self, reason: str, rows: np.ndarray) -> np.ndarray | None:
+        """Whether rows (m,) are written as far as one option is concerned, bool (m,); None where it is not given."""
+        chosen = self.selection
+        if reason == "drop_flags":
+            return (self._read(_FLAGS, rows) & np.uint16(chosen.drop_flags)) == 0 if chosen.drop_flags else None
+        if reason == "classes":
+            return np.isin(self._read("classification", rows), chosen.classes) if chosen.classes else None
+        if reason == "where":
+            where = chosen.where
+            return None if where is None else where.choose({name: self._read(name, rows) for name in where.columns})
+        x, y = self._read("x", rows), self._read("y", rows)
+        if reason == "bbox":
+            if chosen.bbox is None:
+                return None
+            west, south, east, north = chosen.bbox
+            return (x >= west) & (x <= east) & (y >= south) & (y <= north)
+        if not chosen.polygons:
+            return None
+        return np.logical_or.reduce([find_inside(polygon.rings, x, y) for polygon in chosen.polygons])
+
+    def _names(self) -> dict[str, dict[str, str]]:
+        """Names that --where may use, by kind, each with what it stands for; the first kind that has a name counts."""
+        made = [name for name in self.chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
+        computed = {name: name for name in [*made, *_WITHOUT_STAGE]}
+        dimensions = laspy.PointFormat(self.layout.point_format).dimensions
+        fields = [*"xyz", *(one.name for one in dimensions if one.name not in ("X", "Y", "Z"))]
+        standard = {name: name for name in fields}
+        standard |= {"scan_angle": "scan_angle", "scan_angle_rank": "scan_angle"}
+        fields = zip(self.layout.carried, self.layout.extra_fields, strict=False)
+        carried = {one.record.name: field for one, field in fields if not self.layout.dtype[field].shape}
+        return {"computed": computed, "standard": standard, "carried": carried}
+
+    def _find(self, name: str) -> tuple[str, str]:
+        """Kind of a column and what its name stands for; two empty texts where there is none.
+
+        Exact names come first: `Amplitude` is the vendor's, `amplitude` is ours.
+        """
+        names = self._names()
+        for kind, known in names.items():
+            if name in known:
+                return kind, known[name]
+        for kind, known in names.items():
+            alike = [meant for one, meant in known.items() if normalise(one) == normalise(name)]
+            if alike:
+                return kind, alike[0]
+        return "", ""
+
+    def _read(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Values (m,) of a column of rows in the layout `carrying`, NaN for no data."""
+        kind, found = self._find(name)
+        if kind == "computed":
+            return rows[self.carrying.extra_fields[self.needed.index(found) - len(self.needed)]]
+        if kind == "carried":
+            at = self.layout.extra_fields.index(found)
+            return read_dimension(rows, describe_dimension(found, self.layout.carried[at].record))
+        if found in ("x", "y", "z"):
+            header, axis = self.layout.source.header, "xyz".index(found)
+            return rows[found.upper()] * header.scales[axis] + header.offsets[axis]
+        modern = self.layout.point_format >= 6
+        if found == "scan_angle":
+            return rows["scan_angle"] * ANGLE_UNIT if modern else rows["scan_angle_rank"].astype(np.float64)
+        record = laspy.PackedPointRecord(rows, laspy.PointFormat(self.layout.point_format))
+        return widen(np.asarray(record[found]))
+
+
+def build_selection(
+    *,
+    where: Condition | str | None = None,
+    drop_flags: str | None = None,
+    classes: Sequence[int] | None = None,
+    bbox: Sequence[float] | None = None,
+    polygon: Path | str | None = None,
+) -> Selection:
+    """Check the options of a selection.
+
+    Parameters
+    ----------
+    where : Condition or str, optional
+    drop_flags : str, optional
+        Names of flags with commas.
+    classes : sequence of int, optional
+    bbox : sequence of float, optional
+        West, south, east, north.
+    polygon : path, optional
+        GeoJSON file with the areas, in the coordinates of the strips.
+
+    Returns
+    -------
+    Selection
+
+    Raises
+    ------
+    ConfigError
+        For whatever is wrong with them.
+    """
+    flags = 0 if drop_flags is None else read_flags([drop_flags], "--drop-flags")
+    chosen = () if classes is None else tuple(sorted({int(number) for number in classes}))
+    if classes is not None and not (chosen and 0 <= chosen[0] <= chosen[-1] <= 255):
+        raise ConfigError(f"--classes: {list(classes)} must be numbers from 0 to 255, e.g. 2,6")
+    box = None if bbox is None else tuple(map(float, bbox))
+    if box is not None and not (len(box) == 4 and box[0] < box[2] < math.inf and box[1] < box[3] < math.inf):
+        raise ConfigError(f"--bbox: {list(bbox)} must be west, south, east, north, with west < east and south < north")
+    return Selection(
+        drop_flags=flags,
+        classes=chosen,
+        bbox=box,
+        polygon=None if polygon is None else str(polygon),
+        polygons=() if polygon is None else tuple(load_polygons(polygon)),
+        where=parse_condition(where) if isinstance(where, str) else where,
+    )
+
+
+def describe_extent(layout: OutputLayout, selection: Selection) -> str:
+    """Say that the areas lie outside the strip by its header; empty where they do not, or where there is none."""
+    header = layout.source.header
+    (west, south, _), (east, north, _) = header.mins, header.maxs
+    corners = [ring for polygon in selection.polygons for ring in polygon.rings]
+    boxes = [(*np.concatenate(corners).min(axis=0), *np.concatenate(corners).max(axis=0))] if corners else []
+    boxes += [] if selection.bbox is None else [selection.bbox]
+    for left, low, right, high in boxes:
+        if left > east or right < west or low > north or high < south:
+            return (
+                f"the area ({left:.10g} to {right:.10g}, {low:.10g} to {high:.10g}) lies outside the strip "
+                f"({west:.10g} to {east:.10g}, {south:.10g} to {north:.10g}); is it in another CRS?"
+            )
+    return ""
