@@ -15,7 +15,7 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "worker_check"}, {"unit"}, {"explain", "neighbour_pass"}, {"report_file"},
+        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"}, {"explain", "neighbour_pass"}, {"report_file"},
         {"strip_task", "processes", "dask_cluster"}, {"preflight"}, {"run"},
     ],
     "surveying": [

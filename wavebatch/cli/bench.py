@@ -129,7 +129,7 @@ def _bench_against(
         (output / "against.txt").write_text(text + "\n")
         (output / "against.json").write_text(json.dumps(document, indent=2) + "\n")
         talk(f"wrote {output / 'against.txt'} and {output / 'against.json'}")
-    print_result(options["as_json"], document, [text])
+    print_result(options["as_json"], document, [text], "against")
 
 
 def _bench_real(
@@ -153,6 +153,6 @@ def _bench_real(
         if not options["as_json"]:
             click.echo(format_report(report) + "\n")
     if options["as_json"]:
-        print_json({"strips": [asdict(report) for report in reports]})
+        print_json({"strips": [asdict(report) for report in reports]}, "real")
     if failed:
         sys.exit(1)

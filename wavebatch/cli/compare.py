@@ -84,15 +84,16 @@ def compare(
     """  # fmt: skip
     if overlap:
         found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
-        print_result(as_json, found, _list_overlap(found))
+        print_result(as_json, found, _list_overlap(found), "overlap")
         return
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
-        print_result(as_json, agreement, _list_angles(agreement))
+        print_result(as_json, agreement, _list_angles(agreement), "angles")
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
-    print_result(as_json, result.to_json(), [*_list_lines(between), *(_list_match(result) if strip else [])])
+    lines = [*_list_lines(between), *(_list_match(result) if strip else [])]
+    print_result(as_json, result.to_json(), lines, "chains" if strip else "")
     broken = _check_thresholds(between, options)
     for line in broken:
         talk(line)

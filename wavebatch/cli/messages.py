@@ -117,9 +117,20 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else " " if c.isspace() else repr(c)[1:-1] for c in text)
 
 
-def print_json(value: Any) -> None:
-    """Prints `value` (plain, or a dataclass) as JSON with sorted keys; NaN becomes null, because JSON has no NaN."""
-    click.echo(format_json(value))
+def print_json(value: Any, mode: str = "") -> None:
+    """Prints `value` (plain, or a dataclass) as JSON with sorted keys; NaN becomes null, because JSON has no NaN.
+
+    Each document says what it is in its key `schema`, as docs/json.md has it. mode: what the command did, where its
+    documents differ.
+    """
+    value = asdict(value) if is_dataclass(value) else value
+    path, context = [mode] if mode else [], click.get_current_context()
+    while context.parent is not None:
+        path.insert(0, str(context.info_name))
+        context = context.parent
+    schema = {"schema": f"wavebatch.{'-'.join(path)}/1"}
+    named = [{**schema, **one} for one in value] if isinstance(value, list) else {**schema, **value}
+    click.echo(format_json(named))
 
 
 def format_json(value: Any) -> str:
@@ -146,10 +157,10 @@ def print_safely(text: str) -> bool:
         return False
 
 
-def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
-    """The result of a command on stdout: the document as JSON, or the lines."""
+def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str = "") -> None:
+    """The result of a command on stdout: the document as JSON, with its mode, or the lines."""
     if as_json:
-        print_json(document)
+        print_json(document, mode)
     else:
         click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
 

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import NearestGroup, count, talk
+from wavebatch.cli.messages import NearestGroup, count, print_json, talk
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
@@ -71,7 +71,7 @@ def plot() -> None:
 @shared.chain_options
 @shared.system_option
 @shared.strip_options
-@shared.common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "json", "quiet")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
     """Draw waveforms of STRIP with their fit, residual and echoes.
 
@@ -99,6 +99,9 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     if not options["quiet"]:
         echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
+    if options["as_json"]:
+        echoes = sum(len(view.echoes) for view in views)
+        print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
 def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any], str]:
@@ -131,7 +134,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @_flags
-@shared.common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "json", "quiet")
 def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
     """Draw a histogram of a column of CLOUDs of any size.
 
@@ -163,6 +166,15 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
         text = f"{count(total.values, 'value')}, {total.no_data} without data, {total.left_out} left out"
     if not options["quiet"]:
         talk(f"{output}: {text}")
+    if options["as_json"]:
+        tally = counted.total if is_flags(clouds[0], column) else total
+        print_json(_describe(output, column, clouds, tally))
+
+
+def _describe(output: Path, column: str | None, clouds: Sequence[Path], tally: Any) -> dict[str, Any]:
+    """What was drawn, and how many points were not, for --json."""
+    head = {"output": str(output), "column": column, "clouds": [str(path) for path in clouds]}
+    return {**head, **{name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}}
 
 
 def _select(column: str | None, options: dict[str, Any]) -> Any:
@@ -189,7 +201,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
 @_flags
-@shared.common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
 
@@ -215,3 +227,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
         points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
         points += f", {total.left_out} left out" * bool(total.left_out)
         talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} m")
+    if options["as_json"]:
+        cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size}
+        more = {"statistic": statistic, "outside": found.outside, **cells}
+        print_json({**_describe(output, column, clouds, found.total), **more})

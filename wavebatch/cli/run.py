@@ -21,6 +21,7 @@ from wavebatch.cli.messages import (
     count,
     format_json,
     one_line,
+    print_json,
     print_safely,
     printable,
     talk,
@@ -133,7 +134,7 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
 @click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
-@common_options("overwrite", "quiet", failure=EXIT_NOTHING)
+@common_options("overwrite", "json", "quiet", failure=EXIT_NOTHING)
 def run(**options: Any) -> None:
     """Decompose strips into enriched point clouds.
 
@@ -156,7 +157,7 @@ def run(**options: Any) -> None:
     if options["report"] not in (None, "-"):
         _check_report(Path(options["report"]), jobs, batch_options)
     if options["dry_run"]:
-        sys.exit(_dry_run(jobs, batch_options))
+        sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
     try:
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
@@ -175,8 +176,10 @@ def _check_options(options: dict[str, Any]) -> None:
     report = options["report"]
     if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
         raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
-    if report == "-" and options["progress"] == "json":
-        raise ConfigError("--report - and --progress json would both write to stdout; give the report a file")
+    on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
+    on_stdout += ["--progress json"][: options["progress"] == "json"]
+    if len(on_stdout) > 1:
+        raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
 
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
@@ -242,6 +245,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
         if result.advice:
             talk(result.advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
+    is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     errors = [outcome.error for outcome in result.outcomes]
     if errors and all(isinstance(error, ConfigError) for error in errors):
         return EXIT_USAGE
@@ -270,11 +274,11 @@ def exit_code(failed: int, strips: int) -> int:
     return EXIT_NOTHING if failed == strips else EXIT_SOME_FAILED
 
 
-def _dry_run(jobs: list[Any], batch_options: Any) -> int:
+def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
     from wavebatch.batch.preflight import plan_strip
     from wavebatch.stages.chain_file import effective
 
-    failed = 0
+    failed, plans = 0, []
     for job in jobs:
         try:
             plan = plan_strip(job, batch_options)
@@ -282,13 +286,18 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             failed += 1
             talk(f"error: {one_line(error)}")
             continue
+        plans.append(plan)
         line = (
             f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
-        click.echo(printable(line))
+        if not as_json:
+            click.echo(printable(line))
     by = jobs[0].request.describe(jobs[0].chain)
+    if as_json:
+        print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
+        return exit_code(failed, len(jobs))
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
     click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
