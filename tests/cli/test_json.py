@@ -1,0 +1,117 @@
+"""docs/json.md holds every document that `--json` prints: its schema, its keys and their types."""
+
+import json
+import re
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import COMMANDS, main
+
+PAGE = Path(__file__).parents[2] / "docs" / "json.md"
+ROW = re.compile(r"(?m)^\| `(\w+)` \| ([^|]+) \| ([^|]*) \|$")
+KINDS = {"text": str, "list": list, "object": dict, "true or false": bool, "null": type(None)}
+
+
+def _schemas():
+    """Keys of each schema: types, and whether the key may be missing."""
+    parts = re.split(r"(?m)^## (wavebatch\.\S+)$", PAGE.read_text())[1:]
+    return {
+        name: {key: (kind.split(" or ") if kind != "true or false" else [kind], meaning.startswith("optional"))
+               for key, kind, meaning in ROW.findall(text)}
+        for name, text in zip(parts[::2], parts[1::2], strict=True)
+    }  # fmt: skip
+
+
+def _is(value, kind):
+    if kind in ("integer", "number"):
+        return isinstance(value, int if kind == "integer" else (int, float)) and not isinstance(value, bool)
+    return isinstance(value, KINDS[kind])
+
+
+def _hold(document, schema):
+    keys = _schemas()[schema]
+    assert document["schema"] == schema
+    needed = {key for key, (_, optional) in keys.items() if not optional}
+    assert needed <= set(document) <= set(keys), (needed ^ set(document)) & (needed | set(document) - set(keys))
+    for key, value in document.items():
+        assert any(_is(value, kind) for kind in keys[key][0]), (key, value)
+
+
+def _print(*words):
+    result = CliRunner().invoke(main, [*map(str, words), "--json"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def folder(riegl, tmp_path_factory):
+    """A cloud, and the document of its run."""
+    place = tmp_path_factory.mktemp("json")
+    columns = "+incidence_angle,+incidence_angle_normals"
+    document = _print("run", riegl, "-o", place, "--profile", "fast", "--columns", columns, "-q")
+    (place / "run.json").write_text(json.dumps(document))
+    _print("simulate", "mixed", "-o", place / "sim.las", "--pulses", 300, "-q")
+    return place
+
+
+def test_reports(folder, riegl):
+    _hold(json.loads((folder / "run.json").read_text()), "wavebatch.batch-report/1")
+    _hold(json.loads((folder / f"{riegl.stem}.report.json").read_text()), "wavebatch.strip-report/1")
+
+
+CASES = {
+    "run STRIP -o new --dry-run": "run-plan/1",
+    "plot histogram CLOUD --column z -o h.png -q": "plot-histogram/1",
+    "plot histogram CLOUD --column echo_flags -o f.png -q": "plot-histogram/1",
+    "plot map CLOUD --statistic count -o m.png -q": "plot-map/1",
+    "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
+    "stats CLOUD": "stats/1",
+    "compare CLOUD STRIP": "compare/1",
+    "compare fast --strip STRIP --limit 50": "compare-chains/1",
+    "compare CLOUD --angles": "compare-angles/1",
+    "compare CLOUD CLOUD --overlap": "compare-overlap/1",
+    "info STRIP": "info/1",
+    "info CLOUD": "info/1",
+    "check STRIP": "check/1",
+    "survey STRIP --waveforms 200": "system/1",
+    "stages": "stages/1",
+    "simulate slope -o s.las --pulses 300 -q": "simulate/1",
+    "synthesize SIM -o y.las -q": "synthesize/1",
+    "slice STRIP -o s.csv -q": "slice/1",
+    "voxelize STRIP --size 3 -o v.npz -q": "voxelize/1",
+}
+
+
+@pytest.mark.parametrize("line", CASES)
+def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
+    monkeypatch.chdir(tmp_path)
+    names = {"STRIP": riegl, "CLOUD": folder / f"{riegl.stem}.laz", "SIM": folder / "sim.las"}
+    found = _print(*(names.get(word, word) for word in line.split()))
+    for document in found if isinstance(found, list) else [found]:
+        _hold(document, f"wavebatch.{CASES[line]}")
+
+
+def _with_json(command, path):
+    if isinstance(command, click.Group):
+        for name in command.list_commands(None):
+            yield from _with_json(command.get_command(None, name), f"{path} {name}")
+    elif any(one.name == "as_json" for one in command.params):
+        yield path
+
+
+def test_every_command_with_json_is_in_the_page_and_tested():
+    context, text = click.Context(main), PAGE.read_text()
+    paths = {path for name in COMMANDS for path in _with_json(main.get_command(context, name), name)}
+    assert {"run", "plot map"} <= paths
+    for path in paths:
+        assert re.search(rf"`{path}(?: [^`]*)? ?--json`", text), path
+        assert path == "bench" or any(line == path or line.startswith(f"{path} ") for line in CASES), path
+
+
+def test_only_one_document_goes_to_stdout(riegl, tmp_path):
+    for more in (["--report", "-"], ["--progress", "json"]):
+        result = CliRunner().invoke(main, ["run", str(riegl), "-o", str(tmp_path), "--json", *more])
+        assert result.exit_code == 2 and "would both write to stdout" in result.output
