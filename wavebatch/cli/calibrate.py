@@ -32,8 +32,11 @@ this, or six times the stated error, give a note."""
 @shared.system_option
 @shared.sensor_options
 @shared.direction_option
+@shared.html_option
 @shared.common_options("overwrite")
-def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **options: Any) -> None:
+def calibrate(
+    strip: Path, targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
+) -> None:
     """Find the calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
 
     Used are echoes that are alone in their waveform and lie on a target. The incidence angle comes from the plane of
@@ -49,6 +52,7 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
 
     sensor = shared.read_sensor(options)
     refuse_existing(output, overwrite)
+    shared.check_html(html_file)
     loaded, saved = load_targets(targets), shared.read_system(options)
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
@@ -61,13 +65,21 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
             result = f"{numbers}, incidence {target.incidence_deg:.1f} deg"
         talk(f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, {result}")
     constants = [target.constant for target in found.targets if target.constant is not None]
+    notes: list[str] = []
     ratio = max(constants) / min(constants)
     # Channels may have different constants, so that their targets may differ too.
     if ratio > 1 + 6 * max(options["reflectance_error"], LEAST_DOUBT) and not found.channels:
-        talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
+        notes.append(f"constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
+    for note in notes:
+        talk(f"note: {note}")
     for channel in found.channels:
         error, spread = 100 * channel.relative_error, 100 * channel.spread
         numbers = f"constant {channel.constant:.4g} +- {error:.1f} %, spread {spread:.1f} %"
         where = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
         talk(f"{where}: {count(channel.echoes, 'echo')}, {numbers}")
     talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
+    if html_file is not None:
+        from wavebatch.tools.html.calibrate_page import write_calibrate_page
+
+        write_calibrate_page(html_file, found, notes)
+        talk(f"{html_file}: written")

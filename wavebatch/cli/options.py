@@ -61,6 +61,20 @@ def together(*options: Callable) -> Callable:
     return decorate
 
 
+html_option = output_option(
+    "Also write a report page: one HTML file with all pictures in it. An older report of that name is replaced.",
+    "FILE", "--html", "html_file", required=False,
+)  # fmt: skip
+
+
+def check_html(target: Path | None) -> None:
+    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it."""
+    if target is not None:
+        from wavebatch.tools.html.page import check_page
+
+        check_page(target)
+
+
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
 clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
 
