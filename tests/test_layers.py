@@ -149,6 +149,7 @@ def test_no_other_dependency_at_run_time():
         peers = {"gdecomp"} if path.name == "peers.py" else set()
         peers |= {"matplotlib"} if _part(path) == "tools" or path.name == "figure_file.py" else set()
         peers |= {"pyproj"} if path.name == "trajectory_file.py" else set()
+        peers |= {"rasterio"} if path.name == "geotiff_file.py" else set()
         peers |= {"dask", "distributed"} if path.name == "dask_cluster.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path
 

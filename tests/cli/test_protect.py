@@ -93,4 +93,5 @@ def test_every_option_that_writes_is_known_as_such():
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "bench --output",
+        "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
     }  # fmt: skip

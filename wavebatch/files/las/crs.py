@@ -25,6 +25,7 @@ _MAX_RECORD = 1 << 20
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
 _MODEL, _LINEAR, _LINEAR_SIZE, _VERTICAL = 1024, 3076, 3077, 4099
+_GEOGRAPHIC_CODE, _PROJECTED_CODE = 2048, 3072
 _MODELS = {1: "projected", 2: "geographic", 3: "geocentric"}
 _USER_DEFINED, _UNIT_CODES = 32767, range(9001, 9200)
 METRES = {
@@ -85,6 +86,20 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
         text = text or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
         units.append(parse_geotiff(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b"")))
     return text, tuple(units)
+
+
+def read_crs_definition(path: Path, header: LasHeader) -> str | None:
+    """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None."""
+    records = _read_records(path, header)
+    text = records.get(WKT_ID, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
+    if text:
+        return text
+    directory = records.get(GEOTIFF_ID, b"")
+    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
+    keys = {key: value for key, place, _, value in rows[1 : rows[0][3] + 1] if place == 0} if rows else {}
+    # The model says which key holds: a projected CRS also names the geographic one that it is based on.
+    code = keys.get(_GEOGRAPHIC_CODE if keys.get(_MODEL) == 2 else _PROJECTED_CODE, 0)
+    return f"EPSG:{code}" if 0 < code < _USER_DEFINED else None
 
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
