@@ -61,6 +61,7 @@ _CASES = [
     "slice s.las -o s.las --overwrite",
     "voxelize s.las -o link.las --size 1 --overwrite",
     "voxelize s.las -o hard.las --size 1 --overwrite",
+    "voxelize s.las -o v.las --profiles s.las --size 1 --overwrite",
 ]
 
 
@@ -92,6 +93,8 @@ def test_every_option_that_writes_is_known_as_such():
     assert found == {
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
-        "waveform --output", "histogram --output", "map --output", "calibrate --output", "bench --output",
+        "voxelize --profiles",
+        "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
+        "calibrate --plot", "bench --output",
         "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
     }  # fmt: skip

@@ -92,6 +92,43 @@ def test_facets_are_found_with_their_slope_and_place(strip):
         assert line.point[segment.first_pulse] == segment.first_point
 
 
+def fly_over(height, rng, step, half=40.0, altitude=600.0):
+    """A scan line over a surface of the given height(place) [m], pulses `step` m apart, scatter 2 cm."""
+    place = np.arange(-half, half, step)
+    n, count = len(place), 80
+    angle = np.arctan(place / altitude)
+    direction = 0.149896 * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
+    ground = np.stack([place, np.zeros(n), height(place) + 0.02 * rng.standard_normal(n)], axis=1)
+    time = 30 + rng.uniform(-5, 5, n)
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 60 * np.exp(-0.5 * ((sample - time[row]) / 2.0) ** 2) + rng.standard_normal(n * count)
+    origin = ground - direction * time[:, None]
+    figures = (1.0, row, sample.astype(float), np.round(value).astype(np.float32))
+    return ScanLine(0, np.arange(n), np.arange(n) * 1e-5, origin, direction, *figures)
+
+
+@pytest.mark.parametrize("degrees", [3, 8, 20])
+@pytest.mark.parametrize("step", [0.3, 1.0])
+def test_a_shallow_gable_is_two_slopes(degrees, step):
+    """Both slopes lie within the band of one line through them: it was level, or of a slope between."""
+    rise = np.tan(np.radians(degrees))
+    line = fly_over(lambda x: np.where(np.abs(x) < 6, 5 + rise * (6 - np.abs(x)), 0), np.random.default_rng(1), step)
+    options = SliceOptions()
+    roof = [s for s in find_segments(cut_slice(line, options), options) if min(s.start[2], s.end[2]) > 3]
+    assert sorted(s.slope for s in roof) == pytest.approx([-degrees, degrees], abs=0.5)
+    for segment in roof:
+        assert segment.residual < 0.04 and segment.length > 3.9
+        assert max(segment.start[0], segment.end[0]) < 0.6 or min(segment.start[0], segment.end[0]) > -0.6
+
+
+@pytest.mark.parametrize("bend", [lambda x: -(x**2) / 2000, lambda x: 0.1 * np.sin(x / 3), lambda x: 0.15 * (x > 0)])
+def test_a_hill_a_wave_and_a_step_stay_one_line(bend):
+    options = SliceOptions()
+    line = fly_over(bend, np.random.default_rng(2), 0.5)
+    (segment,) = find_segments(cut_slice(line, options), options)
+    assert segment.length > 78
+
+
 def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
     n, count, spacing = 200, 80, 0.5
     row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
@@ -176,3 +213,60 @@ def test_real_strip(riegl, tmp_path):
     assert result.exit_code == 0, result.output
     counts = json.loads(result.stdout)
     assert counts["lines"] > 50 and counts["segments"] > 50
+
+
+def ground_line(starts, n=240, spacing=0.5, tilt=0.0):
+    """A scan line over level ground 30 m below its highest sample; windows open `starts` [ns] after that height."""
+    count, speed = 90, 0.15
+    angle = np.radians(np.linspace(-6, 6, n) + tilt)
+    direction = speed * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
+    sensor = np.array([0.0, 0.0, 700.0])
+    top = sensor + direction * ((700.0 - 30.0) / -direction[:, 2])[:, None]
+    origin = top + direction * starts[:, None]
+    ground = (origin[:, 2] - 0.0) / -direction[:, 2]
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 60 * np.exp(-0.5 * ((sample * spacing - ground[row]) / 1.5) ** 2).astype(np.float32)
+    value += np.random.default_rng(1).normal(0, 1, len(value)).astype(np.float32)
+    place = (np.arange(n), np.arange(n) * 1e-5, origin, direction)
+    return ScanLine(0, *place, spacing, row, sample * spacing, value)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 25.0])
+def test_windows_that_open_at_different_heights_keep_the_relief(tilt):
+    """Counted from their own first samples, level ground was scattered over the image: no segment, or many."""
+    options = SliceOptions(geometry="time", sigma=1.5)
+    rng = np.random.default_rng(2)
+    # The ground lies 200 to 216 ns below the highest sample, so windows of 45 ns open 165 to 195 ns below it.
+    starts = rng.uniform(165, 195, 240)
+    starts[7] = 0.0
+    line = ground_line(starts, tilt=tilt)
+    segments = find_segments(cut_slice(line, options), options)
+    assert max(segment.pulses for segment in segments) > 100
+    for segment in segments:
+        assert segment.residual < (1.0 if tilt == 0 else 2.5)
+        for end in (segment.start, segment.end):
+            assert end[2] == pytest.approx(0.0, abs=0.35 if tilt == 0 else 1.0)
+        # What is drawn is what is placed: the time on the axis of the slice leads to the same height.
+        assert abs(segment.start[0] - segment.end[0]) > 2.5
+
+
+def test_the_axis_of_time_does_not_depend_on_where_windows_open():
+    options = SliceOptions(geometry="time", sigma=1.5)
+    starts = np.full(240, 170.0), np.r_[0.0, np.full(239, 170.0)]
+    together, apart = (cut_slice(ground_line(one), options) for one in starts)
+    # One pulse that sees 25 m higher moves the beginning of the axis for all, not the pulses against each other.
+    shift = apart.x[apart.line.row > 0] - together.x[together.line.row > 0]
+    assert shift == pytest.approx(np.full(len(shift), 170.0 / 0.5), abs=4) and np.ptp(shift) < 2.5
+    assert together.start.min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_both_geometries_find_the_ground_of_a_strip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("village") / "village.las"
+    simulate_strip("village", path, pulses=4000, seed=3)
+    found = {}
+    for geometry in ("plane", "time"):
+        options = SliceOptions(geometry=geometry, sigma=0.65)
+        found[geometry] = [s for line in read_all(path) for s in find_segments(cut_slice(line, options), options)]
+    assert len(found["time"]) >= 0.8 * len(found["plane"]) > 10
+    level = [segment for segment in found["time"] if abs(segment.slope) < 1 and segment.length > 10]
+    assert len(level) > 5

@@ -55,6 +55,9 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
+    energy = job.pulse_energy
+    if energy is not None and Path(energy).is_file():
+        energy = take_fingerprint(Path(energy))
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {
@@ -66,6 +69,8 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
+            "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
+            "pulse_energy": energy,
             **flight,
         },
     }
@@ -82,8 +87,19 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
+        "air": _describe_air(prepared),
+        "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
         **seen,
     }
+
+
+def _describe_air(prepared: Prepared) -> dict[str, Any]:
+    """Attenuation that the columns of light use, its error, and where it comes from."""
+    job, system = prepared.job, prepared.system
+    given = "the default, for which there is no source" if job.calibration is None else "the calibration"
+    source = given if job.attenuation is None else "--attenuation or --visibility"
+    return {"attenuation_db_km": system.attenuation, "error_db_km": system.attenuation_error, "from": source}
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:
@@ -141,7 +157,12 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "warnings": [
+            *facts.warnings,
+            *prepared.scan.warnings,
+            *prepared.doubts,
+            *(f"{name}: {why}" for name, why in lost.items()),
+        ],
         "timing": build_timing(report),
     }
 

@@ -288,5 +288,5 @@ class _Batch:
             report = outcome.report.to_json()
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             if strip.prepared is not None:
-                more["sensor"] = strip.prepared.sensor.describe()
+                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": list(strip.prepared.doubts)}
             self._tell({**event, **more})

@@ -257,6 +257,10 @@ class Progress:
             more = [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
+        elif kind == "written":
+            # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
+            for line in event["doubts"]:
+                self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
         elif kind == "flight" and self._level > 0:

@@ -19,12 +19,14 @@ import click
 from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, format_json, one_line, print_safely, talk
 from wavebatch.cli.options import (
     OutputPath,
+    air_options,
     calibration_option,
     chain_options,
     check_html,
     common_options,
     html_option,
     output_option,
+    read_air,
     read_sensor,
     sensor_options,
     strip_options,
@@ -63,10 +65,12 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
               "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.")
 @sensor_options
 @calibration_option
+@air_options
 @strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
-@click.option("--columns", metavar="LIST", help="a,b writes only these columns; +a,+b adds them to the usual ones.")
+@click.option("--columns", metavar="LIST", help="a,b writes only these columns; +a,+b adds "
+              "them to the usual ones. A shipped chain gets the stages for them.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
               show_default=True, help="Naming scheme for names and units of the extra bytes.")
 @click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
@@ -150,8 +154,8 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str
 
 
 _PASSED_ON = (
-    "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless", "scheduler", "memory",
-    "block_size", "overwrite", "resume",
+    "pulse_energy", "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless",
+    "scheduler", "memory", "block_size", "overwrite", "resume",
 )  # fmt: skip
 """Options that `plan_run` takes under the same names."""
 
@@ -169,6 +173,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],
+        attenuation=read_air(options),
         format=options["file_format"],
         jobs=1 if options["jobs"] is None else options["jobs"],
         **{name: options[name] for name in _PASSED_ON},

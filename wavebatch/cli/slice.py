@@ -33,7 +33,7 @@ _SURVEYED = 2000
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
-              help="plane: slices are vertical planes; time: rows are pulses, columns times; flat surfaces bend.")
+              help="plane: slices are vertical planes; time: rows are pulses, columns times on one axis.")
 @click.option("--std", default=2.0, show_default=True, metavar="STD",
               help="Search samples above this many standard deviations of the slice.")
 @click.option("--sigma", type=float, metavar="NS",
@@ -47,7 +47,18 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
     """Find the straight surface lines in the scan lines of STRIP.
 
     A slice shows the waveforms of one scan line side by side. A new line starts where the scan angle turns or jumps
-    back, or after a pause. Each segment has its end points in space, length, slope and residual.
+    back, or after a pause. With plane slices a line that bends, as at the ridge of a roof, is two segments.
+
+    \b
+    Each segment has:
+      line, segment      scan line and number in it, the strongest first
+      x1 y1 z1 x2 y2 z2  its ends [units of the strip]
+      length             distance of the ends [units of the strip]
+      slope              angle above the horizontal from the first to the second end [degrees]
+      residual           rms distance of the pulses' centroids from it [as length; ns with --geometry time]
+      pulses             how many; first_pulse, last_pulse: which of the line; first_point: index in the file
+      theta, rho         normal form of the line in the slice [degrees, pixels]
+      weight             sum of its samples [DN]
 
     Exit code: 0 done, 1 the strip cannot be read or the output cannot be written, 2 wrong usage.
     """  # fmt: skip

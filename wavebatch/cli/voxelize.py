@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_summary
+from wavebatch.cli.messages import count, counting, print_summary, talk
 
 if TYPE_CHECKING:
     from wavebatch.tools.voxels.strip import VoxelSummary
@@ -36,6 +36,13 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
               help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
               "from the highest return near it]")
+@click.option("--ground-height", type=click.FloatRange(0, 100), default=0.5, show_default=True, metavar="M",
+              help="Signal up to this height above the lowest returns is the ground's [m].")
+@click.option("--reflectance-ratio", type=float, metavar="RATIO",
+              help="Reflectance of the canopy over that of the ground.  [default: estimated from the strip]")
+@click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
+              help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
+              "time.")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
 @shared.system_option
 @shared.calibration_option
@@ -52,14 +59,22 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
       rays           number of rays that crossed it and had light left
       path           length of these rays inside it [m]
       light          light that was left in them, in units of whole rays
-      share          share of that light that came back from it; 1 - share is its transmittance
+      share          share of that light that was caught in it; 1 - share is its gap probability
+
+    Light is shared along a ray as its signal times the square of the range, where signal from the ground counts
+    RATIO times as much as that from the canopy. The ratio is that at which the sum does not depend on how much light
+    reached the ground; where the strip does not show it, it is taken as 1, and a note says so.
 
     Each sample is spread over its length along the ray, so that voxels smaller than a sample (15 cm) have no holes. A
     ray ends at its last signal; voxels after it were not seen. A voxel that is not in the file was not seen, or
     (without --all-crossed) was seen to be empty.
 
     An .npz file holds index (n, 3), one array per value, origin, size, crs and meta; voxel i lies between origin + i
-    size and origin + (i + 1) size. Memory does not grow with the strip; large strips need room in TMPDIR. The options
+    size and origin + (i + 1) size. --profiles writes an .npz with the arrays point, gps_time, start, step, spacing,
+    anchored, clipped, first, count (one value per pulse with signal) and time, energy, cross_section (one per sample
+    with signal); the samples of pulse p are first[p] to first[p] + count[p] - 1, at start + time step.
+
+    Memory does not grow with the strip; large strips need room in TMPDIR. The options
     for the sensor position are for cross sections only.
 
     Exit code: 0 done, 1 the strip cannot be read or the output cannot be written, 2 wrong usage.
@@ -84,8 +99,10 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
             calibration=shared.read_calibration(options),
             sensor=sensor,
             progress=show,
-            **{name: options[name] for name in ("direction", "headerless", "overwrite")},
+            **{name: options[name] for name in ("direction", "headerless", "overwrite", "profiles")},
         )
+    for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
+        talk(f"warning: {line}")
     print_summary(options, summary, _list_lines(summary))
 
 
@@ -102,6 +119,8 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
         f"{summary.output}: {count(summary.voxels, 'voxel')} of {summary.size:g} m in {x} x {y} x {z}, "
         f"{summary.energy:.6g} DN ns from {summary.with_signal} of {count(summary.waveforms, 'waveform')}"
     )
+    if summary.profiles is not None:
+        yield f"{summary.profiles}: {count(summary.profile_samples, 'sample')} of {summary.with_signal} pulses"
     notes = {
         "without a return at the signal; placed by the raw return location": summary.with_signal - summary.anchored,
         "saturated; the energy is too low": summary.clipped,
@@ -111,3 +130,18 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     for text, number in notes.items():
         if number:
             yield f"note: {count(number, 'waveform')} {text}"
+    yield from _tell_ratio(summary)
+
+
+def _tell_ratio(summary: VoxelSummary) -> Iterator[str]:
+    """The reflectance ratio by which light is shared."""
+    if summary.reflectance_ratio_source == "strip":
+        yield (
+            f"reflectance of canopy over ground: {summary.reflectance_ratio:.3g} +- {summary.reflectance_ratio_err:.2g}"
+        )
+    elif summary.reflectance_ratio_source == "assumed":
+        yield (
+            "note: the strip does not show the reflectance of canopy over ground (fewer than 100 pulses, all shared by "
+            "both alike, or too different in energy); it was taken as 1, so 1 - share is a gap probability only if "
+            "both reflect alike: give --reflectance-ratio"
+        )

@@ -76,8 +76,17 @@ class ShapeLimits(NamedTuple):
     high: float
 
 
-def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
-    """Return the allowed widths: 0.7 to 4 times the system's, and positive for every component of a learned pulse.
+LEAST_WIDTH, MOST_WIDTH = 0.7, 4.0
+"""Widths that fits allow where a chain says nothing [widths of the system pulse] (docs/algorithms.md H3)."""
+
+BROADEST = 100.0
+"""Largest width that tables of learned pulses hold [widths of the system pulse]."""
+
+
+def shape_limits(
+    system: SystemPulse, spacing: float, least: float = LEAST_WIDTH, most: float = MOST_WIDTH
+) -> ShapeLimits:
+    """Return the allowed widths, positive for every component of a learned pulse.
 
     Parameters
     ----------
@@ -85,6 +94,8 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
         Result of the survey.
     spacing : float
         Time between two samples [ns].
+    least, most : float
+        Smallest and largest width [widths of the system pulse].
 
     Returns
     -------
@@ -98,10 +109,11 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
     shape = pulse_shape(system, spacing)
     ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
     narrowest = min((extra for _, _, extra in shape.components), default=0.0)
-    return ShapeLimits(ref, max(0.7 * ref, float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))), 4.0 * ref)
+    positive = float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
+    return ShapeLimits(ref, max(least * ref, positive), max(most * ref, positive))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
     """Tabulate peak, delay and full width at half maximum by fitted width; cached, since each block needs it.
 
@@ -118,6 +130,21 @@ def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
         The table.
     """
     return measure_pulse(shape, limits.low, limits.high)
+
+
+def _near_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of the usual widths."""
+    return pulse_measures(shape, limits._replace(high=min(limits.high, _usual(limits))))
+
+
+def _wide_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of all widths above: one of both would be too coarse for the usual ones."""
+    usual = _usual(limits)
+    return pulse_measures(shape, ShapeLimits(limits.ref, usual, max(BROADEST * limits.ref, 1.01 * usual)))
+
+
+def _usual(limits: ShapeLimits) -> float:
+    return max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
 
 
 @lru_cache(maxsize=8)
@@ -156,8 +183,9 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 
     Returns
     -------
-    float64 array, shape (m, 3)
-        Of amplitude, time and sigma as `describe_echoes` gives them; 1 for a Gaussian in white noise.
+    float64 array, shape (m, 4)
+        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 for a Gaussian in white
+        noise.
 
     Notes
     -----
@@ -167,7 +195,7 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
     """
     shape = pulse_shape(system, spacing)
     if not system.correlation and not shape.components:
-        return np.ones((len(width), 3))
+        return np.ones((len(width), 4))
     widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
     return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
 
@@ -176,16 +204,18 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 def _factor_table(
     shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Widths (k,) and the factors of errors there (k, 3)."""
+    """Widths (k,) and the factors of errors there (k, 4)."""
     alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
     widths = np.geomspace(limits.low, limits.high, FACTOR_WIDTHS)
     return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
 
 
 def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """Errors of amplitude, time and width (3,) in noise of this correlation, over those of the main component."""
+    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those of the main component."""
     joint = _pulse_rows(shape, width)
     main = np.linalg.solve(joint @ joint.T, joint)
+    # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
+    main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
     if shape.components:
         table = pulse_measures(shape, limits)
@@ -221,7 +251,18 @@ def describe_echoes(
     """
     if not shape.components:
         return parameters, errors
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    whole = _describe(near, parameters, errors)
+    beyond = parameters[:, 2] > near.width[-1]
+    if beyond.any():
+        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond])
+        for values, others in zip(whole, wide, strict=True):
+            values[beyond] = others
+    return whole
+
+
+def _describe(table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As describe_echoes, with one table."""
     amplitude, time, width = parameters.T
     peak = np.interp(width, table.width, table.peak)
     sigma = table.half_width / FWHM_PER_SIGMA
@@ -249,7 +290,16 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
     """
     if not shape.components:
         return echoes
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    inner = _invert(near, echoes)
+    beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
+    if limits.high > near.width[-1] and beyond.any():
+        inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+    return inner
+
+
+def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
+    """As model_parameters, with one table."""
     amplitude, time, sigma = echoes.T
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
     delay = np.interp(width, table.width, table.delay)

@@ -96,7 +96,7 @@ def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overw
             ends = np.array(segment.ends)
             axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
         plane = piece.geometry == "plane"
-        axes.set_xlabel("along the slice [m]" if plane else "time after the first sample [ns]")
+        axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")
         axes.set_title(f"scan line {piece.line.number}: {len(piece.line)} pulses, {len(segments)} segments")
 
