@@ -4,6 +4,7 @@
 #   make papers    the tables of five papers on simulated data
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
+#   make man       the manual pages, in build/man
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
@@ -12,7 +13,7 @@ BIN    := $(VENV)/bin
 DEMO   := demo
 BENCH  := bench
 
-.PHONY: demo test test-all papers bench docs lint clean
+.PHONY: demo test test-all papers bench docs man lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -66,6 +67,9 @@ endif
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site: site/index.html"
+
+man: $(VENV)/.test
+	$(BIN)/wavebatch --man-pages build/man
 
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from wavebatch.cli.messages import report_errors
+from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
@@ -128,6 +129,12 @@ _COMMON = {
     "overwrite": click.option("--overwrite", is_flag=True, help="Replace existing files."),
     "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
     "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no messages, only errors."),
+    "log_level": click.option("--log-level", type=click.Choice(LEVELS), default="info", show_default=True,
+                              is_eager=True, expose_value=False, callback=keep_level,
+                              help="Last level that --log-file holds."),
+    "log_file": click.option("--log-file", "log_path", type=OutputPath(dir_okay=False, path_type=Path), metavar="FILE",
+                             expose_value=False, callback=begin_log,
+                             help="Append every message with its time to this file, also with --quiet."),
     "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
 }
 
@@ -139,7 +146,8 @@ def common_options(*names: str, failure: int = 1) -> Callable:
     """
 
     def decorate(command: Callable) -> Callable:
-        return together(*(_COMMON[name] for name in (*names, "debug")))(report_errors(failure)(_protected(command)))
+        shared = (*names, "log_file", "log_level", "debug")
+        return together(*(_COMMON[name] for name in shared))(report_errors(failure)(_protected(command)))
 
     return decorate
 

@@ -268,6 +268,8 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
+    for line in click.get_current_context().meta.get("wavebatch.settings", ()):
+        click.echo(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
