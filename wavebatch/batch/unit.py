@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
@@ -30,13 +30,20 @@ from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration, needs_sensor, with_columns, with_physics
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
+
+USUAL_SAMPLES = 256
+"""Waveforms of more samples than this count several times where --block-size is given."""
+
+LARGEST_HEIGHT_ERROR = 0.3
+"""Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
 
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
@@ -51,7 +58,10 @@ class RunOptions:
     points: str = "echoes"
     format: str = "laz"
     point_format: int | None = None
+    las_version: str = "1.4"
     names: str = "wavebatch"
+    no_data: str = "-9999"
+    strict: bool = False
     columns: tuple[str, ...] = ()
     """Columns to write, in order; see `choose_columns`."""
     keep_packets: bool = False
@@ -126,7 +136,9 @@ class Prepared:
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
     pulse_energy: PulseEnergy | None = None
     doubts: tuple[str, ...] = ()
-    """Warnings about inputs that do not quite fit the strip, such as its calibration or its beam."""
+    """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
+    forced: str = ""
+    """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
 
     @property
     def system(self) -> SystemPulse:
@@ -162,6 +174,11 @@ def name_columns(wanted: str | None) -> tuple[str, ...]:
     return tuple(entry.strip().removeprefix("+") for entry in (wanted or "").split(",") if entry.strip(" +"))
 
 
+def split_columns(wanted: str | None) -> list[str]:
+    """Return the entries of --columns, with their `+`."""
+    return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+
+
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
     """Choose the columns to write.
 
@@ -188,7 +205,7 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
         )
     computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
     default = [*computed, "echo_flags"]
-    entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+    entries = split_columns(wanted)
     added = [entry[1:] for entry in entries if entry.startswith("+")]
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:
@@ -215,9 +232,12 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
         facts,
         options.columns,
         point_format=options.point_format,
+        las_version=options.las_version,
         packets=facts if options.keep_packets else None,
         names=options.names,
+        no_data=options.no_data,
         points=options.points,
+        strict=options.strict,
     )
 
 
@@ -247,10 +267,10 @@ def prepare_strip(job: StripJob) -> Prepared:
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
-            stranger = _hold(reader, scan, job)
+            stranger, forced = _hold(reader, scan, job)
             if stranger:
                 job = replace(job, request=replace(job.request, system=None))
-            choice = make_choice(reader, scan, job.chain, job.request)
+            choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
             if job.request.describe(job.chain) is not None:
                 choice = replace(choice, chain=job.extend(choice.chain))
             columns = without_columns(job.options.columns, job.chain, choice.chain)
@@ -259,9 +279,10 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
-            job, misfits = _fit_calibration(reader, scan, job, choice, sensor)
-            choice, doubts = _see_level(reader, scan, job, choice, sensor)
-            doubts = (*misfits, *doubts)
+            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
+            _hold_height(reader, job.sensor, sensor)
+            choice, more = _see_level(reader, scan, job, choice, sensor)
+            doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
             energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
@@ -270,7 +291,10 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, energy, doubts)
+    prepared = Prepared(
+        job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, energy, doubts
+    )
+    return replace(prepared, forced=forced)
 
 
 def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
@@ -284,11 +308,27 @@ def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
     return replace(chain, steps=tuple(steps))
 
 
-def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
-    """Why the strip does not belong to the flight whose survey the job has; empty where it does."""
-    if job.request.system is None or not job.request.flight:
-        return ""
-    return hold_strip(reader, scan, job.request.system.survey)
+def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
+    """Refuse a flight height that contradicts the packet vectors, which are more exact and are used in its place."""
+    seen = dict(sensor.facts).get("height_m")
+    if request.height is None or sensor.height is not None or not seen:
+        return
+    if abs(np.log(request.height / max(seen, 1e-9))) > LARGEST_HEIGHT_ERROR:
+        where = f"by its {sensor.kind} the sensor flew {seen:.0f} m above the points"
+        raise InputError(
+            f"{reader.facts.path}: --flight-height {request.height:g} m contradicts the strip: {where}; leave "
+            "--flight-height out"
+        )
+
+
+def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:
+    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a forced survey."""
+    request = job.request
+    if request.system is None:
+        return "", ""
+    if request.flight:
+        return hold_strip(reader, scan, request.system.survey), ""
+    return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 
 def _fit_calibration(
@@ -352,7 +392,7 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
-        blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)
+        blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
         echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
@@ -367,9 +407,11 @@ def unpack(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
-def _block_size(unit: Unit) -> int:
+def _block_size(unit: Unit, wanted: int | None) -> int:
+    """Waveforms of a block: as many as wanted, but fewer long ones, so that memory stays bounded."""
     longest = int(unit.packets.n_samples.max(initial=1))
-    return int(np.clip(BLOCK_SAMPLES // longest, 64, 65536))
+    most = max(min(BLOCK_SAMPLES // longest, 65536), 1)
+    return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
 
 
 def _run_blocks(

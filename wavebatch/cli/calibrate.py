@@ -5,7 +5,7 @@ Only reads options and prints; the work is in `wavebatch.surveying.targets`.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -113,6 +113,7 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     if options["chain_file"] is not None and options["profile"] is not None:
         raise ConfigError("--chain and --profile exclude each other; give one of them")
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
+    request = replace(request, force=options["force"])
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
     return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)

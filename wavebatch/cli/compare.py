@@ -119,8 +119,8 @@ def _tolerance(options: dict) -> dict[str, float]:
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
-    for name in ("system_file", "limit"):
-        if options[name] is not None:
+    for name in ("system_file", "force", "limit"):
+        if options[name] not in (None, False):
             raise click.UsageError(f"--{name.removesuffix('_file')} is for chains; give --strip STRIP too")
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
@@ -152,8 +152,8 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
         if side is not None and side.is_cloud and not Path(side.name).exists():
             chain = nearest(side.name, [AUTO, *COSTS])
             raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
-    survey = saved.survey if saved else None
-    return match_sides(strip, *sides, survey=survey, limit=options["limit"], **_tolerance(options))
+    more = {"survey": saved and saved.survey, "force": options["force"], "limit": options["limit"]}
+    return match_sides(strip, *sides, **more, **_tolerance(options))
 
 
 def _check_thresholds(result: Comparison, options: dict) -> list[str]:
@@ -250,7 +250,7 @@ def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
 def _refuse_others(options: dict, mode: str, *allowed: str) -> None:
     """UsageError for options that have no meaning in this mode."""
     for name, value in options.items():
-        if value is not None and name not in (*allowed, "debug"):
+        if value not in (None, False) and name not in (*allowed, "debug"):
             raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with {mode}")
 
 

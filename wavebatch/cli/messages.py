@@ -46,6 +46,17 @@ class WrongUsage(click.ClickException):
         click.echo(f"error: {self.message}", file=file, err=file is None)
 
 
+class Unprinted(click.ClickException):
+    """stdout that cannot be written, such as a full disk, as one line."""
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(f"stdout: cannot be written: {error.strerror or error}")
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(f"error: {self.message}", file=file, err=file is None)
+
+
 class Interrupted(click.ClickException):
     """Ctrl-C or SIGTERM as one line and an exit code; click would say `Aborted!` and give 1."""
 
@@ -66,6 +77,10 @@ def _errors_in_one_line() -> Iterator[None]:
         if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
             raise
         raise WrongUsage(error) from error
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # of help and version: commands report their own
+        raise Unprinted(error) from error
 
 
 class NearestGroup(click.Group):
@@ -138,7 +153,7 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
     if as_json:
         print_json(document)
     else:
-        click.echo("\n".join(lines))
+        click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
 def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
@@ -171,6 +186,9 @@ def one_line(error: BaseException) -> str:
         return f"{place}{error.strerror}; check disk and permissions"
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
+    if isinstance(error, MemoryError):
+        needed = f" ({text[0].lower()}{text[1:]})" if text else ""
+        return f"not enough memory{needed}; close other programs, or use fewer --jobs or a smaller --block-size"
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
 
 
@@ -264,10 +282,12 @@ class Progress:
         elif kind == "written":
             log_file.log(printable(_summary(event, False)))
             # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
-            for line in event["doubts"]:
+            for line in (*event["serious"], *event["doubts"]):
                 self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
+        elif kind == "worker":
+            self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
             self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 

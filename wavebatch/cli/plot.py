@@ -104,6 +104,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     """The waveforms that are wanted, and the name of the chain that they were run through."""
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
+    from wavebatch.surveying.systems.saved_check import check_saved
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
     from wavebatch.tools.plots.waveform import read_views
@@ -111,6 +112,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan() as scan:
+        check_saved(reader, scan, request.system and request.system.survey, force=options["force"])
         choice = make_choice(reader, scan, chain, request)
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
@@ -119,6 +121,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
 
 @plot.command()
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", required=True, help="Extra dimension or standard field; echo_flags counts flags.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
@@ -138,7 +141,7 @@ def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any)
     """  # fmt: skip
     from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     check_picture(output, overwrite=options["overwrite"])
     selection = _select(column, options)
     how = {"log": options["log"], "overwrite": options["overwrite"]}
@@ -174,6 +177,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 @plot.command(name="map")
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
@@ -193,7 +197,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     """  # fmt: skip
     from wavebatch.tools.plots.raster import grid_values
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):

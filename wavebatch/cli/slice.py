@@ -5,6 +5,7 @@ Reads options and loops over the scan lines; cutting and searching them is in `w
 
 from __future__ import annotations
 
+import sys
 from contextlib import ExitStack
 from itertools import takewhile
 from pathlib import Path
@@ -13,22 +14,28 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, print_summary, talk
-from wavebatch.core.errors import InputError
+from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, find_crs, plan_crs
+from wavebatch.files.inputs import find_files
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools.slices.lines import read_scan_lines
-from wavebatch.tools.slices.output import SegmentWriter, draw_slice
+from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, SegmentWriter, draw_slice
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
+
+EXIT_SOME_FAILED = 1
+"""Some strips failed."""
 
 _SURVEYED = 2000
 """Waveforms from which the width of the pulse is measured: enough for 1 % of it."""
 
 
 @click.command(name="slice")
-@shared.strip_argument
-@shared.output_option("Write the segments: .csv or .geojson.", required=False)
+@shared.strips_argument
+@shared.output_option("Write the segments: .csv or .geojson; or a folder, which gets STEM.csv for each strip.",
+                      "FILE|DIR", required=False, folder=None)
 @shared.output_option("Draw the first slice of --lines.", "FILE", "--png", required=False)
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
@@ -40,11 +47,18 @@ _SURVEYED = 2000
               help="Standard deviation of the pulse [ns].  [default: surveyed from the strip]")
 @click.option("--shortest", default=20.0, show_default=True, metavar="PIXELS",
               help="Least length of a segment [pixels of one sample].")
+@click.option("--geojson-crs", type=click.Choice(GEOJSON_CRS), default="wgs84", show_default=True,
+              help="Coordinates of a .geojson: longitude and latitude (needs pyproj), or those of the strip with its "
+              "CRS, which GDAL and QGIS read.")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
 @shared.direction_option
 @shared.common_options("overwrite", "json", "quiet")
-def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png: Path | None, **options: Any) -> None:
-    """Find the straight surface lines in the scan lines of STRIP.
+def slice_(
+    strips: tuple[str, ...], output: Path | None, lines: tuple[int, int | None], png: Path | None, **options: Any
+) -> None:
+    """Find the straight surface lines in the scan lines of each STRIP.
+
+    STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line.
 
     A slice shows the waveforms of one scan line side by side. A new line starts where the scan angle turns or jumps
     back, or after a pause. With plane slices a line that bends, as at the ridge of a roof, is two segments.
@@ -60,23 +74,45 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
       theta, rho         normal form of the line in the slice [degrees, pixels]
       weight             sum of its samples [DN]
 
-    Exit code: 0 done, 1 the strip cannot be read or the output cannot be written, 2 wrong usage.
+    Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
     if output is None and png is None:
         raise click.UsageError("give -o for the segments, --png for a picture, or both")
     if png:
         refuse_existing(png, options["overwrite"])
+    paths = find_files(strips, recursive=options["recursive"])
+    if png and len(paths) > 1:
+        raise ConfigError(f"{png}: one picture for {len(paths)} strips; draw them one by one")
+    targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
+    found, failed = shared.for_each(
+        paths, lambda strip: _slice(strip, targets.get(strip), lines, png, options), debug=options["debug"]
+    )
+    if options["as_json"]:
+        print_json(found[0] if len(paths) == 1 else found)
+    sys.exit(EXIT_SOME_FAILED if failed else 0)
+
+
+def _slice(
+    strip: Path, output: Path | None, lines: tuple[int, int | None], png: Path | None, options: dict[str, Any]
+) -> dict[str, Any]:
+    """Work on one strip; returns its counts and says them."""
     with StripReader(strip, direction=options["direction"]) as reader:
+        crs = None
+        if output is not None and output.suffix.lower() == ".geojson":
+            known = find_crs(reader.facts.crs, reader.facts.header.vlrs)
+            crs = plan_crs(strip, known, options["geojson_crs"])
         scan = reader.scan()
         sigma = options["sigma"]
         if sigma is None:
             sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
         settings = shared.from_options(SliceOptions, options, sigma=sigma)
-        counts = _find(reader, scan, settings, output, lines, png, options["overwrite"])
+        counts = _find(reader, scan, settings, output, lines, png, crs, options["overwrite"])
     if not counts["lines"]:
         talk(f"{strip}: has no scan line with a number in --lines")
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
-    print_summary(options, counts, [f"{strip}: {found} of {count(counts['pulses'], 'pulse')}"])
+    if not options["quiet"]:
+        talk(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
+    return {"strip": str(strip), **counts}
 
 
 def _find(
@@ -86,6 +122,7 @@ def _find(
     output: Path | None,
     lines: tuple[int, int | None],
     png: Path | None,
+    crs: GeoJsonCrs | None,
     overwrite: bool,
 ) -> dict[str, Any]:
     """Writes the segments of the wanted lines; returns their counts."""
@@ -94,7 +131,7 @@ def _find(
     with ExitStack() as stack:
         writer = None
         if output:
-            writer = stack.enter_context(SegmentWriter(output, crs=reader.facts.crs, overwrite=overwrite))
+            writer = stack.enter_context(SegmentWriter(output, crs=crs, overwrite=overwrite))
         for line in takewhile(lambda one: end is None or one.number < end, read_scan_lines(reader, scan)):
             if line.number < first:
                 continue

@@ -82,9 +82,11 @@ def _number(path: Path) -> set[tuple[int, int]]:
 
 def _packet_files(path: Path) -> list[Path]:
     """The files in which the packets of a strip may be; none for other files and for strips with their own packets."""
-    if path.suffix.lower() not in (".las", ".laz"):
+    if path.suffix.lower() not in (".las", ".laz") or not os.path.isfile(path):  # a pipe would block for ever
         return []
     try:
+        if not path.is_file():  # opening a pipe waits for ever
+            return []
         with open(path, "rb") as file:
             head = file.read(_FORMAT_BYTE + 1)
     except (OSError, ValueError):

@@ -16,7 +16,6 @@ from pathlib import Path
 
 from wavebatch.files.las.epsg_units import find_unit
 from wavebatch.files.las.header import EVLR_HEADER_SIZE, GEOTIFF_ID, WKT_ID, LasHeader, find_evlrs, is_projection
-from wavebatch.files.strip.packets import MAX_EVLRS
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
@@ -127,7 +126,7 @@ def read_crs_definition(path: Path, header: LasHeader) -> str | None:
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
-    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
+    evlrs, _ = find_evlrs(path, header)
     for evlr in evlrs:
         new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= _MAX_RECORD:

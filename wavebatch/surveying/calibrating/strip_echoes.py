@@ -25,6 +25,7 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.systems.saved_check import check_saved
 
 SCANNERS = 4
 """Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
@@ -114,6 +115,7 @@ def open_source(
         source = find_sensor(reader, scan, sensor)
         if source.kind == "none":
             raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
+        check_saved(reader, scan, request.system and request.system.survey, force=request.force)
         choice = make_choice(reader, scan, chain or widest_chain(), request)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)

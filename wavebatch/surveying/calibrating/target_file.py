@@ -68,7 +68,10 @@ def load_targets(path: Path | str) -> list[Target]:
     """
     text = read_text(path, "target file", 1 << 30)
     lines = io.StringIO(text, newline=None)
-    rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+    try:
+        rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise ConfigError(f"{path}: target file is neither GeoJSON nor CSV ({error})") from error
     targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
@@ -94,8 +97,9 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
             corners = np.array(str(fields["vertices"]).split(), np.float64).reshape(-1, 2)
         else:
             angle = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
-            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1) * float(fields["radius"])
-            corners = circle + [float(fields["x"]), float(fields["y"])]
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):
+                corners = float(fields["radius"]) * circle + [float(fields["x"]), float(fields["y"])]
     except KeyError as error:
         raise ConfigError(
             f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"

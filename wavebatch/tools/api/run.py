@@ -37,6 +37,7 @@ def run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -46,6 +47,9 @@ def run(
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
     point_format: int | None = None,
+    las_version: Literal["1.4", "1.3", "keep"] = "1.4",
+    no_data: Literal["-9999", "nan"] = "-9999",
+    strict: bool = False,
     names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = "wavebatch",
     keep_packets: bool = False,
     direction: Literal["auto", "toward", "away"] = "auto",
@@ -56,6 +60,7 @@ def run(
     block_size: int | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    recursive: bool = False,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
@@ -74,7 +79,10 @@ def run(
     tolerance : float, optional
         Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
     system : Survey, path or str, optional
-        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip.
+        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip. A strip whose
+        samples contradict it fails.
+    force : bool
+        Use the survey of `system` also for strips that contradict it.
     survey : {"each", "flight"}
         Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
         again by later runs into it. A strip that does not fit it gets one of its own.
@@ -89,13 +97,20 @@ def run(
         Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
         text file with columns time and energy.
     columns : str, optional
-        "a,b" writes these columns only, "+a,+b" adds them to the usual ones; a shipped chain gets their stages.
+        "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
+        them.
     points : {"echoes", "returns"}
         One point per echo found, or the points of the input with new columns.
     format : {"laz", "las"}
         Of the clouds.
     point_format : int, optional
-        LAS point format of the clouds; default: that of the strip without waveforms.
+        LAS point format of the clouds; default: 6, or 7 or 8 where the strip has colours.
+    las_version : {"1.4", "1.3", "keep"}
+        LAS version of the clouds; "keep": that of the strip, with its point format.
+    no_data : {"-9999", "nan"}
+        What floating-point columns hold where an echo has no value.
+    strict : bool
+        Fail where extra bytes of a strip have no free value to mark added echoes.
     names : {"wavebatch", "asprs", "riegl", "pdal", "opals"}
         Names and units of the extra bytes.
     keep_packets : bool
@@ -116,6 +131,8 @@ def run(
         Replace existing outputs.
     resume : bool
         Keep outputs that are complete and up to date, make all others again.
+    recursive : bool
+        Take the strips in subfolders of folders too.
     on_event : callable, optional
         Called with a dictionary when a strip starts, advances, is written, skipped or fails.
 
@@ -130,11 +147,11 @@ def run(
         For wrong options, before anything starts.
     """
     plan = plan_run(
-        strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
+        strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
         calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, columns=columns, points=points,
-        format=format, point_format=point_format, names=names, keep_packets=keep_packets, direction=direction,
-        headerless=headerless, jobs=jobs, scheduler=scheduler, memory=memory, block_size=block_size,
-        overwrite=overwrite, resume=resume,
+        format=format, point_format=point_format, las_version=las_version, no_data=no_data, strict=strict, names=names,
+        keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
+        memory=memory, block_size=block_size, overwrite=overwrite, resume=resume, recursive=recursive,
     )  # fmt: skip
     return run_batch(*plan, on_event)
 
@@ -146,6 +163,7 @@ def plan_run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -158,17 +176,18 @@ def plan_run(
     block_size: int | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    recursive: bool = False,
     **output: Any,
 ) -> tuple[list[StripJob], BatchOptions]:
     """Check the options of `run` and turn them into jobs; nothing is started or written.
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
+    strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
         As for `run`.
     scheduler, memory
         As for `run`.
-    block_size, overwrite, resume
+    block_size, overwrite, resume, recursive
         As for `run`.
     **output
         The remaining ones: fields of RunOptions.
@@ -185,7 +204,12 @@ def plan_run(
     ConfigError
         For whatever is wrong with the options.
     """
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")
     found, request = find_request(chain, tolerance=tolerance, system=system)
+    if force and system is None:
+        raise ConfigError("--force is of no use without --system; leave it out")
+    request = replace(request, force=force)
     if survey == "flight":
         if system is not None:
             raise ConfigError("--system and --survey flight exclude each other; give one of them")
@@ -200,7 +224,7 @@ def plan_run(
         found = template.extend(found)
     _check_use(found, sensor, known, air, pulse_energy)
     options = RunOptions(columns=choose_columns(found, columns), **output)
-    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
+    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips), recursive=recursive)
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
     batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
     plan = [replace(template, path=path, chain=found, options=options) for path in paths]
@@ -256,7 +280,9 @@ def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
 
 
 def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, energy: Any) -> None:
-    """Raise ConfigError for files that the chain would ignore."""
+    """Raise ConfigError for files that the chain, or another option, would ignore."""
+    if sensor.trajectory is not None and sensor.height is not None:
+        raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
              "--attenuation": air, "--pulse-energy": energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)

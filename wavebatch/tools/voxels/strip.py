@@ -29,6 +29,7 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import Request, make_choice
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.gap import SAMPLED, find_rule
@@ -128,6 +129,7 @@ def voxelize_strip(
     options: VoxelOptions,
     *,
     system: SavedSurvey | None = None,
+    force: bool = False,
     calibration: Calibration | None = None,
     sensor: SensorRequest | None = None,
     direction: str = "auto",
@@ -140,10 +142,10 @@ def voxelize_strip(
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
-    system: a saved survey, instead of a survey of this strip. calibration: for cross sections; it or the survey must
-    have the divergence of the beam. profiles: an .npz for those of single pulses. progress: called with the number of
-    waveforms done since the last call, and the total. block_size, held: waveforms at a time, and sums in memory; the
-    output does not depend on them.
+    system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
+    for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
+    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held:
+    waveforms at a time, and sums in memory; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
@@ -152,6 +154,7 @@ def voxelize_strip(
     if profiles is not None and Path(profiles).absolute() == target.absolute():
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+        check_saved(reader, scan, system and system.survey, force=force)
         source = _seek_sensor(reader, scan) if calibration is None else _find_sensor(reader, scan, sensor)
         pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
         middle = _find_middle(reader, scan, options)
