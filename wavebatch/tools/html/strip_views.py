@@ -34,6 +34,8 @@ class Views:
     """Waveforms of a strip with the result of its chain."""
 
     searched: int
+    total: int
+    """Waveforms of the strip."""
     random: tuple[WaveformView, ...]
     worst: tuple[tuple[WaveformView, float], ...]
     """With the root mean square of their residual in standard deviations of the noise, the largest first."""
@@ -49,6 +51,7 @@ def read_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, 
     worst: list[tuple[float, WaveformView]] = []
     searched = 0
     with StripReader(path, **reading) as reader, reader.scan() as scan:
+        total = scan.packets
         for block in reader.sample_blocks(scan, min(SEARCHED, sample_size(reader, scan))):
             searched += len(block)
             residual = measure_residuals(block, chain, system)
@@ -57,7 +60,7 @@ def read_views(path: Path, chain: Chain, system: SystemPulse, *, seed: int = 0, 
             drawn = _keep(drawn, block, chain, system, order, SHOWN_RANDOM)
             worst = _keep(worst, block, chain, system, -residual, SHOWN_WORST)
     bad = tuple((view, -key) for key, view in worst if np.isfinite(key))
-    return Views(searched, tuple(sorted((view for _, view in drawn), key=lambda view: view.point)), bad)
+    return Views(searched, total, tuple(sorted((view for _, view in drawn), key=lambda view: view.point)), bad)
 
 
 def _keep(
@@ -102,14 +105,18 @@ def draw_views(views: Views, chain: str, level: int = 3) -> str:
         "Grey: samples and noise; line: fit; dots: echoes; dashed: returns of the input. `wavebatch plot waveform "
         "--point N` draws one of them large."
     )
-    head = f"Drawn at random from {views.searched:,} waveforms that are spread over the strip. Chain: {chain}."
+    whole = f"all {views.searched:,} waveforms"
+    part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
+    head = f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {chain}."
     sheet = figures([draw_waveform(view) for view in views.random], "sheet")
     parts = [section("Random waveforms", paragraph(head), paragraph(legend, "soft"), sheet, level=level)]
     if views.worst:
         words = (
             f"The largest residuals among these {views.searched:,} waveforms, as root mean square in standard "
-            "deviations of the noise (1 is noise alone). Other waveforms of the strip were not searched."
+            "deviations of the noise (1 is noise alone)."
         )
+        if views.searched < views.total:
+            words += f" The other {views.total - views.searched:,} waveforms of the strip were not searched."
         worst = [draw_waveform(view, f"residual {rms:.2f}") for view, rms in views.worst]
         parts.append(section("Worst fits", paragraph(words), figures(worst, "sheet"), level=level))
     return "\n".join(parts)

@@ -25,6 +25,9 @@ SHOWN_SHARE = 0.001
 
 MOST_BARS = 60
 
+FINEST = 160
+"""Points of a fitted curve, about."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudMap:
@@ -83,6 +86,9 @@ def draw_waveform(view: WaveformView, note: str = "") -> str:
     inside = (view.time >= near[0]) & (view.time <= near[1])
     shown = view.samples[inside]
     curve = np.full(len(view.fine), np.nan) if view.fit is None else view.fit
+    # A small picture shows no more points than this: all of them would be most of the page.
+    drawn = np.flatnonzero((view.fine >= near[0]) & (view.fine <= near[1]))
+    drawn = drawn[:: max(1, len(drawn) // FINEST)]
     highest = [float(np.nanmax(values, initial=-np.inf)) for values in (shown, curve)]
     top = max(view.baseline + 6 * view.std, *highest)
     low = min(view.baseline - 3 * view.std, float(np.nanmin(shown, initial=np.inf)))
@@ -94,9 +100,9 @@ def draw_waveform(view: WaveformView, note: str = "") -> str:
     chart.line(view.time[inside], shown, "x", kind="thin")
     chart.points(view.time[inside], shown, "x", radius=1.5)
     for one in view.curves if len(view.curves) > 1 else ():
-        chart.line(view.fine, view.fine_level + one, 3, kind="thin")
+        chart.line(view.fine[drawn], (view.fine_level + one)[drawn], 3, kind="thin")
     if view.fit is not None:
-        chart.line(view.fine, curve, 1)
+        chart.line(view.fine[drawn], curve[drawn], 1)
     peaks = view.baseline + view.echoes.amplitude.astype(np.float64)
     chart.points(view.echoes.time, peaks, 1, radius=3.5, names=[_describe_echo(view, k) for k in range(len(peaks))])
     words = [f"{len(peaks)} {'echo' if len(peaks) == 1 else 'echoes'}", *([note] if note else [])]
