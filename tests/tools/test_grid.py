@@ -110,6 +110,14 @@ def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, monkeypatch, 
     assert np.isfinite(raster).sum() == len(filled)
 
 
+def test_more_buckets_than_tiles_are_fine(rasterio, rng, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "HELD", 100)
+    _, _, height = _cloud(tmp_path / "a.las", rng)
+    _run(tmp_path / "a.las", "--column", "height", "--statistic", "max", "--size", 5000, "-o", tmp_path / "x.tif")
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.read(1, masked=True).max() == np.nanmax(height).astype(np.float32)
+
+
 def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_path):
     x, _, _ = _cloud(tmp_path / "a.las", rng)
     _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "--bounds", "500100,5400100,500200.5,5400150", "-o",

@@ -267,6 +267,8 @@ def _compute_tiles(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Number and values (bands, TILE, TILE) of every tile of a bucket."""
     total = sum(len(piece) for piece in entries.pieces(bucket))
+    if not total:
+        return
     if total <= HELD:
         rows = entries.read(bucket)
         rows = rows[np.argsort(rows["tile"], kind="stable")]
