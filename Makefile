@@ -4,6 +4,7 @@
 #   make papers    the tables of five papers on simulated data
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
+#   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make lint      ruff                    make clean      remove what was made
 
@@ -15,7 +16,7 @@ BENCH  := bench
 MINUTES ?= 10
 SEED   ?= 1
 
-.PHONY: demo test test-all papers bench fuzz docs lint clean
+.PHONY: demo test test-all papers bench fuzz docs man lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -72,6 +73,9 @@ fuzz: $(VENV)/.test
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site: site/index.html"
+
+man: $(VENV)/.test
+	$(BIN)/wavebatch --man-pages build/man
 
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, print_result, row, talk
-from wavebatch.cli.options import common_options, file_option, read_system, system_option
+from wavebatch.cli.options import check_html, common_options, file_option, html_option, read_system, system_option
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @click.option("--max-median", **_TIME, help="Largest absolute median of the time differences [ns].")
 @click.option("--max-rmse", **_TIME, help="Largest root mean square of the time differences [ns].")
 @click.option("--max-nmad", **_TIME, help="Largest robust spread of the time differences [ns].")
+@html_option
 @common_options("json", failure=2)
 def compare(
     a: Path,
@@ -61,6 +62,7 @@ def compare(
     truth: Path | None,
     angles: bool,
     overlap: bool,
+    html_file: Path | None,
     as_json: bool,
     **options: Any,
 ) -> None:
@@ -81,22 +83,35 @@ def compare(
 
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
     """  # fmt: skip
+    check_html(html_file)
     if overlap:
         found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
         print_result(as_json, found, _list_overlap(found))
+        _write_page(html_file, found, [])
         return
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
         print_result(as_json, agreement, _list_angles(agreement))
+        _write_page(html_file, agreement, [])
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
     print_result(as_json, result.to_json(), [*_list_lines(between), *(_list_match(result) if strip else [])])
     broken = _check_thresholds(between, options)
+    _write_page(html_file, result, broken)
     for line in broken:
         talk(line)
     if broken:
         sys.exit(EXIT_VIOLATED)
+
+
+def _write_page(target: Path | None, result: Any, broken: list[str]) -> None:
+    """The page of --html."""
+    if target is not None:
+        from wavebatch.tools.html.compare_page import write_compare_page
+
+        write_compare_page(target, result, broken)
+        talk(f"{target}: written")
 
 
 def _tolerance(options: dict) -> dict[str, float]:

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, one_line, print_result, talk
-from wavebatch.cli.options import common_options, output_option, strip_options, strips_argument
+from wavebatch.cli.options import (
+    check_html,
+    common_options,
+    html_option,
+    output_option,
+    strip_options,
+    strips_argument,
+)
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
@@ -35,11 +42,13 @@ EXIT_PROBLEMS = 1
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]: adds whether echo widths can give "
               "incidence angles; saved in SYSTEM.toml.")
+@html_option
 @strip_options
 @common_options("overwrite", "json")
 def survey(
-    strips: tuple[str, ...], output: Path | None, chain_file: Path | None, as_json: bool, **options: Any
-) -> None:
+    strips: tuple[str, ...], output: Path | None, chain_file: Path | None, html_file: Path | None, as_json: bool,
+    **options: Any,
+) -> None:  # fmt: skip
     """Measure noise, pulse and scene of strips, and choose the chain that they need.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Several strips
@@ -63,13 +72,22 @@ def survey(
     for target in (output, chain_file):
         if target is not None:
             check_target(target, overwrite=overwrite)
+    check_html(html_file)
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
-    print_result(as_json, _document(saved, facts), _lines(saved, facts))
-    for target in (output, chain_file):
+    document = _document(saved, facts)
+    if html_file is not None:
+        from wavebatch.tools.html.survey_page import write_survey_page
+
+        reading = {name: options[name] for name in ("direction", "headerless")}
+        failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
+        used = [path for path in paths if str(path) not in failed]
+        write_survey_page(html_file, saved.survey, document, used, **reading)
+    print_result(as_json, document, _lines(saved, facts))
+    for target in (output, chain_file, html_file):
         if target is not None:
             talk(f"{target}: written")
     if facts.get("misfits") or facts.get("failed"):
