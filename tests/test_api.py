@@ -260,7 +260,8 @@ def test_read_cloud_gives_every_column_by_name(clouds):
     np.testing.assert_array_equal(cloud["x"], np.asarray(points.x))
     for name in points.point_format.standard_dimension_names:
         if name not in ("X", "Y", "Z"):
-            np.testing.assert_array_equal(cloud[name], np.asarray(points[name]))
+            unit = 0.006 if name == "scan_angle" else 1  # counts of 0.006 degrees
+            np.testing.assert_array_equal(cloud[name], np.asarray(points[name]) * unit)
     for name in points.point_format.extra_dimension_names:
         assert name in COLUMNS
         stored = np.asarray(points[name])
@@ -286,6 +287,9 @@ def test_columns_have_our_names_whatever_they_were_written_as(strips, clouds, tm
 def test_read_cloud_reads_only_what_is_asked_for(clouds):
     cloud = wb.read_cloud(clouds[0] / "urban.laz", ["z", "echo_width", "scan_angle_rank"])
     assert cloud.dtype.names == ("z", "echo_width", "scan_angle_rank")
+    np.testing.assert_array_equal(
+        cloud["scan_angle_rank"], wb.read_cloud(clouds[0] / "urban.laz", ["scan_angle"])["scan_angle"]
+    )
     with pytest.raises(wb.ConfigError, match="has no column 'echo_wdth'; did you mean 'echo_width'"):
         wb.read_cloud(clouds[0] / "urban.laz", ["echo_wdth"])
     with pytest.raises(wb.InputError, match="nothing.laz"):

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from struct import pack
 
 import laspy
 import numpy as np
@@ -24,11 +25,15 @@ from writer_tools import (
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.column_names import STYLES
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las import laz_encode
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import Vlr, find_evlrs, read_header
+from wavebatch.files.las.header import Vlr, build_wkt, find_evlrs, read_header
+from wavebatch.tools.api.cloud import read_cloud
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"
 LEICA = "leica-als/simple1_3_full_internal.las"
@@ -37,6 +42,10 @@ VERSION_1_5 = "no-packets/pdrf9-1.5.laz"
 COLUMNS = ["amplitude", "echo_width", "range", "echo_flags"]
 NOT_KEPT = (("LASF_Spec", 4), "laszip encoded", "wavebatch")
 VERSIONS = {4: (1, 3), 5: (1, 3), 9: (1, 4), 10: (1, 4)}
+UTM_KEYS, OTHER_KEYS = (
+    Vlr(b"LASF_Projection", 34735, pack("<12H", 1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, code))
+    for code in (32633, 31468)
+)
 
 
 def make_rows(layout, points, seed=0):
@@ -100,13 +109,14 @@ def test_real_files_come_back_by_both_readers(tmp_path, name, suffix):
         assert read_raw(target, backend).tobytes() == rows.tobytes()
     check_truth(target, rows)
     before, after = read_header(path), read_header(target)
-    assert after.version == before.version and after.creation == before.creation
-    assert after.point_format == {4: 1, 5: 3, 9: 6, 10: 8}[before.point_format]
+    assert after.version == max(before.version, (1, 4)) and after.creation == before.creation
+    assert after.point_format == {4: 6, 5: 7, 9: 6, 10: 8}[before.point_format] and after.global_encoding & 16
     assert after.global_encoding & 0b110 == 0 and after.waveform_start == 0 and after.evlr_count == 0
     assert after.system_identifier.strip(b"\0") == b"MODIFICATION"
     assert after.generating_software.strip(b"\0") == f"wavebatch {__version__}".encode()
     kept = [v for v in payloads(path, *NOT_KEPT) if not 100 <= v.record_id <= 355]
-    assert [v.encode() for v in kept] == [v.encode() for v in payloads(target, *NOT_KEPT)]
+    added = [] if layout.wkt is None else [build_wkt(layout.wkt)]  # Leica's file has GeoTIFF keys only
+    assert [v.encode() for v in (*kept, *added)] == [v.encode() for v in payloads(target, *NOT_KEPT)]
     assert sorted(os.listdir(tmp_path)) == [target.name]
 
 
@@ -155,6 +165,99 @@ def test_the_wkt_bit_says_the_truth(tmp_path):
         assert read_header(tmp_path / f"{name}.laz").global_encoding & 16 == bit, name
 
 
+@pytest.mark.parametrize(
+    ("las_version", "records", "expected"),
+    [
+        ("1.4", "none", ((1, 4), 6, 16)),
+        ("1.4", "wkt", ((1, 4), 6, 16)),
+        ("1.4", "utm", ((1, 4), 6, 16)),
+        ("1.4", "geo", ((1, 4), 1, 0)),
+        ("1.3", "geo", ((1, 3), 1, 0)),
+        ("keep", "geo", ((1, 3), 1, 0)),
+    ],
+)
+def test_version_format_and_legacy_fields_agree(tmp_path, las_version, records, expected):
+    """Legacy counts are zero in point formats 6 to 10 (PDAL, copclib), and the WKT bit says which CRS record counts."""
+    vlrs = {"none": [], "wkt": [build_wkt("PROJCS[]")], "utm": [UTM_KEYS], "geo": [OTHER_KEYS]}[records]
+    points = write_source(tmp_path / "a.las", 4, (1, 3), vlrs=vlrs)
+    layout = plan_output(tmp_path / "a.las", COLUMNS, las_version=las_version)
+    rows = make_rows(layout, points)
+    write(layout, tmp_path / "b.laz", rows)
+    header = read_header(tmp_path / "b.laz")
+    assert (header.version, header.point_format, header.global_encoding & 16) == expected
+    legacy, modern = header.counts
+    assert legacy == (0 if header.point_format >= 6 else 200) and modern == (200 if header.version >= (1, 4) else 0)
+    assert (records == "utm") == (layout.wkt is not None)
+    with laspy.open(tmp_path / "b.laz") as reader:
+        assert set(layout.extra_fields) == set(reader.header.point_format.extra_dimension_names)
+        if records == "utm":
+            assert reader.header.vlrs.get_by_id("LASF_Projection", (2112,))[0].string.startswith(
+                'PROJCS["WGS 84 / UTM zone 33N"'
+            )
+
+
+@pytest.mark.parametrize(("point_format", "internal"), [(4, True), (5, False), (9, True)])
+def test_kept_packets_keep_their_format_in_las_1_4(tmp_path, point_format, internal):
+    version = "1.4" if point_format == 9 else "1.3"
+    write_strip(tmp_path / "a.las", point_format=point_format, version=version, internal=internal)
+    layout = plan_output(tmp_path / "a.las", COLUMNS, packets=facts_of(tmp_path / "a.las"))
+    assert (layout.version, layout.point_format) == ((1, 4), point_format)
+
+
+def test_what_las_1_3_cannot_hold_is_refused(tmp_path):
+    write_source(tmp_path / "nine.las", 9, (1, 4))
+    with pytest.raises(ConfigError, match="nine.las: --las-version 1.3 has no point format 6"):
+        plan_output(tmp_path / "nine.las", [], las_version="1.3")
+    write_source(tmp_path / "evlr.las", 4, (1, 4), evlrs=[(b"me", 7, b"x")])
+    with pytest.raises(InputError, match="evlr.las: has extended records"):
+        plan_output(tmp_path / "evlr.las", [], las_version="1.3")
+    write_source(tmp_path / "wkt.las", 4, (1, 4), vlrs=[build_wkt("PROJCS[]")])
+    with pytest.raises(InputError, match="wkt.las: its CRS is given as WKT"):
+        plan_output(tmp_path / "wkt.las", [], las_version="1.3")
+    with pytest.raises(ConfigError, match="las_version '1.2': must be one of 1.4, 1.3, keep"):
+        plan_output(tmp_path / "wkt.las", [], las_version="1.2")
+
+
+def test_columns_are_found_by_the_account_of_the_run(tmp_path):
+    """Vendors use the names of every style: only the account says which column is wavebatch's."""
+    records = [ExtraRecord.build("Pulse width", "u2", "[ns]", scale=0.1), ExtraRecord.build("Reflectance", "f4", "dB")]
+    points = write_source(tmp_path / "a.las", 9, (1, 4), records=records)
+    values = {"echo_width": np.linspace(3.0, 9.0, 200), "reflectance": np.linspace(0.1, 0.5, 200)}
+    for style in STYLES:
+        layout = plan_output(tmp_path / "a.las", list(values), names=style)
+        write(layout, tmp_path / f"{style}.las", layout.rows(points, columns=values))
+        with CloudReader(tmp_path / f"{style}.las") as reader:
+            np.testing.assert_allclose(next(reader.read_pieces())["echo_width"], values["echo_width"], atol=0.051)
+        with ColumnReader(tmp_path / f"{style}.las", "reflectance") as reader:
+            found = next(reader.read_pieces())["value"]
+            in_db = reader.facts.unit == "dB"
+        expected = 10 * np.log10(values["reflectance"]) if in_db else values["reflectance"]
+        np.testing.assert_allclose(found, expected, atol=0.0051)
+        assert in_db == (style in ("riegl", "pdal"))
+        cloud = read_cloud(tmp_path / f"{style}.las")
+        np.testing.assert_allclose(cloud["echo_width"], values["echo_width"], atol=0.051)
+
+
+def test_a_vendors_column_of_our_name_does_not_hide_ours(tmp_path):
+    records = [ExtraRecord.build("amplitude", "f4", "[DN]", no_data=-9999)]
+    points = write_source(tmp_path / "a.las", 9, (1, 4), records=records)
+    layout = plan_output(tmp_path / "a.las", ["amplitude"])
+    write(layout, tmp_path / "b.las", layout.rows(points, columns={"amplitude": np.arange(200.0)}))
+    cloud = read_cloud(tmp_path / "b.las")
+    np.testing.assert_array_equal(cloud["amplitude"], np.arange(200))
+    np.testing.assert_array_equal(cloud["input_amplitude"], points["amplitude"])
+    with ColumnReader(tmp_path / "b.las", "amplitude") as reader:
+        assert reader.facts.name == "wb_amplitude"
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff", b"[1]", b'{"columns": 3}', b'{"columns": {"amplitude": ["x"]}}'])
+def test_accounts_of_any_bytes_are_no_accounts(tmp_path, payload):
+    records = [ExtraRecord.build("amplitude", "f4", "[DN]", no_data=-9999)]
+    points = write_source(tmp_path / "a.las", 6, (1, 4), records=records, vlrs=[Vlr(b"wavebatch", 1, payload)])
+    with CloudReader(tmp_path / "a.las") as reader:
+        np.testing.assert_array_equal(next(reader.read_pieces())["amplitude"], points["amplitude"])
+
+
 def test_records_are_kept_to_the_byte(tmp_path):
     vlrs = [
         Vlr(b"LASF_Spec", 100, bytes(26), b"descriptor"),
@@ -189,7 +292,7 @@ def test_extra_bytes_records_stay_where_they_were(tmp_path):
     assert (first.record_id, first.description.strip(b"\0"), first.reserved) == (4, b"MAKER", 7)
     with laspy.open(tmp_path / "out.las") as reader:
         names = list(reader.header.point_format.extra_dimension_names)
-    assert names == ["Amplitude", "wb amplitude", "echo_width", "range", "echo_flags"]
+    assert names == ["Amplitude", "wb_amplitude", "echo_width", "range", "echo_flags"]
 
 
 def test_extended_records_are_copied_and_what_is_not_is_said(tmp_path):
@@ -548,10 +651,10 @@ def test_nothing_waits_in_a_buffer_that_a_forked_worker_would_write_again(tmp_pa
 
 def test_more_points_than_an_old_header_counts(tmp_path):
     points = write_source(tmp_path / "a.las", 4, (1, 3))
-    layout = plan_output(tmp_path / "a.las", [])
+    layout = plan_output(tmp_path / "a.las", [], las_version="1.3")
     with CloudWriter(layout, tmp_path / "out.las", provenance={}) as cloud:
         cloud._statistics.count = 2**32 - 100
-        with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; use --point-format 6"):
+        with pytest.raises(InputError, match="LAS 1.3 holds at most 4294967295 points; use --las-version 1.4"):
             cloud.write(layout.rows(points))
 
 

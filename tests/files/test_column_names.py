@@ -5,7 +5,7 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.cloud.column_names import STYLES, describe, name_columns, normalise
+from wavebatch.files.cloud.column_names import STYLES, describe, describe_roundings, name_columns, normalise
 
 ALL = tuple(COLUMNS)
 WRITTEN = tuple(name for name, column in COLUMNS.items() if column.extra_bytes)
@@ -35,20 +35,53 @@ def test_styles_name_columns_that_exist(style):
 @pytest.mark.parametrize("taken", ["Amplitude", "AMPLITUDE", "amplitude"])
 def test_the_inputs_name_stays_and_ours_gets_a_prefix(taken):
     (column,) = name_columns(["amplitude"], "wavebatch", [taken])
-    assert column.record.name == "wb amplitude"
+    assert column.record.name == "wb_amplitude"
 
 
 def test_collisions_with_prefixed_names_separators_and_standard_fields():
     def named(columns, style, taken):
         return [column.record.name for column in name_columns(columns, style, taken)]
 
-    assert named(["amplitude"], "wavebatch", ["Amplitude", "wb_amplitude"]) == ["wb2 amplitude"]
-    assert named(["echo_width"], "wavebatch", ["Echo Width"]) == ["wb echo_width"]
-    assert named(["echo_width"], "asprs", ["Pulse width"]) == ["wb pulse width"]
-    assert named(["echo_width"], "pdal", ["echo_width"]) == ["wb EchoWidth"]
+    assert named(["amplitude"], "wavebatch", ["Amplitude", "wb_amplitude"]) == ["wb2_amplitude"]
+    assert named(["echo_width"], "wavebatch", ["Echo Width"]) == ["wb_echo_width"]
+    assert named(["echo_width"], "asprs", ["Pulse width"]) == ["wb_pulse_width"]
+    assert named(["echo_width"], "pdal", ["echo_width"]) == ["wb_EchoWidth"]
     assert named(["amplitude", "amplitude"], "opals", []) == ["Amplitude"]
     assert named(["x", "y", "z", "range"], "wavebatch", ["X"]) == ["range"]
     assert named(["range"], "pdal", []) == ["EchoRange"]
+
+
+def test_names_with_a_prefix_are_identifiers():
+    """PDAL takes only identifiers in its expressions."""
+    for style in STYLES:
+        taken = [column.record.name for column in name_columns(list(COLUMNS), style, [])]
+        again = [column.record.name for column in name_columns(list(COLUMNS), style, taken)]
+        assert all(name.isidentifier() and name.startswith("wb_") for name in again), again
+
+
+def test_no_data_of_floating_point_columns_can_be_nan():
+    plain, nan = (
+        {column.column: column.record for column in name_columns(list(COLUMNS), "asprs", [], no_data)}
+        for no_data in ("-9999", "nan")
+    )
+    for name, record in plain.items():
+        if record.dtype.kind == "f":
+            assert record.no_data[0] == -9999 and np.isnan(nan[name].no_data[0]), name
+        else:
+            assert record == nan[name]
+    with pytest.raises(ConfigError, match="no_data '0': must be one of -9999, nan"):
+        name_columns(["amplitude"], "wavebatch", [], "0")
+
+
+def test_styles_that_round_say_so_with_step_and_limits():
+    (line,) = describe_roundings(name_columns(list(COLUMNS), "asprs", []))
+    assert line.startswith("echo_width: written as 'pulse width', rounded to 0.1 ns and kept within 0 to 6553.5 ns")
+    assert [line.split(":")[0] for line in describe_roundings(name_columns(list(COLUMNS), "riegl", []))] == [
+        "echo_width",
+        "reflectance",
+    ]
+    for style in ("wavebatch", "pdal", "opals"):
+        assert describe_roundings(name_columns(list(COLUMNS), style, [])) == []
 
 
 def test_unknown_names_are_one_line():

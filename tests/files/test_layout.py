@@ -32,8 +32,9 @@ def plain(rows, point_format):
 @pytest.mark.parametrize(("point_format", "family"), [(4, 1), (5, 3), (9, 6), (10, 8)])
 def test_the_family_is_kept_with_every_field(tmp_path, point_format, family):
     points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format])
-    layout = plan_output(tmp_path / "a.las", [])
+    layout = plan_output(tmp_path / "a.las", [], las_version="keep")
     assert (layout.point_format, layout.version) == (family, VERSIONS[point_format])
+    assert layout.notes == ()
     rows = layout.rows(points)
     before, after = fields_of(points, point_format), fields_of(rows, family)
     assert not set(after) - set(before)
@@ -48,7 +49,7 @@ def test_promotion_keeps_every_field(tmp_path, old, new):
     points = write_source(tmp_path / "a.las", old, VERSIONS.get(old, (1, 3)), vlrs=[WKT])
     points["bit_fields"] = np.arange(200)
     layout = plan_output(tmp_path / "a.las", ["amplitude"], point_format=new)
-    assert layout.version == ((1, 4) if new >= 6 else (1, 3))
+    assert layout.version == (1, 4)
     rows = plain(layout.rows(points), new)
     before, after = fields_of(points, old), fields_of(rows, new)
     for name in set(after) & set(before) - {"overlap"}:
@@ -85,11 +86,14 @@ def test_points_are_echoes_or_returns(tmp_path):
 def test_geotiff_cannot_be_promoted_but_wkt_can(tmp_path):
     for name, vlrs in (("geo", [GEOTIFF]), ("both", [GEOTIFF, WKT]), ("none", [])):
         write_source(tmp_path / f"{name}.las", 4, (1, 3), vlrs=vlrs)
-    with pytest.raises(InputError, match="geo.las: its CRS is given by GeoTIFF keys only, point format 6 needs WKT"):
+    with pytest.raises(InputError, match="geo.las: its CRS is given by GeoTIFF keys only, point formats 6 to 10 need"):
         plan_output(tmp_path / "geo.las", [], point_format=6)
-    assert plan_output(tmp_path / "geo.las", []).point_format == 1
-    assert plan_output(tmp_path / "both.las", [], point_format=6).point_format == 6
-    assert plan_output(tmp_path / "none.las", [], point_format=6).point_format == 6
+    old = plan_output(tmp_path / "geo.las", [])
+    assert (old.version, old.point_format) == ((1, 4), 1) and "--point-format 6 tries" in old.notes[0]
+    for name in ("both", "none"):
+        for wanted in (None, 6):
+            layout = plan_output(tmp_path / f"{name}.las", [], point_format=wanted)
+            assert (layout.version, layout.point_format, layout.notes) == ((1, 4), 6, ())
 
 
 def test_coordinates_are_rounded_kept_or_refused(tmp_path):
@@ -113,7 +117,7 @@ def test_coordinates_are_rounded_kept_or_refused(tmp_path):
 @pytest.mark.parametrize(("point_format", "limit"), [(4, 7), (9, 15)])
 def test_return_numbers_are_cut_to_what_the_format_holds(tmp_path, point_format, limit):
     points = write_source(tmp_path / "a.las", point_format, VERSIONS[point_format], n=20)
-    layout = plan_output(tmp_path / "a.las", [])
+    layout = plan_output(tmp_path / "a.las", [], las_version="keep")
     assert layout.max_return == limit
     rows = layout.rows(points, return_number=np.arange(1, 21), number_of_returns=np.full(20, 20))
     after, before = (fields_of(r, f) for r, f in ((rows, layout.point_format), (points, point_format)))
@@ -157,33 +161,42 @@ def write_several(path):
 def test_returns_keep_all_extra_bytes_exactly(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
-    assert layout.dropped == {} and layout.written[0].record.name == "wb amplitude"
-    assert layout.extra_fields == (*points.dtype.names[-6:], "wb amplitude")
+    assert layout.copied == () and layout.written[0].record.name == "wb_amplitude"
+    assert layout.extra_fields == (*points.dtype.names[-6:], "wb_amplitude")
     rows = layout.rows(points, matched=np.zeros(6, bool))
     for name in points.dtype.names[-6:]:
         assert rows[name].tobytes() == points[name].tobytes(), name
     assert [(r.name, r.code) for r in layout.extra_records[:-1]] == [(r.name, r.code) for r in SEVERAL]
 
 
-def test_echoes_carry_extra_bytes_to_matched_rows_only(tmp_path):
+def test_echoes_carry_every_extra_byte_and_mark_added_rows_where_a_value_is_free(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"])
-    assert set(layout.dropped) == {"bare", "ExtraBytes"}
-    assert all("no value is free" in reason for reason in layout.dropped.values())
-    assert layout.extra_fields == ("Amplitude", "real", "declared", "normal", "wb amplitude")
+    assert layout.copied == ("bare", "ExtraBytes")
+    assert layout.extra_fields == (*points.dtype.names[-6:], "wb_amplitude")
     matched = np.array([True, False, True, True, False, True])
     rows = layout.rows(points, matched=matched)
     for name, record in zip(layout.extra_fields[:-1], layout.extra_records, strict=False):
         assert rows[name][matched].tobytes() == points[name][matched].tobytes(), name
+        if name in layout.copied:
+            assert rows[name].tobytes() == points[name].tobytes() and record.no_data is None, name
+            continue
         expected = np.broadcast_to(record.no_data.reshape(record.dtype.shape), rows[name][~matched].shape)
         np.testing.assert_array_equal(rows[name][~matched], expected, name)
     assert layout.rows(points)["real"].tobytes() == points["real"].tobytes()
 
 
+def test_strict_refuses_what_cannot_be_marked(tmp_path):
+    write_several(tmp_path / "a.las")
+    with pytest.raises(InputError, match="a.las: --strict: no value is free .* bare, ExtraBytes; leave --strict out"):
+        plan_output(tmp_path / "a.las", ["amplitude"], strict=True)
+    assert plan_output(tmp_path / "a.las", ["amplitude"], strict=True, points="returns").copied == ()
+
+
 def test_our_own_output_can_be_an_input(tmp_path):
     write_source(tmp_path / "a.las", 6, (1, 4), records=[ExtraRecord.build("amplitude", "f4", "[DN]", no_data=-9999)])
     layout = plan_output(tmp_path / "a.las", ["amplitude"])
-    assert layout.extra_fields == ("amplitude", "wb amplitude")
+    assert layout.extra_fields == ("amplitude", "wb_amplitude")
 
 
 def test_a_layout_survives_pickling_and_does_not_depend_on_blocks(tmp_path):
@@ -237,8 +250,8 @@ def test_real_vendor_file(tmp_path):
     path = data_file(RIEGL)
     points = read_raw(path)
     layout = plan_output(path, ["amplitude", "echo_width"], names="riegl")
-    assert [column.record.name for column in layout.written] == ["wb amplitude", "wb Pulse width"]
-    assert layout.dropped == {} and layout.extra_fields[:2] == ("Amplitude", "Pulse width")
+    assert [column.record.name for column in layout.written] == ["wb_amplitude", "wb_Pulse_width"]
+    assert layout.copied == () and layout.extra_fields[:2] == ("Amplitude", "Pulse width")
     for record, name in zip(layout.extra_records, ("Amplitude", "Pulse width"), strict=False):
         assert int(record.no_data[0]) not in points[name]
     rows = layout.rows(points)

@@ -1,16 +1,21 @@
 """What strips are run with: chosen by their survey, by a tolerance or from a file, and what reports say of it."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 from batch_tools import read_cloud
 from click.testing import CliRunner
+from helpers_scenes import make_scene
 
 from wavebatch.cli import main
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain_file import parse_chain
-from wavebatch.surveying.choose_chain import Request, make_choice, widest
-from wavebatch.tools.simulate import simulate_strip
+from wavebatch.surveying.choose_chain import COSTS, Request, make_choice, widest
+from wavebatch.tools.simulate import find_pulse, simulate_strip
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def _run(*arguments):
@@ -162,6 +167,51 @@ def test_a_dry_run_says_that_the_strip_decides(strips, tmp_path):
     result = _run(strips, "-o", tmp_path, "--dry-run")
     assert result.exit_code == 0 and "chosen per strip (auto)" in result.stdout
     assert "decompose.adaptive" in result.stdout and list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def ringing(tmp_path_factory):
+    """A flat strip whose pulse has after-pulses, and its saved survey."""
+    folder = tmp_path_factory.mktemp("ringing")
+    scene = make_scene("flat", pulse=find_pulse("riegl"), n_samples=100)
+    simulate_strip(scene, folder / "ringing.las", pulses=3000, seed=4)
+    arguments = ["survey", str(folder / "ringing.las"), "-o", str(folder / "SYSTEM.toml")]
+    assert CliRunner().invoke(main, arguments).exit_code == 0
+    return folder
+
+
+@pytest.mark.parametrize("options", [["--profile", "fast"], ["--chain", EXAMPLES / "urban.toml"]])
+@pytest.mark.parametrize("saved", [False, True])
+def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_counted(ringing, tmp_path, options, saved):
+    options = [*options, *(["--system", ringing / "SYSTEM.toml"] if saved else [])]
+    result = _run(ringing / "ringing.las", "-o", tmp_path, "-q", *options)
+    assert result.exit_code == 0
+    report = _report(tmp_path, "ringing")
+    (line,) = result.stderr.splitlines()
+    assert line.endswith(f"warning: {report['warnings'][0]}")
+    found = re.search(r"pulse, .* about (\d+) of its (\d+) echoes are false .* use --profile auto", line)
+    assert int(found[2]) == report["counts"]["echoes"]
+    false = report["choice"]["predictions"][0]["false_share"]
+    assert false > 0.1 and int(found[1]) == round(false * int(found[2]))
+    assert report["choice"]["by"] == "user"
+
+
+@pytest.mark.parametrize(
+    "options", [["--profile", "accurate"], ["--profile", "auto"], ["--chain", EXAMPLES / "forest.toml"]]
+)
+def test_chains_that_fit_the_pulse_are_not_doubted(ringing, tmp_path, options):
+    result = _run(ringing / "ringing.las", "-o", tmp_path, "-q", *options)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "predictions" not in _report(tmp_path, "ringing")["choice"]
+
+
+def test_a_tolerance_leaves_out_chains_that_do_not_fit_the_pulse(ringing, tmp_path):
+    assert _run(ringing / "ringing.las", "-o", tmp_path, "-q", "--tolerance", "10m").exit_code == 0
+    choice = _report(tmp_path, "ringing")["choice"]
+    assert choice["chain"] == "profile accurate"
+    assert [one["chain"] for one in choice["predictions"] if one["range_error_m"] <= 10] == list(COSTS)
+    result = _run(ringing / "ringing.las", "-o", tmp_path / "b", "--tolerance", "0.1mm")
+    assert result.exit_code == 2 and re.search(r"fast [\d.]+ m \(\d+ % of its echoes would be false\)", result.stderr)
 
 
 def test_a_choice_travels_between_processes(strips):

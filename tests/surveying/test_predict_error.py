@@ -13,7 +13,7 @@ from wavebatch.stages.chain_file import list_profiles, load_profile
 from wavebatch.stages.score import score
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.choose_chain import COSTS
-from wavebatch.surveying.predict_error import Prediction, predict_errors, simulate_again
+from wavebatch.surveying.predict_error import Prediction, leave_out_false, predict_errors, simulate_again
 from wavebatch.tools.simulate import find_pulse, known_system
 
 CHAINS = {name: load_profile(name) for name in COSTS}
@@ -52,6 +52,21 @@ def test_the_bound_and_a_perfect_chain_agree_on_flat_ground():
     assert accurate.name == "accurate" and accurate.factor == pytest.approx(1.0, abs=0.06)
     assert accurate.range_error == accurate.bound * accurate.factor
     assert accurate.to_json()["range_error_m"] == pytest.approx(accurate.range_error, rel=1e-5)
+
+
+def test_false_echoes_are_predicted_as_often_as_they_come():
+    """Chains of plain Gaussians take parts of a pulse with lobes for echoes; those that fit the pulse do not."""
+    scene = make_scene("flat", pulse=find_pulse("riegl"), n_samples=100)
+    block, truth = make_block(scene, 6000, seed=6)
+    predictions = predict_errors(block, survey_block(block).system, CHAINS)
+    for prediction in predictions:
+        found = CHAINS[prediction.name].run(block, survey_block(block).system)
+        false = 1 - score(found, truth, len(block), noise_std=scene.recording.recorded_noise).correctness
+        assert prediction.false_share == pytest.approx(false, abs=0.06), prediction
+        assert prediction.to_json()["false_share"] == pytest.approx(prediction.false_share, rel=1e-5)
+    assert predictions[0].false_share > 0.1
+    assert [one.name for one in leave_out_false(predictions)] == ["accurate"]
+    assert leave_out_false(predictions[:1]) == predictions[:1] and leave_out_false([]) == []
 
 
 def test_predictions_are_the_same_every_time():

@@ -192,7 +192,7 @@ def test_ours_comes_before_the_vendors_but_the_vendors_own_name_wins(tmp_path):
     path = write_cloud(
         tmp_path / "both.las", n=30,
         Amplitude=(stored.astype("u2"), None, 0.01, "Echo signal amplitude [dB]"),
-        **{"wb amplitude": (stored.astype("f4"), None, None, "peak above the baseline [DN]")},
+        **{"wb_amplitude": (stored.astype("f4"), None, None, "peak above the baseline [DN]")},
     )  # fmt: skip
     for asked, unit in (("amplitude", "DN"), ("Amplitude", "dB")):
         with ColumnReader(path, asked) as reader:

@@ -129,7 +129,8 @@ def test_csv_and_geojson_hold_the_same_segments(strip, tmp_path):
     rows = list(csv.DictReader((tmp_path / "s.csv").read_text().splitlines()))
     assert len(rows) == counts["segments"] > 8
     assert {row["line"] for row in rows} == {"1", "2"}
-    assert run(strip, "-o", tmp_path / "s.geojson", "--lines", "1:3", "-q").output == ""
+    arguments = ("--geojson-crs", "keep", "--lines", "1:3", "-q")
+    assert run(strip, "-o", tmp_path / "s.geojson", *arguments).output == ""
     features = json.loads((tmp_path / "s.geojson").read_text())["features"]
     assert len(features) == len(rows)
     for row, feature in zip(rows, features, strict=True):

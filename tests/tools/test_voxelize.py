@@ -89,7 +89,7 @@ def load(path):
 
 def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, **options):
     settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed)
-    summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), **options)
+    summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), force=True, **options)
     return summary, load(target) if target.suffix == ".npz" else laspy.read(target)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from wavebatch.batch.counts import AMPLITUDE_BINS, RunReport
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
+from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.sensor import SensorSource
 
@@ -54,6 +55,8 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
         hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
     """
     lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines += _name_height(prepared)
+    lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
         if total and not known:
@@ -64,6 +67,54 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
                 remedy = REASONS[NoData.UNCERTAIN][1]
                 lines.append(f"{column}: {known} of {total} echoes have one, the widest: {outlook.reason}; {remedy}")
     return tuple(lines)
+
+
+def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
+    """Find what makes results of a strip wrong; these lines are printed with --quiet too.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    report : RunReport
+        Of the whole strip.
+
+    Returns
+    -------
+    tuple of str
+        One line each: a forced survey of another sensor, a chain that does not fit the strip's pulse.
+    """
+    choice, echoes = prepared.choice, report.count("echoes")
+    lines = []
+    if prepared.forced:
+        lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
+    if not choice.doubted or not echoes:
+        return tuple(lines)
+    share, (_, best) = choice.false_share, choice.predictions
+    lines.append(
+        f"{choice.chain.name or 'this chain'}: does not fit this strip's pulse, which is no plain Gaussian: about "
+        f"{round(share * echoes)} of its {echoes} echoes are false ({100 * share:.0f} % in a trial with the learned "
+        f"pulse, {100 * best.false_share:.1f} % for profile {best.name}); use --profile auto"
+    )
+    return tuple(lines)
+
+
+def _name_height(prepared: Prepared) -> Iterator[str]:
+    """A flight height that was not needed."""
+    height, sensor = prepared.job.sensor.height, prepared.sensor
+    if height is not None and sensor.height is None:
+        seen = dict(sensor.facts).get("height_m")
+        where = f": {seen:.0f} m above the points" if seen else ""
+        yield f"--flight-height {height:g} m is not used: positions are from the strip's {sensor.kind}{where}"
+
+
+def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """Extra bytes of the input that added echoes share with the nearest return."""
+    added = report.count("added_echoes")
+    if added and prepared.layout.copied:
+        yield (
+            f"{', '.join(prepared.layout.copied)}: kept; {added} added echoes have the value of the nearest return of "
+            "their packet, because no value is free for no-data"
+        )
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -99,6 +99,7 @@ def build_document(
     cloud: Path,
     size: int,
     dropped: Mapping[str, str],
+    serious: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the report of a strip whose cloud is complete.
 
@@ -113,6 +114,8 @@ def build_document(
         Of the cloud [bytes].
     dropped : mapping of str to str
         Records of the input that the cloud does not have, and why.
+    serious : sequence of str
+        Warnings about wrong results, which come first.
 
     Returns
     -------
@@ -121,7 +124,6 @@ def build_document(
     """
     facts, layout = prepared.facts, prepared.layout
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
-    lost = {**layout.dropped, **dropped}
     return {
         "schema": STRIP_SCHEMA,
         **described,
@@ -136,12 +138,15 @@ def build_document(
         "output": {
             "file": cloud.name,
             "size": size,
+            "las_version": "{}.{}".format(*layout.version),
             "point_format": layout.point_format,
+            "kept_extra_bytes": [carried.record.name for carried in layout.carried],
+            "copied_to_added_echoes": dict.fromkeys(layout.copied, report.count("added_echoes")),
             "columns": {written.column: written.record.name for written in layout.written},
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*facts.warnings, *prepared.scan.warnings, *(f"{name}: {why}" for name, why in lost.items())],
+        "warnings": [*serious, *facts.warnings, *prepared.scan.warnings, *map(": ".join, dropped.items())],
         "timing": build_timing(report),
     }
 

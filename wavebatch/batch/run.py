@@ -287,6 +287,7 @@ class _Batch:
         else:
             report = outcome.report.to_json()
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
+            more["serious"] = list(strip.serious)
             if strip.prepared is not None:
                 more["sensor"] = strip.prepared.sensor.describe()
             self._tell({**event, **more})

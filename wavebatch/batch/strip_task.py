@@ -19,7 +19,7 @@ from typing import Any
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.dask_cluster import Cluster
-from wavebatch.batch.explain import find_remarks
+from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.processes import Workers
 from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_unit
@@ -65,6 +65,8 @@ class StripTask:
         self.prepared: Prepared | None = None
         self.written = 0
         self.warnings: list[str] = []
+        self.serious: tuple[str, ...] = ()
+        """Those of the warnings that are about wrong results; they are printed with --quiet too."""
         self._options = options
         self._submitted = 0
         self._blob = b""
@@ -211,7 +213,10 @@ class StripTask:
         size = self._writer.complete()
         self._report += RunReport(timing={"publish": time.perf_counter() - start})
         dropped = self._writer.dropped
-        document = report_file.build_document(self.prepared, self._described, self._report, cloud, size, dropped)
+        self.serious = find_warnings(self.prepared, self._report)
+        document = report_file.build_document(
+            self.prepared, self._described, self._report, cloud, size, dropped, self.serious
+        )
         draft = draft_text(report, report_file.format_json(document), overwrite=replaces)
         try:
             if replaces:

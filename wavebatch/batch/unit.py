@@ -19,7 +19,7 @@ import numpy as np
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
@@ -27,13 +27,17 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_level
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics, with_stages
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
+
+LARGEST_HEIGHT_ERROR = 0.3
+"""Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
 
 _ALWAYS = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
@@ -48,7 +52,10 @@ class RunOptions:
     points: str = "echoes"
     format: str = "laz"
     point_format: int | None = None
+    las_version: str = "1.4"
     names: str = "wavebatch"
+    no_data: str = "-9999"
+    strict: bool = False
     columns: tuple[str, ...] = ()
     """Columns to write, in order; see `choose_columns`."""
     keep_packets: bool = False
@@ -67,13 +74,18 @@ class StripJob:
     sensor: SensorRequest = SensorRequest()
     """Where the sensor's positions come from; used only if the chain needs them."""
     calibration: Calibration | None = None
+    added: tuple[str, ...] = ()
+    """Stages that make columns of --columns which no shipped chain computes."""
 
     def extend(self, chain: Chain) -> Chain:
-        """Return the chain with the physical stages that trajectory, calibration and divergence allow."""
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and `added`."""
         sources = (self.calibration, self.request.system and self.request.system.survey.system)
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
-        return with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        calibrated = self.calibration is not None
+        return with_stages(
+            with_physics(chain, sensor=given, calibrated=calibrated, divergence=divergence), self.added
+        )
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with the job's calibration, if it has one."""
@@ -106,6 +118,8 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    forced: str = ""
+    """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
 
     @property
     def system(self) -> SystemPulse:
@@ -122,6 +136,11 @@ class Prepared:
     def row_layout(self) -> OutputLayout:
         """The layout of a unit's rows: that of the cloud, then the columns that a second pass needs."""
         return self.layout if self.second_step is None else self.layout.extended(RAY)
+
+
+def split_columns(wanted: str | None) -> list[str]:
+    """Return the entries of --columns, with their `+`."""
+    return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
 
 
 def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
@@ -150,7 +169,7 @@ def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
         )
     computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
     default = [*computed, "echo_flags"]
-    entries = [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+    entries = split_columns(wanted)
     added = [entry[1:] for entry in entries if entry.startswith("+")]
     chosen = [entry for entry in entries if not entry.startswith("+")]
     if wanted is not None and not entries:
@@ -177,9 +196,12 @@ def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
         facts,
         options.columns,
         point_format=options.point_format,
+        las_version=options.las_version,
         packets=facts if options.keep_packets else None,
         names=options.names,
+        no_data=options.no_data,
         points=options.points,
+        strict=options.strict,
     )
 
 
@@ -209,10 +231,10 @@ def prepare_strip(job: StripJob) -> Prepared:
         scan = reader.scan()
         try:
             scanned = time.perf_counter()
-            stranger = _hold(reader, scan, job)
+            stranger, forced = _hold(reader, scan, job)
             if stranger:
                 job = replace(job, request=replace(job.request, system=None))
-            choice = make_choice(reader, scan, job.chain, job.request)
+            choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
             if job.request.describe(job.chain) is not None:
                 choice = replace(choice, chain=job.extend(choice.chain))
             columns = without_columns(job.options.columns, job.chain, choice.chain)
@@ -221,6 +243,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
+            _hold_height(reader, job.sensor, sensor)
             choice = _see_level(reader, scan, job, choice, sensor)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
@@ -228,14 +251,30 @@ def prepare_strip(job: StripJob) -> Prepared:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger)
+    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, forced)
 
 
-def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> str:
-    """Why the strip does not belong to the flight whose survey the job has; empty where it does."""
-    if job.request.system is None or not job.request.flight:
-        return ""
-    return hold_strip(reader, scan, job.request.system.survey)
+def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
+    """Refuse a flight height that contradicts the packet vectors, which are more exact and are used in its place."""
+    seen = dict(sensor.facts).get("height_m")
+    if request.height is None or sensor.height is not None or not seen:
+        return
+    if abs(np.log(request.height / max(seen, 1e-9))) > LARGEST_HEIGHT_ERROR:
+        where = f"by its {sensor.kind} the sensor flew {seen:.0f} m above the points"
+        raise InputError(
+            f"{reader.facts.path}: --flight-height {request.height:g} m contradicts the strip: {where}; leave "
+            "--flight-height out"
+        )
+
+
+def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:
+    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a forced survey."""
+    request = job.request
+    if request.system is None:
+        return "", ""
+    if request.flight:
+        return hold_strip(reader, scan, request.system.survey), ""
+    return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 
 def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:

@@ -52,7 +52,8 @@ def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **optio
     loaded, saved = load_targets(targets), shared.read_system(options)
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
-    found = calibrate_strip(strip, loaded, sensor=sensor, system=saved.survey.system if saved else None, **figures)
+    known = saved and saved.survey
+    found = calibrate_strip(strip, loaded, sensor=sensor, survey=known, force=options["force"], **figures)
     write_text(output, format_calibration(found), overwrite=overwrite)
     for target in found.targets:
         result = "too few, left out"

@@ -120,8 +120,8 @@ def _match(a: Path, b: Path | None, strip: Path, truth: Path | None, options: di
         if side is not None and side.is_cloud and not Path(side.name).exists():
             chain = nearest(side.name, [AUTO, *COSTS])
             raise click.UsageError(f"{side.name}: is neither a file nor a shipped chain; {chain}")
-    survey = saved.survey if saved else None
-    return match_sides(strip, *sides, survey=survey, limit=options["limit"], **_tolerance(options))
+    more = {"survey": saved and saved.survey, "force": options["force"], "limit": options["limit"]}
+    return match_sides(strip, *sides, **more, **_tolerance(options))
 
 
 def _check_thresholds(result: Comparison, options: dict) -> list[str]:

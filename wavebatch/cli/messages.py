@@ -257,6 +257,9 @@ class Progress:
             more = [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
+        elif kind == "written":
+            for line in event["serious"]:
+                self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
         elif kind == "flight" and self._level > 0:

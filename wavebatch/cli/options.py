@@ -75,9 +75,12 @@ strip_options = together(
     direction_option,
     click.option("--headerless", is_flag=True, help="Read a .wdp file that lacks its 60-byte header."),
 )
-system_option = file_option(
-    "--system", "system_file", text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."
-)
+system_option = together(
+    file_option("--system", "system_file",
+                text="Use this saved survey (`wavebatch survey -o FILE`) instead of surveying the strip."),
+    click.option("--force", is_flag=True, help="Use the survey of --system also where bits, noise or echo width of the "
+                 "strip contradict it."),
+)  # fmt: skip
 calibration_option = file_option(
     "--calibration", "calibration_file",
     text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",
@@ -99,7 +102,8 @@ sensor_options = together(
 _COMMON = {
     "overwrite": click.option("--overwrite", is_flag=True, help="Replace existing files."),
     "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
-    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print no progress and no messages, only errors."),
+    "quiet": click.option("-q", "--quiet", is_flag=True,
+                          help="Print no progress and no messages, only errors and warnings of wrong results."),
     "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
 }
 

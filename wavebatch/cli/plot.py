@@ -104,6 +104,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     """The waveforms that are wanted, and the name of the chain that they were run through."""
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
+    from wavebatch.surveying.systems.saved_check import check_saved
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
     from wavebatch.tools.plots.waveform import read_views
@@ -111,6 +112,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan() as scan:
+        check_saved(reader, scan, request.system and request.system.survey, force=options["force"])
         choice = make_choice(reader, scan, chain, request)
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))

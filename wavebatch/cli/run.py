@@ -62,13 +62,22 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 @strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
-@click.option("--columns", metavar="LIST", help="a,b writes only these columns; +a,+b adds them to the usual ones.")
+@click.option("--columns", metavar="LIST",
+              help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
+              "shipped ones get the stages that make them.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
               show_default=True, help="Naming scheme for names and units of the extra bytes.")
 @click.option("--format", "file_format", type=click.Choice(["laz", "las"]), default="laz", show_default=True,
               help="File format of the clouds.")
 @click.option("--point-format", type=click.IntRange(0, 10), metavar="0-10",
-              help="LAS point format of the clouds.  [default: that of the strip without waveforms]")
+              help="LAS point format of the clouds.  [default: 6, or 7 or 8 where the strip has colours]")
+@click.option("--las-version", type=click.Choice(["1.4", "1.3", "keep"]), default="1.4", show_default=True,
+              help="LAS version of the clouds. PDAL and QGIS read extra bytes only from LAS 1.4; keep: that of the "
+              "strip, with its point format.")
+@click.option("--no-data", type=click.Choice(["-9999", "nan"]), default="-9999", show_default=True,
+              help="What floating-point columns hold where an echo has no value; declared in the cloud.")
+@click.option("--strict", is_flag=True, help="Fail where extra bytes of the strip have no free value to mark added "
+              "echoes; these get the value of the nearest return otherwise.")
 @click.option("--keep-packets", is_flag=True, help="Copy the waveforms too: point format and packets stay as they are.")
 @click.option("--jobs", type=click.IntRange(0), metavar="N",
               help="Processes; 0: one per processor. The result does not depend on it.  [default: 1]")
@@ -142,8 +151,8 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
 
 
 _PASSED_ON = (
-    "columns", "points", "point_format", "names", "keep_packets", "direction", "headerless", "scheduler", "memory",
-    "block_size", "overwrite", "resume",
+    "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets", "direction",
+    "headerless", "scheduler", "memory", "block_size", "overwrite", "resume",
 )  # fmt: skip
 """Options that `plan_run` takes under the same names."""
 
@@ -158,6 +167,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         chain=options["chain_file"] or options["profile"],
         tolerance=_read_tolerance(options["tolerance"]),
         system=options["system_file"],
+        force=options["force"],
         survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],

@@ -16,6 +16,7 @@ from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_summary, talk
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, find_crs, plan_crs
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
 from wavebatch.tools.slices.lines import read_scan_lines
@@ -40,6 +41,9 @@ _SURVEYED = 2000
               help="Standard deviation of the pulse [ns].  [default: surveyed from the strip]")
 @click.option("--shortest", default=20.0, show_default=True, metavar="PIXELS",
               help="Least length of a segment [pixels of one sample].")
+@click.option("--geojson-crs", type=click.Choice(GEOJSON_CRS), default="wgs84", show_default=True,
+              help="Coordinates of a .geojson: longitude and latitude (needs pyproj), or those of the strip with its "
+              "CRS, which GDAL and QGIS read.")
 @click.option("--most", default=20, show_default=True, metavar="N", help="Most segments per slice.")
 @shared.direction_option
 @shared.common_options("overwrite", "json", "quiet")
@@ -56,12 +60,16 @@ def slice_(strip: Path, output: Path | None, lines: tuple[int, int | None], png:
     if png:
         refuse_existing(png, options["overwrite"])
     with StripReader(strip, direction=options["direction"]) as reader:
+        crs = None
+        if output is not None and output.suffix.lower() == ".geojson":
+            known = find_crs(reader.facts.crs, reader.facts.header.vlrs)
+            crs = plan_crs(strip, known, options["geojson_crs"])
         scan = reader.scan()
         sigma = options["sigma"]
         if sigma is None:
             sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
         settings = shared.from_options(SliceOptions, options, sigma=sigma)
-        counts = _find(reader, scan, settings, output, lines, png, options["overwrite"])
+        counts = _find(reader, scan, settings, output, lines, png, crs, options["overwrite"])
     if not counts["lines"]:
         talk(f"{strip}: has no scan line with a number in --lines")
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
@@ -75,6 +83,7 @@ def _find(
     output: Path | None,
     lines: tuple[int, int | None],
     png: Path | None,
+    crs: GeoJsonCrs | None,
     overwrite: bool,
 ) -> dict[str, Any]:
     """Writes the segments of the wanted lines; returns their counts."""
@@ -83,7 +92,7 @@ def _find(
     with ExitStack() as stack:
         writer = None
         if output:
-            writer = stack.enter_context(SegmentWriter(output, crs=reader.facts.crs, overwrite=overwrite))
+            writer = stack.enter_context(SegmentWriter(output, crs=crs, overwrite=overwrite))
         for line in takewhile(lambda one: end is None or one.number < end, read_scan_lines(reader, scan)):
             if line.number < first:
                 continue

@@ -84,7 +84,7 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
             calibration=shared.read_calibration(options),
             sensor=sensor,
             progress=show,
-            **{name: options[name] for name in ("direction", "headerless", "overwrite")},
+            **{name: options[name] for name in ("direction", "headerless", "overwrite", "force")},
         )
     print_summary(options, summary, _list_lines(summary))
 

@@ -7,7 +7,7 @@ Before you change it: files of earlier versions must stay readable.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,10 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
 
-NEEDS_SENSOR = ("range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle")
+NEEDS_SENSOR = (
+    "range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle", "relative_backscatter",
+    "relative_cross_section", "relative_reflectance",
+)  # fmt: skip
 """Columns that need the sensor's position."""
 
 _NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
@@ -145,6 +148,37 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
     names += ["attribute.backscatter_coefficient"] if calibrated else []
     names += ["attribute.cross_section"] if calibrated and divergence else []
     names += ["attribute.reflectance"] if calibrated else []
+    return with_stages(chain, names)
+
+
+def find_makers(chain: Chain, columns: Iterable[str]) -> tuple[str, ...]:
+    """Find the attribute stages that a chain lacks for some columns.
+
+    Parameters
+    ----------
+    chain : Chain
+    columns : iterable of str
+        Names in COLUMNS; those that no attribute stage makes are left out.
+
+    Returns
+    -------
+    tuple of str
+        Names of stages, each after those whose columns it needs.
+    """
+    have, found = set(chain.makes), []
+    for column in columns:
+        if column in have:
+            continue
+        maker = next((one for one in STAGES.values() if one.kind == "attribute" and column in one.makes), None)
+        if maker is not None:
+            before = find_makers(chain, [name for name in maker.needs if name not in have])
+            found += [name for name in (*before, maker.name) if name not in found]
+            have.update(*(STAGES[name].makes for name in (*before, maker.name)))
+    return tuple(found)
+
+
+def with_stages(chain: Chain, names: Iterable[str]) -> Chain:
+    """Return the chain with these stages at its end, with their default parameters; those that it has stay."""
     have = {step.stage.name for step in chain.steps}
     added = tuple(Step(STAGES[name]) for name in names if name not in have)
     return replace(chain, steps=(*chain.steps, *added)) if added else chain

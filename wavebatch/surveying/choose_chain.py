@@ -7,7 +7,7 @@ Before you change it: the choice must depend on the strip and the request alone,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import SAMPLE, Decision, Survey, join_digitizers, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain, decide, widest_chain
-from wavebatch.surveying.predict_error import Prediction, predict_errors
+from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, leave_out_false, predict_errors
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 
 SAMPLE_SAMPLES = 1 << 21
@@ -44,6 +44,8 @@ class Request:
     """A saved survey; None: the strip is surveyed."""
     flight: bool = False
     """The saved survey is that of the strip's flight, or will be made before the run: the strip is held against it."""
+    force: bool = False
+    """Use the saved survey also where the strip contradicts it."""
 
     def describe(self, chain: Chain) -> str | None:
         """Return what chooses the chain, for reports; None where the user gave `chain` itself."""
@@ -61,7 +63,22 @@ class Choice:
     decisions: tuple[Decision, ...] = ()
     """Parts that the chain has or leaves out; empty where the survey did not choose the chain."""
     predictions: tuple[Prediction, ...] = ()
-    """Of each chain that was compared with a tolerance, the fastest first."""
+    """Of each chain that was compared with a tolerance, the fastest first; or of the user's chain and the accurate one,
+    where the user's finds false echoes on a strip like this."""
+
+    @property
+    def false_share(self) -> float:
+        """Share of false echoes to expect from the user's chain; 0 where there is no doubt about it."""
+        return self.predictions[0].false_share if self.doubted else 0.0
+
+    @property
+    def doubted(self) -> bool:
+        """Whether a trial shows that the user's chain finds false echoes on this strip."""
+        return bool(self.predictions) and self.predictions[0].name == _USERS
+
+
+_USERS = "user"
+"""Name of the user's chain among the predictions; shipped chains have theirs."""
 
 
 def widest(request: Request) -> Chain:
@@ -129,13 +146,55 @@ def _choose_by_tolerance(block: WaveformBlock | None, found: Survey, tolerance: 
     if block is None:
         return Choice(chains[COSTS[0]], found)
     predictions = predict_errors(block, found.system, chains)
-    good = [prediction for prediction in predictions if prediction.range_error <= tolerance]
+    fitting = leave_out_false(predictions)
+    good = [prediction for prediction in fitting if prediction.range_error <= tolerance]
     if not good:
-        errors = ", ".join(f"{prediction.name} {prediction.range_error:.3g} m" for prediction in predictions)
+        errors = ", ".join(
+            f"{one.name} {one.range_error:.3g} m" + ("" if one in fitting else f" ({_in_words(one)})")
+            for one in predictions
+        )
         raise ConfigError(
             f"{strip}: no shipped chain meets a tolerance of {tolerance:g} m; predicted errors are {errors}: allow more"
         )
     return Choice(chains[good[0].name], found, predictions=tuple(predictions))
+
+
+def _in_words(prediction: Prediction) -> str:
+    return f"{100 * prediction.false_share:.0f} % of its echoes would be false"
+
+
+def try_chain(reader: StripReader, scan: StripScan, choice: Choice, request: Request) -> Choice:
+    """Find out whether the user's chain takes the strip's pulse for several echoes.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    choice : Choice
+        Of `make_choice`.
+    request : Request
+
+    Returns
+    -------
+    Choice
+        With two predictions, of the user's chain and of the accurate one, where the first finds more false echoes by
+        MOST_FALSE; else the same one.
+
+    Notes
+    -----
+    Only strips whose pulse is no plain Gaussian are tried: a trial takes as long as some 4,000 waveforms of the run.
+    """
+    system = choice.survey.system
+    if request.describe(choice.chain) is not None or (len(system.components) < 2 and not system.kappa):
+        return choice
+    sample = read_sample(reader, scan, WAVEFORMS)
+    if not sample:
+        return choice
+    chains = {_USERS: choice.chain, COSTS[-1]: load_profile(COSTS[-1])}
+    predictions = predict_errors(sample[0], system, chains)
+    if predictions[0] in leave_out_false(predictions):
+        return choice
+    return replace(choice, predictions=tuple(predictions))
 
 
 def describe_choice(choice: Choice, request: Request) -> dict[str, Any]:
@@ -147,6 +206,7 @@ def describe_choice(choice: Choice, request: Request) -> dict[str, Any]:
     }
     if request.tolerance is not None:
         report["tolerance_m"] = request.tolerance
+    if request.tolerance is not None or choice.predictions:
         report["predictions"] = [prediction.to_json() for prediction in choice.predictions]
     return report
 

@@ -219,7 +219,7 @@ def survey_flight(samples: Sequence[StripSample]) -> Flight:
             break
         group = fitting
     used = {index: kind for index, kind in kinds.items() if any(block.digitizer.index == index for block in blocks)}
-    figures = {**survey.figures, **_describe_look(whole), **_describe_kinds(used), "flight_strips": float(len(group))}
+    figures = {**survey.figures, **describe_look(whole), **_describe_kinds(used), "flight_strips": float(len(group))}
     identity = {"strips": [dict(sample.fingerprint) for sample in group]}
     name = group[0].path.name if len(samples) == 1 else f"{len(group)} strips"
     return Flight(SavedSurvey(replace(survey, figures=figures), name, identity), tuple(held))
@@ -370,10 +370,15 @@ def _find_group(samples: list[StripSample]) -> list[StripSample]:
     return best or samples
 
 
-def _describe_look(look: Look) -> dict[str, float]:
-    """As figures of a survey; `read_flight` reads them."""
+def describe_look(look: Look) -> dict[str, float]:
+    """Return what strips record as figures of a survey; `read_flight` reads them."""
     level = {f"flight_level_{name}": float(value) for name, value in look.level._asdict().items() if value is not None}
     return {**level, "flight_width": look.width, "flight_steady": look.steady, "flight_misfit": look.misfit}
+
+
+def describe_kinds(blocks: Iterable[WaveformBlock]) -> dict[str, float]:
+    """Return what the descriptors of blocks mean as figures of a survey; `read_flight` reads them."""
+    return _describe_kinds({block.digitizer.index: _kind(block) for block in blocks})
 
 
 def _describe_kinds(kinds: Mapping[int, Kind]) -> dict[str, float]:

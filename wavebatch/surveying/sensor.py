@@ -15,6 +15,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.geojson_crs import find_crs
 from wavebatch.files.strip.ray_sample import Rays, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
@@ -169,7 +170,7 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
 
 
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
-    crs = request.crs or (reader.facts.crs if (reader.facts.crs or "").endswith("]") else None)
+    crs = request.crs or find_crs(reader.facts.crs, reader.facts.header.vlrs)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))

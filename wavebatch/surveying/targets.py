@@ -27,10 +27,11 @@ from wavebatch.files.text_file import read_text
 from wavebatch.kernels.geometry.planes import fit_normal
 from wavebatch.kernels.physics.radiometry import calibrate_echoes
 from wavebatch.stages.chain_file import load_profile
-from wavebatch.surveying import survey_blocks
+from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, TargetResult
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.systems.saved_check import check_saved
 
 LEAST_ECHOES = 10
 """A target with fewer echoes is left out: a median of fewer is no better than one echo."""
@@ -130,6 +131,8 @@ def calibrate_strip(
     *,
     sensor: SensorRequest | None = None,
     system: SystemPulse | None = None,
+    survey: Survey | None = None,
+    force: bool = False,
     attenuation: float = 0.22,
     divergence: float | None = None,
     reflectance_error: float = 0.03,
@@ -148,6 +151,10 @@ def calibrate_strip(
         Where the sensor's positions come from; by default from the strip's packets.
     system : SystemPulse, optional
         The pulse; by default from a survey of the strip.
+    survey : Survey, optional
+        A saved survey, in place of `system`: checked against the strip.
+    force : bool
+        Use the survey also where the strip contradicts it.
     attenuation : float
         Of the air, one way [dB/km].
     divergence : float, optional
@@ -164,7 +171,7 @@ def calibrate_strip(
     Raises
     ------
     InputError
-        Where no target has enough echoes, or the sensor's position is unknown.
+        Where no target has enough echoes, the sensor's position is unknown, or the strip contradicts the survey.
 
     Notes
     -----
@@ -174,6 +181,8 @@ def calibrate_strip(
         source = find_sensor(reader, scan, sensor or SensorRequest())
         if source.kind == "none":
             raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
+        check_saved(reader, scan, survey, force=force)
+        system = survey.system if survey is not None else system
         pulse = system or survey_blocks(read_sample(reader, scan)).system
         found = [np.concatenate(parts)[:MOST_ECHOES] for parts in _collect(reader, scan, targets, source, pulse)]
         fingerprint = take_fingerprint(path, reader.facts.packets.file)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wavebatch.files.cloud.echo_reader import CloudReader, find_columns
+from wavebatch.files.cloud.echo_reader import CloudReader
 
 WIDTHS, NORMALS = "incidence_angle", "incidence_angle_normals"
 ANGLES = (WIDTHS, f"{WIDTHS}_err", NORMALS, f"{NORMALS}_err")
@@ -23,7 +23,7 @@ class AngleReader(CloudReader):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._angles = find_columns(list(self._format.extra_dimensions), ANGLES)
+        self._angles = self._find_ours(list(self._format.extra_dimensions), ANGLES)
         self.has = frozenset(self._angles)
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:

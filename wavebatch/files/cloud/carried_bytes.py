@@ -1,7 +1,8 @@
 """Extra bytes that are copied unchanged from a strip to its output cloud.
 
-`layout.plan_output` calls it. Rows of new echoes have no extra bytes, so a dimension is copied only if it has a free
-value for "no data".
+`layout.plan_output` calls it. Every dimension is kept. An added echo has no extra bytes of its own: it gets the "no
+data" value of a dimension, or, where no value is free for that, the value of the nearest return of its packet, as the
+standard fields do. Before you change it: a dimension must never be dropped, vendors have no other place for their data.
 """
 
 from __future__ import annotations
@@ -20,22 +21,20 @@ class Carried:
     record: ExtraRecord
     source: int
     """Byte offset in the input record; the output's dtype has the offset there."""
+    copied: bool = False
+    """Whether added echoes get the value of the nearest return, because no value is free for "no data"."""
 
 
-def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[tuple[Carried, ...], dict[str, str]]:
-    """Return the extra dimensions to copy, and for the others the reason why not.
+def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
+    """Return the extra dimensions of the input, all of which are copied.
 
     whole: every output row comes from an input point, so no value for "no data" is needed.
     """
     at = STANDARD_DTYPES[checked.header.point_format].itemsize
-    carried, dropped = [], {}
+    carried = []
     for record in checked.records:
-        empty = choose_no_data(record)
-        if whole:
-            carried.append(Carried(record, at))
-        elif empty is None:
-            dropped[record.name] = "no value is free to mark echoes that the input does not have as a return"
-        else:
-            carried.append(Carried(record.with_no_data(empty), at))
+        empty = None if whole else choose_no_data(record)
+        marked = record if empty is None else record.with_no_data(empty)
+        carried.append(Carried(marked, at, copied=not whole and empty is None))
         at += record.dtype.itemsize
-    return tuple(carried), dropped
+    return tuple(carried)

@@ -68,6 +68,9 @@ STYLES: dict[str, dict[str, Naming]] = {
 }  # fmt: skip
 """Columns that a style names differently; all other columns keep wavebatch's name, type and unit."""
 
+NO_DATA = {"-9999": -9999.0, "nan": float("nan")}
+"""Values of --no-data: what is stored in floating-point columns where an echo has no value."""
+
 _RELATIVE = ("backscatter", "cross_section", "reflectance")
 _SHORT = {
     "amplitude": "peak above the baseline",
@@ -141,16 +144,21 @@ def describe(column: Column, unit: str | None = None) -> str:
     return meaning + tail
 
 
-def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> list[WrittenColumn]:
+def name_columns(
+    columns: Sequence[str], style: str, taken: Collection[str], no_data: str = "-9999"
+) -> list[WrittenColumn]:
     """Return the extra-bytes columns among `columns`, in order, as `style` writes them.
 
     taken: names of the input's extra bytes, which stay. If the name of a wavebatch column is equal to one of these, to
-    a LAS field or to another column (compared by `normalise`), it gets the prefix `wb `, or `wb2 `, `wb3 ` ... if that
+    a LAS field or to another column (compared by `normalise`), it gets the prefix `wb_`, or `wb2_`, `wb3_` ... if that
     is taken too. Columns that are LAS fields (x, y, z) are skipped, repeated ones count once.
-    Raises ConfigError for an unknown style or column.
+    no_data: a key of NO_DATA.
+    Raises ConfigError for an unknown style, column or no-data value.
     """
     if style not in STYLES:
         raise ConfigError(f"names {style!r}: must be one of {', '.join(STYLES)}")
+    if no_data not in NO_DATA:
+        raise ConfigError(f"no_data {no_data!r}: must be one of {', '.join(NO_DATA)}")
     used = {normalise(name) for name in taken} | _STANDARD
     written: list[WrittenColumn] = []
     for key in dict.fromkeys(columns):
@@ -162,13 +170,11 @@ def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> 
         naming = STYLES[style].get(key, Naming(key))
         name = _avoid(naming.name, used)
         used.add(normalise(name))
-        record = ExtraRecord.build(
-            name,
-            naming.dtype or column.dtype,
-            describe(column, naming.unit),
-            no_data=column.no_data if naming.no_data is None else naming.no_data,
-            scale=naming.scale,
-        )
+        dtype = naming.dtype or column.dtype
+        empty = column.no_data if naming.no_data is None else naming.no_data
+        if empty is not None and np.dtype(dtype).kind == "f":
+            empty = NO_DATA[no_data]
+        record = ExtraRecord.build(name, dtype, describe(column, naming.unit), no_data=empty, scale=naming.scale)
         written.append(WrittenColumn(key, record, naming))
     return written
 
@@ -176,6 +182,23 @@ def name_columns(columns: Sequence[str], style: str, taken: Collection[str]) -> 
 def _avoid(name: str, used: Collection[str]) -> str:
     candidate, number = name, 1
     while normalise(candidate) in used:
-        prefix = "wb " if number == 1 else f"wb{number} "
-        candidate, number = prefix + name, number + 1
+        prefix = "wb_" if number == 1 else f"wb{number}_"
+        # Without spaces, because PDAL takes only identifiers in its expressions.
+        candidate, number = prefix + name.replace(" ", "_"), number + 1
     return candidate
+
+
+def describe_roundings(written: Sequence[WrittenColumn]) -> list[str]:
+    """Return a line for each column that its style stores in coarser steps than it was computed with."""
+    lines = []
+    for column in written:
+        record, naming = column.record, column.naming
+        if naming.scale is None:
+            continue
+        unit, limits = naming.unit or COLUMNS[column.column].unit, np.iinfo(record.dtype)
+        low, high = (limit * naming.scale for limit in (max(limits.min, -limits.max), limits.max))
+        lines.append(
+            f"{column.column}: written as {record.name!r}, rounded to {naming.scale:g} {unit} and kept within "
+            f"{low:g} to {high:g} {unit}; --names wavebatch keeps every digit"
+        )
+    return lines

@@ -19,7 +19,7 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import normalise
-from wavebatch.files.cloud.echo_reader import CloudReader, find_columns
+from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.point_formats import ANGLE_UNIT
 
@@ -32,6 +32,10 @@ _UNITS = {
     "x_t": "m/ps", "y_t": "m/ps", "z_t": "m/ps",
 }  # fmt: skip
 """Units of the standard fields that have one."""
+
+
+_ANGLES = {"scanangle": "scan_angle_rank", "scananglerank": "scan_angle"}
+"""The scan angle [deg] of the point formats 0 to 5 and of 6 to 10, each by the name that the other formats have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,18 +84,23 @@ class ColumnReader(CloudReader):
         standard = [one.name for one in dimensions if one.is_standard and one.name not in ("X", "Y", "Z")]
         return [*extra, "x", "y", "z", *standard]
 
-    def _find(self, column: str | None) -> tuple[ColumnFacts, Callable[[np.ndarray], np.ndarray]]:
+    def _find(
+        self, column: str | None, *, stored: bool = False
+    ) -> tuple[ColumnFacts, Callable[[np.ndarray], np.ndarray]]:
+        """Facts and reading function of a column; stored: its name is that in the file."""
         if column is None:
             return ColumnFacts("points", "-", "", 1.0), lambda raw: np.ones(len(raw))
         known = self.list_columns()
         extra = {one.name: one for one in self._format.extra_dimensions if one.num_elements == 1}
-        ours = find_columns(list(extra.values()), COLUMNS)
+        ours = self._find_ours(list(extra.values()), COLUMNS, decibel=True)
         alike = [name for name in known if normalise(name) == normalise(column)]
-        if column not in known:
+        if column in self.written and not stored:
+            column = ours[column].name
+        elif column not in known:
             if column in ours:
                 column = ours[column].name
-            elif alike or normalise(column) == "scanangle" and "scan_angle_rank" in known:
-                column = alike[0] if alike else "scan_angle_rank"
+            else:
+                column = next(iter(alike), _ANGLES.get(normalise(column), column))
         if column in extra:
             dimension = extra[column]
             return self._describe_extra(dimension), lambda raw: self._read_column(raw, dimension)
@@ -106,7 +115,8 @@ class ColumnReader(CloudReader):
         text = dimension.description or ""
         found = re.search(r"\[([^\[\]]+)\]\s*$", text)
         unit, meaning = (found[1], text[: found.start()].strip()) if found else ("-", text.strip())
-        name = dimension.name.removeprefix("wb ")
+        stored = {stored: column for column, stored in self.written.items()}
+        name = stored.get(dimension.name) or re.sub(r"^wb\d*[ _]", "", dimension.name)
         if name in COLUMNS and found and unit == COLUMNS[name].unit:
             meaning = COLUMNS[name].meaning
         is_integer = np.dtype(dimension.dtype).kind in "ui"

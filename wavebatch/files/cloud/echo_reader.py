@@ -15,6 +15,7 @@ from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_names import STYLES
+from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
@@ -26,8 +27,14 @@ CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_
 
 CLOUD_DTYPE = np.dtype(
     [
-        ("gps_time", "<f8"), ("xyz", "<f8", 3), ("ray", "<f4", 3), ("flags", "<u2"), ("number", "u1"), ("total", "u1"),
-        ("intensity", "<u2"), *((name, "<f4") for name in CLOUD_COLUMNS),
+        ("gps_time", "<f8"),
+        ("xyz", "<f8", 3),
+        ("ray", "<f4", 3),
+        ("flags", "<u2"),
+        ("number", "u1"),
+        ("total", "u1"),
+        ("intensity", "<u2"),
+        *((name, "<f4") for name in CLOUD_COLUMNS),
     ]  # fmt: skip
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
@@ -54,7 +61,10 @@ class CloudReader(Closing):
         names = set(self._format.dimension_names)
         self.has_gps_time = "gps_time" in names
         self.has_packets = "wavepacket_index" in names
-        self._sources = find_columns(list(self._format.extra_dimensions), (*CLOUD_COLUMNS, "echo_flags"))
+        extra = list(self._format.extra_dimensions)
+        self.written = find_written(checked.header, [one.name for one in extra])
+        """The file's name of each wavebatch column, by the account of the run; empty without one."""
+        self._sources = self._find_ours(extra, (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
         self._points = open_points(checked)
 
@@ -70,6 +80,16 @@ class CloudReader(Closing):
         size = max(min(size, _PIECE_BYTES // self._format.size), 1)
         for start in range(0, self.point_count, size):
             yield self._convert(self._points.read(start, min(start + size, self.point_count)))
+
+    def _find_ours(
+        self, extra: list[DimensionInfo], columns: Iterable[str], *, decibel: bool = False
+    ) -> dict[str, DimensionInfo]:
+        """The dimension of each wavebatch column that the cloud has; decibel: also of those that are written in dB."""
+        if not self.written:
+            return find_columns(extra, columns)
+        by_name = {one.name: one for one in extra}
+        found = {name: by_name[self.written[name]] for name in columns if name in self.written}
+        return {name: one for name, one in found.items() if decibel or not (one.description or "").endswith("[dB]")}
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
         rows = self._place(raw, CLOUD_DTYPE)
@@ -122,10 +142,11 @@ def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
 
 
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
-    """Return the extra dimension of each column that the cloud has.
+    """Return the extra dimension of each column that the cloud has, by its names alone.
 
-    wavebatch's name is preferred to those of other styles, and a name with the prefix `wb ` to one without. A dimension
-    of another style counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
+    For clouds without an account of the run, which other programs may drop. wavebatch's name is preferred to those of
+    other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A dimension of another style
+    counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """
     by_name = {dimension.name: dimension for dimension in extra}
     wanted = set(columns)
@@ -134,7 +155,7 @@ def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str
         names += [(key, naming.name, naming.scale) for key, naming in style.items() if not naming.decibel]
     found: dict[str, DimensionInfo] = {}
     for column, name, scale in names:
-        for dimension in (by_name.get(f"wb {name}"), by_name.get(name)):
+        for dimension in map(by_name.get, (f"wb_{name.replace(' ', '_')}", f"wb {name}", name)):
             if column in wanted and dimension is not None and _is_stored_as(dimension, column, scale):
                 found.setdefault(column, dimension)
     return found

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -16,10 +15,10 @@ from wavebatch.core.echoes import COLUMNS
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.cloud.carried_bytes import Carried, plan_carried
 from wavebatch.files.cloud.column_names import Naming, WrittenColumn, describe, name_columns
+from wavebatch.files.cloud.las_version import choose_version
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import GEOTIFF_ID, PROJECTION, WKT_ID, LasHeader, find_evlrs, has_record
-from wavebatch.files.las.point_formats import choose_format, copy_standard
+from wavebatch.files.las.point_formats import copy_standard
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packets import PacketPlace
 
@@ -40,8 +39,16 @@ class OutputLayout:
     """Whether all rows keep the input's extra bytes (returns), or only matched rows (echoes)."""
     packets: PacketPlace | None
     """The packets of the input, if the output keeps them."""
-    dropped: Mapping[str, str]
-    """Extra bytes of the input that are not copied, and why."""
+    wkt: str | None = None
+    """CRS, where the input gives it by GeoTIFF keys only and the point format needs WKT."""
+    notes: tuple[str, ...] = ()
+    """What the user should know about the format."""
+
+    @property
+    def copied(self) -> tuple[str, ...]:
+        """Extra bytes of the input of which added echoes get the value of the nearest return."""
+        fields = self.extra_fields
+        return tuple(name for name, carried in zip(fields, self.carried, strict=False) if carried.copied)
 
     @property
     def max_return(self) -> int:
@@ -89,7 +96,7 @@ class OutputLayout:
         columns : mapping of str to array (m,)
             Physical values by name in COLUMNS; missing columns and values that are not finite become no-data.
         matched : bool (m,)
-            Rows that keep the input's extra bytes (in other rows they become no-data); None: all rows.
+            Rows that keep the input's extra bytes; in other rows those that can become no-data. None: all rows.
         time : float (m,), ns
             Echo times; with kept packets they become the return location of rows with a new position.
 
@@ -154,7 +161,7 @@ class OutputLayout:
         values = np.ascontiguousarray(source).view(np.dtype(fields))
         for carried, name in zip(self.carried, names, strict=True):
             rows[name] = values[name]
-            if not (self.whole or matched is None):
+            if not (self.whole or matched is None or carried.copied):
                 empty = carried.record.no_data
                 rows[name][~np.asarray(matched)] = empty if len(empty) > 1 else empty[0]
 
@@ -172,9 +179,12 @@ def plan_output(
     columns: Sequence[str],
     *,
     point_format: int | None = None,
+    las_version: str = "1.4",
     packets: StripFacts | None = None,
     names: str = "wavebatch",
+    no_data: str = "-9999",
     points: str = "echoes",
+    strict: bool = False,
 ) -> OutputLayout:
     """Return the layout of the output of a strip.
 
@@ -185,13 +195,19 @@ def plan_output(
     columns : sequence of str
         Names in COLUMNS, in the order in which they are written.
     point_format : int or None
-        None keeps the format of the input, without its waveform fields unless packets are kept.
+        None: that of `las_version` with the fields of the input, without its waveform fields unless packets are kept.
+    las_version : {"1.4", "1.3", "keep"}
+        Of the output. "1.4" also turns point formats 0 to 5 into 6 and 7, unless packets are kept; LAS 1.5 stays 1.5.
     packets : StripFacts or None
         Facts of the strip, to keep its packets; None leaves them out.
     names : str
         Style of the column names, a key of STYLES.
+    no_data : str
+        What floating-point columns hold where there is no value, a key of NO_DATA.
     points : {"echoes", "returns"}
         Whether extra bytes of the input are kept in matched rows only, or in all rows.
+    strict : bool
+        Refuse a strip whose extra bytes cannot be marked as missing for added echoes.
 
     Raises
     ------
@@ -202,35 +218,30 @@ def plan_output(
     """
     if points not in ("echoes", "returns"):
         raise ConfigError(f"points {points!r}: must be echoes or returns")
-    path, header = checked.path, checked.header
-    target = choose_format(path, header, point_format, packets is not None)
-    _check_crs(path, header, target)
-    carried, dropped = plan_carried(checked, points == "returns")
-    written = name_columns(columns, names, [entry.record.name for entry in carried])
-    dtype = build_dtype(target, [entry.record for entry in (*carried, *written)])
+    path = checked.path
+    chosen = choose_version(path, checked.header, las_version, point_format, packets is not None)
+    carried = plan_carried(checked, points == "returns")
+    written = name_columns(columns, names, [entry.record.name for entry in carried], no_data)
+    dtype = build_dtype(chosen.point_format, [entry.record for entry in (*carried, *written)])
     if dtype.itemsize > 65535:
         raise InputError(f"{path}: its extra bytes leave no room for the columns in a 65535-byte record; choose fewer")
     if packets is not None and packets.packets.file is None:
         raise InputError(f"{path}: has no packets to keep; leave --keep-packets out")
-    return OutputLayout(
+    layout = OutputLayout(
         source=checked,
-        version=header.version if target < 6 else max(header.version, (1, 4)),
-        point_format=target,
+        version=chosen.version,
+        point_format=chosen.point_format,
         dtype=dtype,
         carried=carried,
         written=tuple(written),
         whole=points == "returns",
         packets=None if packets is None else packets.packets,
-        dropped=dropped,
+        wkt=chosen.wkt,
+        notes=chosen.notes,
     )
-
-
-def _check_crs(path: Path, header: LasHeader, target: int) -> None:
-    if not header.point_format < 6 <= target or not has_record(header.vlrs, PROJECTION, GEOTIFF_ID):
-        return
-    evlrs, _ = find_evlrs(path, header)
-    if not has_record([*header.vlrs, *evlrs], PROJECTION, WKT_ID):
+    if strict and layout.copied:
         raise InputError(
-            f"{path}: its CRS is given by GeoTIFF keys only, point format {target} needs WKT, and wavebatch does not "
-            "convert them; leave --point-format out, or add a WKT record to the strip first"
+            f"{path}: --strict: no value is free to mark added echoes in its extra bytes {', '.join(layout.copied)}; "
+            "leave --strict out to give them the value of the nearest return, or write --points returns"
         )
+    return layout

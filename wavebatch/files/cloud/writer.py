@@ -16,6 +16,7 @@ import numpy as np
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.layout import OutputLayout
+from wavebatch.files.cloud.provenance import USER_ID
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
@@ -32,13 +33,13 @@ from wavebatch.files.las.header import (
     Evlr,
     LasHeader,
     Vlr,
+    build_wkt,
     decode_text,
     find_evlrs,
     has_record,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 
-_USER_ID = "wavebatch"
 _DESCRIPTORS = range(100, 356)
 
 
@@ -108,14 +109,17 @@ def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, 
 def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: list[Evlr]) -> LasHeader:
     source = layout.source.header
     vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
-    earlier = sum(vlr.user == _USER_ID for vlr in vlrs)
-    vlrs.append(_encode_provenance(layout.source.path, source, provenance, earlier + 1))
+    earlier = sum(vlr.user == USER_ID for vlr in vlrs)
+    if layout.wkt is not None:
+        vlrs.append(build_wkt(layout.wkt))
+    vlrs.append(_encode_provenance(layout, provenance, earlier + 1))
     encoding = source.global_encoding & ~(WAVES_INTERNAL | WAVES_EXTERNAL)
     if layout.packets is not None:
         encoding |= WAVES_INTERNAL if layout.packets.internal else WAVES_EXTERNAL
-    if layout.point_format >= 6 and (
-        has_record([*vlrs, *evlrs], PROJECTION, WKT_ID) or not has_record(vlrs, PROJECTION, GEOTIFF_ID)
-    ):
+    has_wkt, has_keys = has_record([*vlrs, *evlrs], PROJECTION, WKT_ID), has_record(vlrs, PROJECTION, GEOTIFF_ID)
+    if layout.version < (1, 4):
+        encoding &= ~WKT_BIT  # a reserved bit there
+    elif not has_keys and (has_wkt or layout.point_format >= 6) or has_wkt and layout.point_format >= 6:
         encoding |= WKT_BIT
     return LasHeader(
         version=layout.version,
@@ -148,12 +152,14 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
-def _encode_provenance(path: Path, source: LasHeader, provenance: Mapping[str, Any], number: int) -> Vlr:
-    """JSON with sorted keys and no time of day; it also keeps which program wrote the input."""
+def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], number: int) -> Vlr:
+    """JSON with sorted keys and no time of day; it also keeps which program wrote the input, and names the columns."""
+    path, source = layout.source.path, layout.source.header
     made_by = {key: decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
-    account = {"wavebatch": __version__, "input_header": made_by, **provenance}
+    columns = {written.column: written.record.name for written in layout.written}
+    account = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
     text = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
     payload = text.encode(errors="backslashreplace")
     if len(payload) > 65535:
         raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most 65535")
-    return Vlr(_USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
+    return Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")

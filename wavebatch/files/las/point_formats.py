@@ -14,6 +14,8 @@ from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader
 
 WITHOUT_WAVES = {4: 1, 5: 3, 9: 6, 10: 8}
 """For each waveform format the format with the same fields except the waveform fields."""
+MODERN = {0: 6, 1: 6, 2: 7, 3: 7}
+"""For each format of LAS 1.0 to 1.3 the one of LAS 1.4 that holds its fields; those without GPS time get zero."""
 _WAVE_FIELDS = frozenset(STANDARD_DTYPES[4].names) - frozenset(STANDARD_DTYPES[1].names)
 ANGLE_UNIT = 0.006
 """Degrees per count of `scan_angle` in formats 6-10; `scan_angle_rank` of formats 0-5 counts whole degrees."""

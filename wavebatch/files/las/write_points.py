@@ -71,7 +71,7 @@ class PointFile(contextlib.AbstractContextManager):
         self._statistics.add(rows)
         if self._statistics.count >= 2**32 and self._header.version < (1, 4):
             version = "{}.{}".format(*self._header.version)
-            raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --point-format 6")
+            raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
         with self._guarded():
             self._encoder.write(rows)
             self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again

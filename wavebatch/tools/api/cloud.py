@@ -9,7 +9,6 @@ import numpy as np
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.echo_reader import find_columns
 
 
 def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.ndarray:
@@ -37,7 +36,8 @@ def read_cloud(path: Path | str, columns: Sequence[str] | None = None) -> np.nda
     Notes
     -----
     wavebatch's columns have wavebatch's names and units, whatever `--names` they were written with, except those that
-    were written in dB. All other extra bytes have their names in the file. Where the file stores a no-data value the
+    were written in dB. All other extra bytes have their names in the file; `input_amplitude` is one that the input of
+    the run had under the name of a wavebatch column. Where the file stores a no-data value the
     column is NaN. Columns of floating-point numbers keep their type. Integer columns that are scaled or declare a
     no-data value become float64, so that they can be NaN; all other integer columns (`echo_flags`, return numbers,
     classes) keep their type. `scan_angle` is in degrees.
@@ -58,9 +58,9 @@ class _TableReader(ColumnReader):
     def __init__(self, path: Path, columns: Sequence[str] | None) -> None:
         super().__init__(path, None)
         names = self._name_columns()
-        chosen = {name: names.get(name, name) for name in (names if columns is None else columns)}
+        chosen = names if columns is None else columns
         try:
-            found = {name: self._find(stored) for name, stored in chosen.items()}
+            found = {name: self._find(names.get(name, name), stored=name in names) for name in chosen}
         except BaseException:
             self.close()
             raise
@@ -72,7 +72,8 @@ class _TableReader(ColumnReader):
         """Name of every column in the table -> its name in the file."""
         known = self.list_columns()
         extra = [one for one in self._format.extra_dimensions if one.num_elements == 1]
-        ours = {one.name: name for name, one in find_columns(extra, COLUMNS).items() if name not in known}
+        ours = {one.name: name for name, one in self._find_ours(extra, COLUMNS).items()}
+        ours |= {name: f"input_{name}" for name in ours.values() if name in known and name not in ours}
         axes = {axis: axis for axis in "xyz"}
         standard = {name: name for name in known if name not in axes and name not in {one.name for one in extra}}
         return axes | standard | {ours.get(one.name, one.name): one.name for one in extra}

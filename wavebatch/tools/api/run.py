@@ -14,12 +14,12 @@ from typing import Any, Literal
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, split_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.calibration import load_calibration, needs_sensor
+from wavebatch.surveying.calibration import find_makers, load_calibration, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -36,6 +36,7 @@ def run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -43,6 +44,9 @@ def run(
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
     point_format: int | None = None,
+    las_version: Literal["1.4", "1.3", "keep"] = "1.4",
+    no_data: Literal["-9999", "nan"] = "-9999",
+    strict: bool = False,
     names: Literal["wavebatch", "asprs", "riegl", "pdal", "opals"] = "wavebatch",
     keep_packets: bool = False,
     direction: Literal["auto", "toward", "away"] = "auto",
@@ -71,7 +75,10 @@ def run(
     tolerance : float, optional
         Range error [m]; the cheapest shipped chain that meets it runs, in place of `chain`.
     system : Survey, path or str, optional
-        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip.
+        A survey, or the file of a saved one (`wavebatch survey -o`), in place of one of each strip. A strip whose
+        samples contradict it fails.
+    force : bool
+        Use the survey of `system` also for strips that contradict it.
     survey : {"each", "flight"}
         Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
         again by later runs into it. A strip that does not fit it gets one of its own.
@@ -80,13 +87,20 @@ def run(
     calibration : path or str, optional
         A file of `wavebatch calibrate`.
     columns : str, optional
-        "a,b" writes these columns only, "+a,+b" adds them to the usual ones.
+        "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
+        them.
     points : {"echoes", "returns"}
         One point per echo found, or the points of the input with new columns.
     format : {"laz", "las"}
         Of the clouds.
     point_format : int, optional
-        LAS point format of the clouds; default: that of the strip without waveforms.
+        LAS point format of the clouds; default: 6, or 7 or 8 where the strip has colours.
+    las_version : {"1.4", "1.3", "keep"}
+        LAS version of the clouds; "keep": that of the strip, with its point format.
+    no_data : {"-9999", "nan"}
+        What floating-point columns hold where an echo has no value.
+    strict : bool
+        Fail where extra bytes of a strip have no free value to mark added echoes.
     names : {"wavebatch", "asprs", "riegl", "pdal", "opals"}
         Names and units of the extra bytes.
     keep_packets : bool
@@ -121,8 +135,9 @@ def run(
         For wrong options, before anything starts.
     """
     plan = plan_run(
-        strips, out, chain=chain, tolerance=tolerance, system=system, survey=survey, sensor=sensor,
-        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format, names=names,
+        strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
+        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format,
+        las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
         memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
     )  # fmt: skip
@@ -136,6 +151,7 @@ def plan_run(
     chain: ChainLike = None,
     tolerance: float | None = None,
     system: Survey | Path | str | None = None,
+    force: bool = False,
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
@@ -152,7 +168,7 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, survey, sensor, calibration, columns, jobs, scheduler, memory
+    strips, out, chain, tolerance, system, force, survey, sensor, calibration, columns, jobs, scheduler, memory
         As for `run`.
     block_size, overwrite, resume
         As for `run`.
@@ -172,6 +188,9 @@ def plan_run(
         For whatever is wrong with the options.
     """
     found, request = find_request(chain, tolerance=tolerance, system=system)
+    if force and system is None:
+        raise ConfigError("--force is of no use without --system; leave it out")
+    request = replace(request, force=force)
     if survey == "flight":
         if system is not None:
             raise ConfigError("--system and --survey flight exclude each other; give one of them")
@@ -182,12 +201,15 @@ def plan_run(
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)
+        extra = find_makers(found, [entry.lstrip("+") for entry in split_columns(columns)])
+        template = replace(template, added=extra)
+        found = template.extend(found)
     _check_use(found, sensor, known)
     options = RunOptions(columns=choose_columns(found, columns), **output)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
     batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
-    plan = [StripJob(path, found, options, request, sensor, known) for path in paths]
+    plan = [replace(template, path=path, chain=found, options=options) for path in paths]
     check_outputs(plan, batch_options)
     return plan, batch_options
 
@@ -232,7 +254,9 @@ def find_request(
 
 
 def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any) -> None:
-    """Raise ConfigError for files that the chain would ignore."""
+    """Raise ConfigError for files that the chain, or another option, would ignore."""
+    if sensor.trajectory is not None and sensor.height is not None:
+        raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration}
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):

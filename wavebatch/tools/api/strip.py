@@ -16,6 +16,7 @@ from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.angle_limits import survey_angles
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.systems.saved_check import with_look
 
 BLOCK_SIZE = 16_384
 """Waveforms of a block by default: above some 4,000 the speed hardly changes, memory does (80 samples: about 10 MB)."""
@@ -153,7 +154,7 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     if not sample:
         path = strip.facts.path
         raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-    found = survey_blocks(sample)
+    found = with_look(survey_blocks(sample), sample)
     if divergence is not None:
         found = survey_angles(strip.reader, strip.scan, found, divergence)
     chosen = decide(found)

@@ -22,6 +22,7 @@ from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
@@ -92,12 +93,14 @@ def match_sides(
     *,
     tolerance_ns: float = 1.0,
     survey: Survey | None = None,
+    force: bool = False,
     limit: int | None = None,
 ) -> Matchup:
     """Compares the echoes of a and b on the waveforms of a strip; without b, a with the vendor's returns.
 
-    At least one side is a chain. survey: used instead of a survey of the strip. limit: use about as many waveforms,
-    spread evenly over the strip, instead of all; not with a cloud. Memory is bounded, as in compare_clouds.
+    At least one side is a chain. survey: used instead of a survey of the strip; force: also where the strip contradicts
+    it. limit: use about as many waveforms, spread evenly over the strip, instead of all; not with a cloud. Memory is
+    bounded, as in compare_clouds.
     Raises InputError for files that cannot be read, ConfigError for sides that cannot be compared.
     """
     clouds = [side for side in (a, b) if side is not None and side.is_cloud]
@@ -107,6 +110,7 @@ def match_sides(
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
+        check_saved(reader, scan, survey, force=force)
         survey = survey or survey_blocks(read_sample(reader, scan))
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         chosen = choose_chain(survey)

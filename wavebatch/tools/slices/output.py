@@ -14,6 +14,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.figure_file import open_picture
+from wavebatch.files.geojson_crs import GeoJsonCrs
 from wavebatch.tools.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")
@@ -27,21 +28,22 @@ _MOST_PIXELS = 40_000_000
 class SegmentWriter:
     """Writes segments to a .csv or .geojson file: `write` as often as needed, then `commit`.
 
-    A context manager: without `commit` no file remains. crs: WKT that is stored in the GeoJSON as `crs_wkt`;
-    coordinates are those of the strip. Raises ConfigError for another suffix, InputError if the target exists (without
-    overwrite) or cannot be written.
+    A context manager: without `commit` no file remains. crs: how points are written as GeoJSON; a .csv has the
+    coordinates of the strip. Raises ConfigError for another suffix, InputError if the target exists (without overwrite)
+    or cannot be written.
     """
 
-    def __init__(self, target: Path, *, crs: str | None = None, overwrite: bool = False) -> None:
+    def __init__(self, target: Path, *, crs: GeoJsonCrs | None = None, overwrite: bool = False) -> None:
         self.target = Path(target)
         suffix = self.target.suffix.lower()
         if suffix not in SEGMENT_SUFFIXES:
             raise ConfigError(f"{target}: segments are written as .csv or .geojson")
         refuse_existing(self.target, overwrite)
-        self._geojson, self._count = suffix == ".geojson", 0
+        self._geojson, self._count, self._crs = suffix == ".geojson", 0, crs or GeoJsonCrs(None, None)
         self._draft = Draft(self.target, overwrite=overwrite)
         if self._geojson:
-            self._put('{"type": "FeatureCollection", "crs_wkt": ' + json.dumps(crs) + ', "features": [')
+            member = "" if self._crs.member is None else f'"crs": {json.dumps(self._crs.member)}, '
+            self._put('{"type": "FeatureCollection", ' + member + '"features": [')
         else:
             self._put(",".join(_HEAD) + "\n")
 
@@ -64,10 +66,10 @@ class SegmentWriter:
         self._draft.publish()
 
     def _feature(self, segment: Segment) -> str:
-        ends = [[round(value, 4) for value in end] for end in (segment.start, segment.end)]
+        ends = np.array([segment.start, segment.end])
         feature = {
             "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": ends},
+            "geometry": {"type": "LineString", "coordinates": self._crs.place(ends)},
             "properties": {name: getattr(segment, name) for name in ("line", "segment", *_FIGURES)},
         }
         return (",\n" if self._count else "\n") + json.dumps(feature)

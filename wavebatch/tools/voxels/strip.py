@@ -27,6 +27,7 @@ from wavebatch.surveying.calibration import Calibration
 from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
+from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
@@ -102,6 +103,7 @@ def voxelize_strip(
     options: VoxelOptions,
     *,
     system: SavedSurvey | None = None,
+    force: bool = False,
     calibration: Calibration | None = None,
     sensor: SensorRequest | None = None,
     direction: str = "auto",
@@ -113,15 +115,17 @@ def voxelize_strip(
 ) -> VoxelSummary:
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
-    system: a saved survey, instead of a survey of this strip. calibration: for cross sections; it or the survey must
-    have the divergence of the beam. progress: called with the number of waveforms done since the last call, and the
-    total. block_size, held: waveforms at a time, and sums in memory; the output does not depend on them.
+    system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
+    for cross sections; it or the survey must have the divergence of the beam. progress: called with the number of
+    waveforms done since the last call, and the total. block_size, held: waveforms at a time, and sums in memory; the
+    output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
     refuse_existing(target, overwrite)
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+        check_saved(reader, scan, system and system.survey, force=force)
         pulse = _find_pulse(reader, scan, system, calibration)
         source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
         middle = _find_middle(reader, scan, options)

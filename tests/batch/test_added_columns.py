@@ -1,0 +1,65 @@
+"""Columns that no shipped chain computes, and flight heights that the strip does not need."""
+
+import numpy as np
+import pytest
+
+import wavebatch as wb
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import load_profile
+from wavebatch.surveying.calibration import find_makers, needs_sensor, with_stages
+
+MADE = sorted({name for stage in STAGES.values() if stage.kind == "attribute" for name in stage.makes} & COLUMNS.keys())
+
+
+@pytest.mark.parametrize("column", [name for name in MADE if COLUMNS[name].extra_bytes])
+def test_every_column_that_a_stage_makes_can_be_asked_for(column):
+    chain = load_profile("fast")
+    full = with_stages(chain, find_makers(chain, [column]))
+    assert column in full.makes  # and Chain has checked that what its stages need comes before them
+    assert find_makers(full, [column]) == ()
+
+
+def test_nothing_is_found_for_columns_without_a_stage():
+    assert find_makers(load_profile("fast"), ["echo_time", "echo_flags", "nothing"]) == ()
+
+
+@pytest.mark.parametrize("chain", [None, "auto", "fast", "accurate"])
+@pytest.mark.parametrize("columns", ["+range,+energy", "amplitude,range,energy"])
+def test_shipped_chains_get_the_stages(tiny_strip, tmp_path, chain, columns):
+    result = wb.run(tiny_strip, tmp_path, chain=chain, columns=columns)
+    assert not result.failed
+    cloud = wb.read_cloud(tmp_path / f"{tiny_strip.stem}.laz")
+    known = np.isfinite(cloud["amplitude"])
+    assert known.any() and np.isfinite(cloud["energy"][known]).all() and np.isfinite(cloud["range"][known]).any()
+    assert ("echo_width" in cloud.dtype.names) == columns.startswith("+")
+
+
+@pytest.mark.parametrize("column", ["range", "relative_backscatter", "relative_reflectance", "cross_section"])
+def test_added_stages_get_the_position_of_the_sensor(column):
+    chain = load_profile("fast")
+    assert needs_sensor(with_stages(chain, find_makers(chain, [column])))
+
+
+def test_a_chain_of_the_user_stays_as_it_is(tiny_strip, tmp_path):
+    with pytest.raises(wb.ConfigError, match=r"does not compute 'range'; add stage attribute\.range to it"):
+        wb.run(tiny_strip, tmp_path, chain=load_profile("fast"), columns="+range")
+
+
+def test_a_flight_height_is_used_named_or_refused(tiny_strip, tmp_path):
+    def run(height, folder):
+        sensor = wb.SensorRequest(height=height)
+        return wb.run(tiny_strip, tmp_path / folder, chain="fast", columns="+range", sensor=sensor).outcomes[0]
+
+    known = run(None, "none")
+    seen = known.report
+    outcome = run(800.0, "near")
+    assert outcome.error is None
+    (line,) = [line for line in outcome.report.remarks if "--flight-height" in line]
+    assert line.startswith("--flight-height 800 m is not used: positions are from the strip's direction vectors: ")
+    assert not [line for line in seen.remarks if "--flight-height" in line]
+    error = run(8000.0, "far").error
+    assert "--flight-height 8000 m contradicts the strip: by its direction vectors" in str(error)
+    both = wb.SensorRequest(trajectory=tiny_strip, height=800.0)
+    with pytest.raises(wb.ConfigError, match="--trajectory and --flight-height exclude each other"):
+        wb.run(tiny_strip, tmp_path / "both", columns="+range", sensor=both)

@@ -1,0 +1,103 @@
+"""A saved survey of another sensor is refused by every command with --system; one of the same sensor never is."""
+
+from dataclasses import replace
+
+import pytest
+from click.testing import CliRunner
+from helpers_scenes import make_scene
+from writer_tools import data_file
+
+from wavebatch.cli import main
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.systems.known_systems import known_systems
+from wavebatch.surveying.systems.saved_check import find_contradiction
+from wavebatch.tools.api.strip import survey
+from wavebatch.tools.simulate import find_pulse, simulate_strip
+
+SCENES = {
+    "flat": make_scene("flat"),
+    "forest": make_scene("forest"),
+    "slope": make_scene("slope"),
+    "noisy": make_scene("flat", noise_std=2.5),
+    "bits": make_scene("flat", bits=16),
+    "wide": make_scene("flat", pulse=find_pulse("leica"), n_samples=100),
+    "narrow": make_scene("flat", pulse=replace(find_pulse("gaussian"), sigma=1.2)),
+}
+CONTRADICTED = {"noisy": "its noise is", "bits": "samples have 16 bits", "wide": "ns wide", "narrow": "ns wide"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Strips by scene, and the saved survey of the flat one."""
+    folder = tmp_path_factory.mktemp("saved")
+    for name, scene in SCENES.items():
+        simulate_strip(scene, folder / f"{name}.las", pulses=1500, seed=5)
+    result = CliRunner().invoke(main, ["survey", str(folder / "flat.las"), "-o", str(folder / "SYSTEM.toml")])
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def contradiction(strip, saved):
+    with StripReader(strip) as reader, reader.scan() as scan:
+        return find_contradiction(reader, scan, saved)
+
+
+@pytest.mark.parametrize("plain", [False, True], ids=["with figures", "hand-written"])
+@pytest.mark.parametrize("name", SCENES)
+def test_another_sensor_contradicts_and_another_scene_does_not(folder, name, plain):
+    saved = load_survey(folder / "SYSTEM.toml").survey
+    if plain:
+        saved = replace(saved, figures={key: saved.figures[key] for key in ("bits", "spacing_ns")})
+    found = contradiction(folder / f"{name}.las", saved)
+    if plain and name == "noisy":
+        return  # less than three times the noise: such files do not give that of quiet samples
+    assert (found != "") == (name in CONTRADICTED), found
+    assert CONTRADICTED.get(name, "") in found
+
+
+def test_shipped_and_saved_surveys_of_real_strips_fit_their_own_strip_and_no_other():
+    paths = {
+        "riegl-q680i": data_file("riegl-q680i/100429_152240_2535pt_UTM.las"),
+        "leica-als": data_file("leica-als/simple1_3_full_internal.las"),
+    }
+    for known in known_systems():
+        shipped = replace(survey(paths[known.name]), system=known.system)
+        plain = replace(shipped, figures={key: shipped.figures[key] for key in ("bits", "spacing_ns")})
+        for name, path in paths.items():
+            for saved in (survey(paths[known.name]), plain, replace(plain, figures={})):
+                assert (contradiction(path, saved) == "") == (name == known.name), (name, known.name)
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["run", "-o", "out"],
+        ["voxelize", "--size", "5", "-o", "out.npz"],
+        ["compare", "fast", "--strip"],
+        ["plot", "waveform", "--packet", "3", "-o", "out.png"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_every_command_refuses_and_obeys_force(folder, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    arguments = [*command, folder / "noisy.las", "--system", folder / "SYSTEM.toml"]
+    result = run(*arguments)
+    assert result.exit_code == {"run": 4, "compare": 2}.get(command[0], 1), result.output
+    assert "noisy.las: the survey given by --system is not of this sensor: its noise is" in result.stderr
+    assert "--force" in result.stderr and len(result.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.glob("*.[nlp][ap][zsn]")) and not list(tmp_path.glob("out/*.laz"))
+    assert run(*arguments, "--force").exit_code == 0
+
+
+def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
+    result = run("run", folder / "noisy.las", "-o", tmp_path, "-q", "--system", folder / "SYSTEM.toml", "--force")
+    assert result.exit_code == 0
+    assert "warning: --force: the survey given by --system is not of this sensor: its noise is" in result.stderr
+    assert "--force: the survey" in (tmp_path / "noisy.report.json").read_text()
+    result = run("run", folder / "flat.las", "-o", tmp_path, "--force")
+    assert result.exit_code == 2 and "--force is of no use without --system" in result.stderr

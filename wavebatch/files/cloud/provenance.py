@@ -1,0 +1,44 @@
+"""The account of the run in a cloud: JSON in VLRs of the user id "wavebatch", one per run, the latest with the largest
+number.
+
+`CloudWriter` writes it; all readers of clouds find wavebatch's columns with it, `wavebatch info` shows it. Before you
+change it: the bytes may come from any program, so whatever is not as expected counts as no account.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from typing import Any
+
+from wavebatch.files.las.header import LasHeader
+
+USER_ID = "wavebatch"
+"""User id of the records."""
+
+
+def read_accounts(header: LasHeader) -> list[dict[str, Any]]:
+    """Return the accounts in a cloud's header, oldest first; empty for a file that wavebatch did not write."""
+    records = sorted((vlr for vlr in header.vlrs if vlr.user == USER_ID), key=lambda vlr: vlr.record_id)
+    accounts = []
+    for record in records:
+        try:
+            account = json.loads(record.payload)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(account, dict):
+            accounts.append(account)
+    return accounts
+
+
+def find_written(header: LasHeader, extra: Collection[str]) -> dict[str, str]:
+    """Return the file's name of each wavebatch column, by the latest account.
+
+    extra: names of the extra dimensions of the file. Another program may have renamed or left out some since then; if
+    none of the columns is left the account does not describe this file, and the result is empty.
+    """
+    accounts = read_accounts(header)
+    columns = accounts[-1].get("columns") if accounts else None
+    if not isinstance(columns, dict):
+        return {}
+    return {column: name for column, name in columns.items() if isinstance(name, str) and name in extra}

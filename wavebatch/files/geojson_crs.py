@@ -1,0 +1,107 @@
+"""The CRS of GeoJSON that is written: WGS 84, which is all that the standard (RFC 7946) knows, or that of the strip.
+
+`wavebatch slice` writes with it. Heights stay those of the strip: only pyproj's grids could change their datum.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.las.geotiff_wkt import find_code
+from wavebatch.files.las.header import Vlr
+
+GEOJSON_CRS = ("wgs84", "keep")
+"""Values of --geojson-crs."""
+
+_DEGREES, _METRES = 9, 4
+"""Decimals of coordinates: a tenth of a millimetre."""
+
+
+@dataclass(frozen=True, slots=True)
+class GeoJsonCrs:
+    """How points of a strip are written."""
+
+    member: dict[str, Any] | None
+    """Value of the member `crs` of the file; None for none."""
+    project: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None
+    """Longitude and latitude of x and y; None: coordinates stay as they are."""
+
+    def place(self, points: np.ndarray) -> list[list[float]]:
+        """Return coordinates of points (n, 3) as they are written."""
+        points = np.array(points, np.float64)
+        if self.project is not None:
+            points[:, 0], points[:, 1] = self.project(points[:, 0], points[:, 1])
+        decimals = _METRES if self.project is None else _DEGREES
+        return [[round(x, decimals), round(y, decimals), round(z, _METRES)] for x, y, z in points.tolist()]
+
+
+def find_crs(text: str | None, vlrs: Iterable[Vlr]) -> str | None:
+    """Return the CRS of a file as GIS understand it: its WKT, or `EPSG:code` by its GeoTIFF keys; None without either.
+
+    text: as `read_crs` gives it.
+    """
+    if text is not None and text.rstrip().endswith("]"):
+        return _repair(text)
+    code = find_code(vlrs)
+    return None if code is None else f"EPSG:{code}"
+
+
+def _repair(wkt: str) -> str:
+    """The WKT with degrees as the unit of its geographic CRS.
+
+    RIEGL's RiPROCESS writes metres there. PROJ then takes a central meridian of 15 for 15 radians: a strip in Austria
+    would lie in Siberia.
+    """
+    start = wkt.find("GEOGCS[")
+    wrong = re.search(r'UNIT\["[Mm]et(?:er|re)",\s*1(?:\.0*)?\s*(,AUTHORITY\["EPSG","9001"\])?\]', wkt[start:])
+    if start < 0 or wrong is None or "PROJECTION[" in wkt[start : start + wrong.start()]:
+        return wkt
+    unit = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
+    return wkt[: start + wrong.start()] + unit + wkt[start + wrong.end() :]
+
+
+def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
+    """Return how points of a strip are written as GeoJSON.
+
+    path: of the strip, for messages. crs: from `find_crs`. mode: one of GEOJSON_CRS.
+    Raises InputError for a strip whose CRS is missing or unknown, ConfigError without pyproj.
+    """
+    if mode not in GEOJSON_CRS:
+        raise ConfigError(f"geojson_crs {mode!r}: must be one of {', '.join(GEOJSON_CRS)}")
+    if mode == "keep":
+        return GeoJsonCrs(None if crs is None else _name(crs), None)
+    if crs is None:
+        raise InputError(
+            f"{path}: has no CRS, so its points have no longitude and latitude, which GeoJSON needs; write .csv, or "
+            "--geojson-crs keep for the coordinates of the strip"
+        )
+    try:
+        import pyproj
+    except ImportError as error:
+        raise ConfigError(
+            f"{path}: GeoJSON in WGS 84 needs pyproj: pip install 'wavebatch[gis]'; or write .csv, or --geojson-crs "
+            "keep for the coordinates of the strip"
+        ) from error
+    try:
+        source = pyproj.CRS.from_user_input(crs)
+        transformer = pyproj.Transformer.from_crs(source.to_2d(), "EPSG:4326", always_xy=True)
+    except pyproj.exceptions.ProjError as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: its CRS is not understood ({reason}); write --geojson-crs keep") from error
+    return GeoJsonCrs(None, transformer.transform)
+
+
+def _name(crs: str) -> dict[str, Any]:
+    """The member `crs` of GeoJSON 2008, which GDAL and QGIS read: an EPSG code, or else the WKT."""
+    found = re.search(r'(?:AUTHORITY\["EPSG","|ID\["EPSG",)(\d+)"?\]\s*\]\s*$', crs) or re.fullmatch(r"EPSG:(\d+)", crs)
+    code = int(found[1]) if found else 0
+    # RIEGL writes code 0, which GDAL would look up.
+    plain = re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", crs)
+    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}" if code else plain}}

@@ -1,0 +1,141 @@
+"""Whether a saved survey contradicts the strip that it is used for: another sensor, other settings, another unit.
+
+All commands with `--system` call `check_saved`. It measures what `flight` holds strips of a flight against, except the
+level, which the noise stage finds for every waveform. Before you change it: slopes and forest widen echoes, so a strip
+of the same sensor must never be refused for its scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.surveying import Survey
+from wavebatch.surveying.choose_chain import sample_size
+from wavebatch.surveying.flight import (
+    HELD,
+    STEADY,
+    Look,
+    compare_looks,
+    describe_kinds,
+    describe_look,
+    look_at,
+    read_flight,
+)
+
+LARGEST_WIDTH, LEAST_WIDTH, LARGEST_MISFIT, LARGEST_NOISE = 1.4, 0.7, 0.15, 3.0
+"""Limits for files without the figures of a look, such as shipped or hand-written ones: width of a Gaussian fit over
+that of the saved pulse, whose lobes widen either; misfit as a share of the amplitude; ratio of the noise, which such
+files give for thresholds and not of quiet samples."""
+
+Form = tuple[float, float]
+"""Bits and spacing [ns] of samples."""
+
+
+def with_look(survey: Survey, blocks: Iterable[WaveformBlock]) -> Survey:
+    """Return a survey with the figures by which `check_saved` and `hold_strip` know other strips of the sensor.
+
+    Parameters
+    ----------
+    survey : Survey
+    blocks : iterable of WaveformBlock
+        The sample that it was made on.
+
+    Returns
+    -------
+    Survey
+    """
+    blocks = list(blocks)
+    look = look_at(blocks, survey.system)
+    if look is None:
+        return survey
+    return replace(survey, figures={**survey.figures, **describe_look(look), **describe_kinds(blocks)})
+
+
+def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, force: bool = False) -> str:
+    """Check that a saved survey can be that of a strip.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    survey : Survey or None
+        None, as without --system, is never contradicted.
+    force : bool
+        Return the contradiction, where there is one, in place of an error.
+
+    Returns
+    -------
+    str
+        The contradiction, with `force`; else empty.
+
+    Raises
+    ------
+    InputError
+        Where bits, spacing, noise or width of the strip contradict the survey.
+    """
+    reason = "" if survey is None else find_contradiction(reader, scan, survey)
+    if reason and not force:
+        raise InputError(
+            f"{reader.facts.path}: the survey given by --system is not of this sensor: {reason}; leave --system out to "
+            "survey the strip, or use it all the same with --force"
+        )
+    return reason
+
+
+def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> str:
+    """Return what contradicts the survey in a strip; empty where nothing does, or where too little is there to see.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    survey : Survey
+
+    Returns
+    -------
+    str
+    """
+    blocks = tuple(reader.sample_blocks(scan, min(HELD, sample_size(reader, scan))))
+    if not blocks:
+        return ""
+    figures = survey.figures
+    forms = {(float(block.digitizer.bits), float(block.spacing)) for block in blocks}
+    if "flight_width" in figures:
+        whole, kinds = read_flight(survey)
+        known = {kind[:2] for kind in kinds.values()}
+    else:
+        known = {(figures["bits"], figures["spacing_ns"])} if {"bits", "spacing_ns"} <= figures.keys() else forms
+    if not forms & known:
+        return f"its samples have {_in_words(forms)}, those of the survey {_in_words(known)}"
+    look = look_at(blocks, survey.system)
+    if look is None:
+        return ""
+    if "flight_width" not in figures:
+        return _compare_system(look, survey)
+    look = replace(look, level=look.level._replace(mean=whole.level.mean))
+    return compare_looks(look, whole, survey.system).replace("the flight", "the survey")
+
+
+def _in_words(forms: set[Form]) -> str:
+    return " or ".join(f"{bits:g} bits, {step:g} ns apart" for bits, step in sorted(forms))
+
+
+def _compare_system(look: Look, survey: Survey) -> str:
+    """Why echoes and noise are not of the saved pulse, with wide limits."""
+    system = survey.system
+    noises = [system.noise_std, *(value for value in system.noise_by_kind.values() if value > 0)]
+    if not min(noises) / LARGEST_NOISE < look.level.std < max(noises) * LARGEST_NOISE:
+        return f"its noise is {look.level.std:.2f} DN, that of the survey {system.noise_std:.2f}"
+    if not look.width:
+        return ""
+    ratio = look.width / system.sigma_ref
+    if ratio < LEAST_WIDTH or (ratio > LARGEST_WIDTH and look.steady > STEADY):
+        pulse = f"the saved pulse {system.sigma_ref:.2f} ns"
+        return f"its echoes are {look.width:.2f} ns wide (Gaussian sigma), {pulse}"
+    if look.misfit > LARGEST_MISFIT:
+        return f"the saved pulse misses its strong echoes by {100 * look.misfit:.0f} % of the amplitude"
+    return ""
