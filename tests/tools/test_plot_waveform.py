@@ -21,8 +21,9 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.decompose.rebuild import MODELS
-from wavebatch.tools.bench.plot import _draw_panel, _place_labels
+from wavebatch.tools.bench.plot import _draw_panel
 from wavebatch.tools.plots.draw_sheet import draw_sheet
+from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Wanted, find_places
 from wavebatch.tools.plots.waveform import build_views, read_views
 
@@ -299,7 +300,7 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
         axes = figure.subplots()
         labels = _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
         figure.draw_without_rendering()
-        _place_labels(axes, labels)
+        place_labels(axes, labels, keep=True)
         boxes = [text.get_window_extent() for text in axes.texts]
         frame = axes.get_window_extent()
     assert len(boxes) == 5

@@ -15,9 +15,12 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
+from wavebatch.files.text_file import write_text
 
+_SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
 _flags = shared.together(
     click.option("--flags-with", multiple=True, metavar="NAMES",
@@ -33,6 +36,10 @@ def _read_range(context: click.Context, parameter: click.Parameter, text: str | 
     if not low < high or high - low == float("inf"):
         raise click.BadParameter(f"{text!r} does not go up from one finite number to another")
     return low, high
+
+
+def _read_times(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | str | None:
+    return "all" if text == "all" else _read_range(context, parameter, text)
 
 
 def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
@@ -65,14 +72,18 @@ def plot() -> None:
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
-@click.option("--times", "shown", callback=_read_range, metavar="LOW:HIGH",
-              help="Part of the waveforms to show [ns].  [default: all]")
+@click.option("--times", "shown", callback=_read_times, metavar="LOW:HIGH|all",
+              help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
+@click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
+              "threshold; detector: that of the chain's own detector.")
+@click.option("--echoes", "table", is_flag=True,
+              help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes them instead.")
 @shared.chain_options
 @shared.system_option
 @shared.strip_options
 @shared.common_options("overwrite", "quiet")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
-    """Draw waveforms of STRIP with their fit, residual and echoes.
+    """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
 
     Shows samples, baseline and noise, the fitted sum, the pulse of each echo, the residual in standard deviations of
     the noise, echoes with their errors, and the returns of the file. The chain is chosen and run as by `wavebatch run`.
@@ -86,28 +97,54 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
     if options["random"] and any(options[name] for name in ("packets", "points", "times", "flags_with")):
         raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
-    check_picture(output, overwrite=options["overwrite"])
+    if options["sheet"] and (options["show"] or options["table"]):
+        raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
+    tabular = output.suffix.lower() == ".csv"
+    check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
     wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
-    views, chain = _view(strip, wanted, options)
-    from wavebatch.tools.plots.draw_sheet import draw_sheet
-    from wavebatch.tools.plots.draw_waveform import draw_waveforms
+    views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
+    if tabular:
+        from wavebatch.tools.plots.echo_table import format_echoes
 
-    shown, overwrite = options["shown"], options["overwrite"]
-    draw = draw_sheet if options["sheet"] else draw_waveforms
-    draw(views, output, strip=strip.name, chain=chain, times=shown, overwrite=overwrite)
+        write_text(output, format_echoes(views), overwrite=options["overwrite"])
+    else:
+        _draw_waveforms(views, output, strip.name, chain, options)
     if not options["quiet"]:
         echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
 
 
-def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any], str]:
-    """The waveforms that are wanted, and the name of the chain that they were run through."""
+def _check(output: Path, options: dict[str, Any]) -> None:
+    check_picture(output, overwrite=options["overwrite"])
+
+
+def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
+    """Draws the waveforms as small multiples or as a contact sheet."""
+    shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
+    if shown == "all":
+        last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
+        shown = (min(-0.5 * view.spacing for view in views), last)
+    if options["sheet"]:
+        from wavebatch.tools.plots.draw_sheet import draw_sheet
+
+        draw_sheet(views, output, times=shown, **more)
+        return
+    from wavebatch.tools.plots.draw_waveform import draw_waveforms
+
+    draw_waveforms(views, output, times=shown, table=options["table"], **more)
+
+
+def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
+    """The waveforms that are wanted, and the chain that they were run through, in words.
+
+    ranges: compute the distances of the echoes from the sensor, too, if its position is known.
+    """
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
     from wavebatch.surveying.systems.saved_check import check_saved
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
-    from wavebatch.tools.plots.waveform import read_views
+    from wavebatch.tools.plots.waveform import add_ranges, describe_chain, read_views
 
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
@@ -116,7 +153,11 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
         choice = make_choice(reader, scan, chain, request)
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
-        return read_views(reader, scan, places, choice.chain, system), choice.chain.name
+        run, fill = choice.chain, None
+        if ranges:
+            run, fill = add_ranges(choice.chain, reader, scan)
+        views = read_views(reader, scan, places, run, system, options["show"], fill)
+        return views, describe_chain(choice.chain)
 
 
 @plot.command()
