@@ -163,44 +163,80 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @plot.command()
 @shared.clouds_argument
 @_output
-@click.option("--column", required=True, help="Extra dimension or standard field; echo_flags counts flags.")
+@click.option("--column", "columns", required=True, multiple=True,
+              help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
+              "share an axis, others get one of their own.")
+@click.option("--by", metavar="COLUMN", help="Draw one line per value of this column, e.g. number_of_returns or "
+              "classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
-              help="Values to show.  [default: all but far outliers]")
+              help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
+@click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
 @_flags
 @shared.common_options("overwrite", "quiet")
-def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
-    """Draw a histogram of a column of CLOUDs of any size.
+def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
+    """Draw histograms of columns of CLOUDs of any size.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Points without data are left
     out and counted. For a column with discrete values, each bin holds the same number of possible values.
 
+    Several lines (of --column, --by or --each) are drawn as shares of their values, so that they can be compared.
+
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
+    from wavebatch.tools.plots.histogram import is_flags
 
     clouds = find_files(map(str, clouds))
-    check_picture(output, overwrite=options["overwrite"])
-    selection = _select(column, options)
-    how = {"log": options["log"], "overwrite": options["overwrite"]}
-    if is_flags(clouds[0], column):
-        _refuse_for_flags(options)
-        counted = count_flags(clouds, selection)
-        from wavebatch.tools.plots.draw_cloud import draw_flags
-
-        draw_flags(counted, output, names=tuple(path.name for path in clouds), **how)
-        text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
+    _check(output, options)
+    columns = tuple(dict.fromkeys(columns))
+    if any(is_flags(clouds[0], column) for column in columns):
+        text = _draw_flags(clouds, columns, output, options)
     else:
-        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each")})
-        from wavebatch.tools.plots.draw_cloud import draw_histogram
-
-        draw_histogram(found, output, **how)
-        total = found.total
-        text = f"{count(total.values, 'value')}, {total.no_data} without data, {total.left_out} left out by flags"
+        text = _draw_histograms(clouds, columns, output, options)
     if not options["quiet"]:
         talk(f"{output}: {text}")
+
+
+def _draw_flags(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]) -> str:
+    """Draws the counts of flags; returns a summary."""
+    from wavebatch.tools.plots.histogram import count_flags
+
+    if len(columns) > 1:
+        raise ConfigError(f"flags are counted by name, not by value: draw {', '.join(columns)} one by one")
+    _refuse_for_flags(options)
+    counted = count_flags(clouds, _select(columns[0], options))
+    from wavebatch.tools.plots.draw_cloud import draw_flags
+
+    names = tuple(path.name for path in clouds)
+    draw_flags(counted, output, names=names, log=options["log"], overwrite=options["overwrite"])
+    return f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
+
+
+def _draw_histograms(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]) -> str:
+    """Draws histograms, those of one unit in one axis; returns a summary."""
+    from wavebatch.tools.plots.histogram import count_values
+    from wavebatch.tools.plots.values import Clouds
+
+    panels: dict[str, list[Any]] = {}
+    for column in columns:
+        selection = _select(column, options)
+        panels.setdefault(Clouds(clouds, selection).facts.unit, []).append(selection)
+    how = {name: options[name] for name in ("bins", "limits", "each", "by")}
+    if len(panels) > 1 and options["limits"]:
+        raise ConfigError(f"--range is for one unit; {', '.join(columns)} are in {', '.join(panels)}")
+    every = [count_values(clouds, selections, **how) for selections in panels.values()]
+    from wavebatch.tools.plots.draw_cloud import draw_histograms
+
+    how = {name: options[name] for name in ("log", "counts", "overwrite")}
+    draw_histograms(every, output, **how)
+    texts = []
+    for found in every:
+        total, outside = found.total, int(found.below.sum() + found.above.sum())
+        parts = f"{total.no_data} without data, {total.left_out} left out by flags, {outside} outside the picture"
+        texts.append(f"{count(total.values, 'value')}, {parts}")
+    return "; ".join(texts)
 
 
 def _select(column: str | None, options: dict[str, Any]) -> Any:
@@ -210,7 +246,9 @@ def _select(column: str | None, options: dict[str, Any]) -> Any:
 
 
 def _refuse_for_flags(options: dict[str, Any]) -> None:
-    for name, option in (("bins", "--bins"), ("limits", "--range"), ("each", "--each")):
+    for name, option in (
+        ("bins", "--bins"), ("limits", "--range"), ("each", "--each"), ("by", "--by"), ("counts", "--counts"),
+    ):  # fmt: skip
         if options[name]:
             raise ConfigError(f"{option} is of no use for flags, which are counted by name")
 
