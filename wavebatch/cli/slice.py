@@ -31,6 +31,9 @@ _SURVEYED = 2000
 @shared.strip_argument
 @shared.output_option("Write the segments: .csv or .geojson.", required=False)
 @shared.output_option("Draw the first slice of --lines.", "FILE", "--png", required=False)
+@shared.output_option("Draw all segments of --lines in plan and in 3D.", "FILE", "--overview", required=False)
+@shared.output_option("Write the samples of --lines as a cube of line, pulse and time, for `wavebatch plot cube`.",
+                      "FILE.npz", "--cube", required=False)
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,

@@ -127,7 +127,7 @@ def draw_flags(
         axes.set_xlim(0, max(int(counts.max(initial=1)), 1) * (10.0 if log else 1.25))
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
-        name = _name_clouds(names)
+        name = name_clouds(names)
         title = f"{name}   {plain_text(found.facts.name, 40)}\n{found.total.values:,} points; a point may have several flags"
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
@@ -206,10 +206,10 @@ def _title(names: tuple[str, ...], total: Tally, column: str, outside: Mapping[s
     """Title: clouds, column, number of values, and points that are not shown, with the reason."""
     rest = {"without data": total.no_data, "left out": total.left_out, **outside}
     parts = [f"{total.values:,} values", *(f"{number:,} {text}" for text, number in rest.items() if number)]
-    return f"{_name_clouds(names)}   {plain_text(column, 60)}\n{', '.join(parts)}"
+    return f"{name_clouds(names)}   {plain_text(column, 60)}\n{', '.join(parts)}"
 
 
-def _name_clouds(names: tuple[str, ...]) -> str:
+def name_clouds(names: tuple[str, ...]) -> str:
     return plain_text(names[0], 60) if len(names) == 1 else f"{len(names)} clouds"
 
 

@@ -1,4 +1,4 @@
-"""`wavebatch plot`: pictures of waveforms, histograms and maps.
+"""`wavebatch plot`: pictures of waveforms, histograms and maps; sections and profiles are in `sections`.
 
 Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
 else has succeeded: matplotlib takes long to import and may be missing.
@@ -14,6 +14,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, talk
+from wavebatch.cli.plot.sections import flag_options, profile, section, select
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
@@ -22,12 +23,6 @@ from wavebatch.files.text_file import write_text
 
 _SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
-_flags = shared.together(
-    click.option("--flags-with", multiple=True, metavar="NAMES",
-                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
-    click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
-)  # fmt: skip
-
 
 def _read_range(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
     if text is None:
@@ -48,7 +43,7 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 
 @click.group(cls=NearestGroup)
 def plot() -> None:
-    """Draw waveforms, histograms and maps as .png, .svg or .pdf.
+    """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
 
     Needs matplotlib: pip install 'wavebatch[plot]'. No screen is needed; the same input gives the same bytes.
     """
@@ -174,7 +169,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
-@_flags
+@flag_options
 @shared.common_options("overwrite", "quiet")
 def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Draw histograms of columns of CLOUDs of any size.
@@ -206,7 +201,7 @@ def _draw_flags(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, 
     if len(columns) > 1:
         raise ConfigError(f"flags are counted by name, not by value: draw {', '.join(columns)} one by one")
     _refuse_for_flags(options)
-    counted = count_flags(clouds, _select(columns[0], options))
+    counted = count_flags(clouds, select(columns[0], options))
     from wavebatch.tools.plots.draw_cloud import draw_flags
 
     names = tuple(path.name for path in clouds)
@@ -221,7 +216,7 @@ def _draw_histograms(clouds: Sequence[Path], columns: tuple[str, ...], output: P
 
     panels: dict[str, list[Any]] = {}
     for column in columns:
-        selection = _select(column, options)
+        selection = select(column, options)
         panels.setdefault(Clouds(clouds, selection).facts.unit, []).append(selection)
     how = {name: options[name] for name in ("bins", "limits", "each", "by")}
     if len(panels) > 1 and options["limits"]:
@@ -237,12 +232,6 @@ def _draw_histograms(clouds: Sequence[Path], columns: tuple[str, ...], output: P
         parts = f"{total.no_data} without data, {total.left_out} left out by flags, {outside} outside the picture"
         texts.append(f"{count(total.values, 'value')}, {parts}")
     return "; ".join(texts)
-
-
-def _select(column: str | None, options: dict[str, Any]) -> Any:
-    from wavebatch.tools.plots.values import Selection, read_flags
-
-    return Selection(column, read_flags(options["flags_with"]), read_flags(options["flags_without"]))
 
 
 def _refuse_for_flags(options: dict[str, Any]) -> None:
@@ -262,7 +251,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
-@_flags
+@flag_options
 @shared.common_options("overwrite", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
@@ -279,7 +268,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
-    selection = _select(column, options)
+    selection = select(column, options)
     found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bounds"])
     from wavebatch.tools.plots.draw_cloud import draw_map
 
@@ -288,3 +277,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
         grid, total = found.grid, found.total
         points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
         talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} m")
+
+
+plot.add_command(section)
+plot.add_command(profile)
