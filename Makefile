@@ -3,6 +3,7 @@
 #   make test      the fast tests          make test-all   all of them
 #   make papers    the tables of five papers on simulated data
 #   make bench     error against run time  make docs       the documentation as a site, in site/
+#   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
@@ -54,7 +55,13 @@ papers: $(VENV)/.run
 bench: $(VENV)/.test
 	@mkdir -p $(BENCH)
 	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
+ifdef BASE
+	@rm -rf $(BENCH)/base && git worktree prune && git worktree add --quiet --detach $(BENCH)/base $(BASE)
+	$(BIN)/wavebatch bench --against $(BENCH)/base --pulses 200000 --repeat 5 -o $(BENCH); \
+	  status=$$?; git worktree remove --force $(BENCH)/base; exit $$status
+else
 	$(BIN)/wavebatch bench --scene mixed --scene open --scene forest --scene empty --promises -o $(BENCH)
+endif
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -19,7 +19,7 @@ SYSTEMS = {
     "gaussian": SystemPulse(2.0, baseline=12.0, baseline_spread=0.4, noise_std=1.0, saturation=255.0),
     "skewed": SystemPulse(2.0, baseline=12.0, noise_std=1.0, kappa=0.1),
     "learned": SystemPulse(
-        2.0, baseline=12.0, noise_std=1.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.0), (-0.03, 10.0, 3.0))
+        2.0, baseline=12.0, noise_std=1.0, components=((1.0, 0.0, 2.0), (0.1, 5.0, 2.0), (-0.03, 10.0, 3.0)), skew=0.05
     ),
     "noise grows": SystemPulse(2.0, baseline=12.0, noise_std=1.0, noise_gain=0.05),
     "short": SystemPulse(0.6, baseline=12.0, noise_std=0.3),

@@ -54,5 +54,14 @@ def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
         [*command, "-n", f"CHAIN={chain}"], check=True, env=environment, capture_output=True, text=True
     )
     assert told.stdout.count(f"--chain {chain} --resume --quiet {strips.name}/b.las") == 1
+    (strips / "b.las").rename(strips / "b.LAS")
+    (strips / "c.laz").write_bytes(b"no strip")
+    (out / "summary.json").unlink()
+    failing = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert failing.returncode != 0 and "c.laz: not a LAS or LAZ file" in failing.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert {Path(one["strip"]).name: one["status"] for one in summary["strips"]} == {
+        "a.las": "skipped", "b.LAS": "skipped", "c.laz": "failed"
+    }  # fmt: skip
     nothing = subprocess.run([*command, "STRIPS=none"], env=environment, capture_output=True, text=True)
     assert nothing.returncode != 0 and "none holds no .las or .laz file; say STRIPS=FOLDER" in nothing.stderr

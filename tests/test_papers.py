@@ -3,10 +3,18 @@
 import importlib
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from wavebatch.kernels.fit.pulse_shape import PulseShape
+from wavebatch.kernels.physics import radar, radiometry
+from wavebatch.stages.attribute import width_angle
+from wavebatch.stages.decompose import models, skew
+from wavebatch.tools.simulate import from_returns
+from wavebatch.tools.slices import segments
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
@@ -67,3 +75,132 @@ def test_a_figure_outside_its_band_fails(load, monkeypatch, capsys):
     assert lines[6] == "a text"
     assert lines[-3:] == ["2 figures not accepted", "  things: bad", "  things: unknown"]
     assert table.main(lambda number, seed: [], "Things.", 10) == 0
+
+
+def double_amplitudes(monkeypatch, load):
+    made = from_returns._model_pulses
+    monkeypatch.setattr(
+        from_returns, "_model_pulses", lambda *a: replace((p := made(*a)), amplitude=2 * p.amplitude)
+    )  # fmt: skip
+    return load("s4_ussyshkin").table_of_synthesis(3000, 0)
+
+
+def double_strengths(monkeypatch, load):
+    measured = from_returns._measure_strength
+    monkeypatch.setattr(from_returns, "_measure_strength", lambda *a: 2 * measured(*a))
+    return load("s4_ussyshkin").table_of_synthesis(3000, 0)
+
+
+def double_distances(monkeypatch, load):
+    made = from_returns._model_pulses
+    monkeypatch.setattr(from_returns, "_model_pulses", lambda *a: replace((p := made(*a)), time=2 * p.time))
+    return load("s4_ussyshkin").table_of_synthesis(3000, 0)
+
+
+def leave_the_pulse_in(monkeypatch, load):
+    """Widths of echoes as if all of them came from the slope."""
+    right = width_angle.added_variance
+
+    def wrong(block, system, *others):
+        variance, error = right(block, system, *others)
+        return variance + system.sigma_ref**2, error
+
+    monkeypatch.setattr(width_angle, "added_variance", wrong)
+    return load("s3_rhomberg_kauert").table_of_rays(4000, 0)
+
+
+def zero_the_heights(monkeypatch, load):
+    right = segments.Slice.locate
+    monkeypatch.setattr(segments.Slice, "locate", lambda piece, end: (*right(piece, end)[:2], 0.0))
+    return load("s2_jutzi").table_of_lines(1000, 0)
+
+
+def zero_the_heights_of_a_strip(monkeypatch, load):
+    right = segments.Slice.locate
+    monkeypatch.setattr(segments.Slice, "locate", lambda piece, end: (*right(piece, end)[:2], 0.0))
+    return load("s2_jutzi").table_of_a_strip(3000, 0)
+
+
+def forget_where_windows_open(monkeypatch, load):
+    """Times count from the first sample of each packet: the relief is lost."""
+    monkeypatch.setattr(segments, "align_times", lambda line: np.zeros(len(line)))
+    return load("s2_jutzi").table_of_a_strip(3000, 0)
+
+
+def drop_from_equation(power):
+    def run(monkeypatch, load):
+        script, right = load("s4_ussyshkin"), radar.receive_power
+        wrong = lambda section, distance, **others: right(section, distance, **others) * distance**power  # noqa: E731
+        monkeypatch.setattr(script, "receive_power", wrong)
+        return script.table_of_the_equation()
+
+    return run
+
+
+def drop_from_footprint(monkeypatch, load):
+    script, right = load("s4_ussyshkin"), radar.spread_cross_section
+    wrong = lambda rho, distance, beam: right(rho, distance, beam) / distance**2  # noqa: E731
+    monkeypatch.setattr(script, "spread_cross_section", wrong)
+    return script.table_of_the_equation()
+
+
+def drop_from_backscatter(monkeypatch, load):
+    right = radiometry.backscatter
+    wrong = lambda constant, distance, *others: right(constant, distance, *others) / distance**2 * 600**2  # noqa: E731
+    monkeypatch.setattr(radiometry, "backscatter", wrong)
+    return load("s0_wagner").table_of_cross_sections(1000, 0)
+
+
+def drop_from_section(monkeypatch, load):
+    right = radiometry.cross_section
+    wrong = lambda gamma, distance, beam: right(gamma, distance, beam) / distance**2 * 600**2  # noqa: E731
+    monkeypatch.setattr(radiometry, "cross_section", wrong)
+    return load("s0_wagner").table_of_cross_sections(1000, 0)
+
+
+def forget_the_skew(monkeypatch, load):
+    monkeypatch.setattr(skew, "system_skew", lambda system: 0.0)
+    monkeypatch.setattr(skew, "skewed_shape", lambda system, kappa: PulseShape())
+    return load("s1_wang").table_of_estimates(600, 0)
+
+
+def stretch_the_times(monkeypatch, load):
+    """Distances that are 0.1 % too long."""
+    script, right = load("s2_jutzi"), models.gauss_newton
+    monkeypatch.setattr(script, "gauss_newton", lambda *a: replace((found := right(*a)), time=1.001 * found.time))
+    return script.table_of_profile(1000, 0)
+
+
+RIGHT = {
+    "s0_wagner": lambda s: s.table_of_cross_sections(1000, 0),
+    "s1_wang": lambda s: s.table_of_estimates(600, 0),
+    "s2_jutzi": lambda s: s.table_of_lines(1000, 0),
+    "s3_rhomberg_kauert": lambda s: s.table_of_rays(4000, 0),
+    "s4_ussyshkin": lambda s: s.table_of_synthesis(3000, 0),
+}
+WRONG = [
+    double_amplitudes, double_strengths, double_distances, leave_the_pulse_in, zero_the_heights, drop_from_equation(2),
+    drop_from_equation(4), drop_from_footprint, drop_from_backscatter, drop_from_section, forget_the_skew,
+    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_what_is_right_is_accepted(name, load):
+    table = RIGHT[name](load(name))
+    assert not table.failures and len(table.rows) >= 4
+
+
+@pytest.mark.parametrize("spoil", WRONG, ids=lambda spoil: spoil.__qualname__.split(".")[0])
+def test_scripts_fail_where_the_code_is_wrong(spoil, load, monkeypatch):
+    """Deliberate errors: in synthesize, the angles, the slices, the powers of the range, the skew, the distances."""
+    assert spoil(monkeypatch, load).failures
+
+
+def test_tables_say_where_their_inputs_come_from(load):
+    scripts = {name: load(name) for name in SCRIPTS}
+    assert "inputs follow from the paper" in scripts["s1_wang"].table_of_models(20, 0).title
+    counts = str(scripts["s0_wagner"].table_of_conclusions(1000, 0))
+    assert " 8.9 " in counts and " 11.2 " in counts
+    misses = scripts["s4_ussyshkin"].table_of_separations(4000, 0)
+    assert sum("miss" in row[0] for row in misses.rows) == 4

@@ -9,6 +9,8 @@ and the straight lines that the Hough transform finds in a slice of waveforms (d
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from published import PULSE_SIGMA, paint_slice
@@ -16,6 +18,7 @@ from table import Table, main
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.least_squares import Limits, Windows, fit_windows
@@ -23,8 +26,9 @@ from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.decompose.models import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
-from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
-from wavebatch.tools.slices.lines import ScanLine
+from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes, simulate_strip
+from wavebatch.tools.simulate.geometry import GROUND
+from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
 
 RATIOS = (2, 3, 4, 5, 6, 7, 8, 10)
@@ -47,6 +51,8 @@ FALSE_ALARMS = {
 """Least, most and expected share [%] of waveforms of 200 samples of noise with an echo."""
 PULSES = {"1": (20.4, 2.10), "2": (12.3, 3.49), "3": (29.4, 1.46), "4": (20.7, 2.07)}
 """Table 1: amplitude over noise and bound of the range [mm] of its pulses, 0.217 m wide, sampled every 50 ps."""
+APART, WIDE = (9.908, 6.164, 2.440), 0.217
+"""Table 1: distances of its pulses one after the other, and the mean of their sigmas, both [m]."""
 BASIN = {0.5: (99.9, 100), 1.0: (99.9, 100), 1.5: (0, 45), 2.0: (0, 0.5), 3.0: (0, 0.5)}
 """Least and most share of undamped fits that converge [%], by distance of the start in sigma."""
 START_WIDTHS = (0.4, 0.7, 1.0, 1.5, 2.0, 3.0)
@@ -115,6 +121,35 @@ def table_of_precision(number: int, seed: int) -> Table:
     return table
 
 
+def table_of_profile(number: int, seed: int) -> Table:
+    """Table 1 as one waveform: its four pulses at their distances, every 50 ps, and what comes back of each."""
+    table = Table("table 1, the profile of four pulses: paper, and what comes back", 3)
+    spacing = 0.05
+    range_of = np.r_[0.0, np.cumsum(APART)]
+    time = 10 + range_of / HALF_C
+    heights = np.array([ratio for ratio, _ in PULSES.values()])
+    sigma = WIDE / HALF_C
+    recording = fine_recording(1.0, sigma, n_samples=int(time[-1] / spacing) + 200, spacing=spacing)
+    n, rng = max(number // 40, 5), np.random.default_rng(seed)
+    block, _ = simulate_echoes(recording, np.tile(time, (n, 1)), heights * FINE, sigma, rng)
+    noise, system = known_noise(recording, n), known_system(recording)
+    found = gauss_newton(block, noise, system, matched_filter(block, noise, system))
+    table.near("pulses per waveform", len(found) / n, 4.0)
+    rows = found.take(np.isin(found.waveform, np.flatnonzero(found.count(n) == 4)))
+    table.add("  waveforms with four [%]", 25 * len(rows) / n, 99)
+    mean = {name: getattr(rows, name).reshape(-1, 4).mean(axis=0) for name in ("time", "amplitude", "sigma")}
+    for pulse, (height, apart) in enumerate(zip(heights, np.r_[np.nan, APART], strict=True)):
+        # The errors of one waveform are 1.5 to 3.5 mm, the paper rounds to millimetres and tenths of a millivolt.
+        if pulse:
+            ours = HALF_C * (mean["time"][pulse] - mean["time"][pulse - 1])
+            table.near(f"pulse {pulse + 1}: distance from the one before [m]", ours, apart, within=0.004, paper=apart)
+        ours = mean["amplitude"][pulse] / FINE
+        table.near(f"pulse {pulse + 1}: maximum [mV]", ours, height, within=0.4, paper=height)
+        width = HALF_C * mean["sigma"][pulse]
+        table.near(f"pulse {pulse + 1}: sigma [m]", width, WIDE, within=0.004, paper=WIDE)
+    return table
+
+
 def table_of_basins(number: int, seed: int) -> Table:
     """Fits that reach the echo from starts that are off, mean over widths of the start; sigma 2, SNR 100."""
     table = Table("fits that converge, by the start's distance [%]", 1)
@@ -156,7 +191,7 @@ def table_of_lines(number: int, seed: int) -> Table:
     rng = np.random.default_rng(seed)
     options = SliceOptions(geometry="time", sigma=8.0)
     for slope in SLOPES:
-        off, turn, alone = [], [], []
+        off, turn, alone, heights = [], [], [], []
         for _ in range(max(number // 500, 2)):
             middle = 200 + rng.uniform(-3, 3)
             line = scan_line(paint_slice(rng, [(middle, slope, 0, 320)]))
@@ -164,9 +199,13 @@ def table_of_lines(number: int, seed: int) -> Table:
             alone.append(len(segments) == 1)
             time, pulse = np.mean(segments[0].ends, axis=0)
             off.append((time - slope * (pulse - 160) - middle) / np.hypot(1, slope))
+            # Windows begin at a height of 100 m and look straight down.
+            places = segments[0].start, segments[0].end
+            heights += [end[2] - (100 - HALF_C * at) for end, (at, _) in zip(places, segments[0].ends, strict=True)]
             turn.append((segments[0].theta - np.degrees(np.arctan2(-slope, 1)) + 90) % 180 - 90)
         table.add(f"slope {slope:g}: rms position [px]", np.sqrt(np.mean(np.square(off))), 0, 0.05, spec=0.02)
         table.add(f"slope {slope:g}: rms angle [deg]", np.sqrt(np.mean(np.square(turn))), 0, 0.1, spec=0.04)
+        table.add(f"slope {slope:g}: rms height of the ends [m]", np.sqrt(np.mean(np.square(heights))), 0, 1e-3)
         table.near(f"slope {slope:g}: slices with one segment [%]", 100 * np.mean(alone), 100)
     line = scan_line(paint_slice(rng, [(200, 0.1, 0, 140), (200, 0.1, 180, 320)]))
     segments = find_segments(cut_slice(line, options), options)
@@ -175,13 +214,36 @@ def table_of_lines(number: int, seed: int) -> Table:
     return table
 
 
+def table_of_a_strip(number: int, seed: int) -> Table:
+    """`wavebatch slice` on a strip of a village: heights of its level ground and roofs, in both geometries."""
+    table = Table("segments of a village, ground at 120 m")
+    with TemporaryDirectory() as folder:
+        strip = Path(folder) / "village.las"
+        simulate_strip("village", strip, pulses=max(number, 3000), seed=seed)
+        with StripReader(strip) as reader:
+            lines = list(read_scan_lines(reader, reader.scan()))
+        for geometry in ("plane", "time"):
+            options = SliceOptions(geometry=geometry, sigma=0.65)
+            found = [one for line in lines for one in find_segments(cut_slice(line, options), options)]
+            level = np.array([(one.start[2], one.end[2]) for one in found if abs(one.slope) < 1.5])
+            ground = level[level.mean(axis=1) < GROUND + 2].mean(axis=1) if len(level) else np.empty(0)
+            table.add(f"{geometry}: segments per scan line", len(found) / len(lines), 10)
+            table.add(f"{geometry}: of these level and on the ground [%]", 100 * len(ground) / len(found), 25, 70)
+            off = np.median(np.abs(ground - GROUND)) if len(ground) else np.inf
+            table.add(f"{geometry}: median distance of these from the ground [m]", min(off, 1e3), 0, 0.05)
+            table.add(f"{geometry}: highest segment above the ground [m]", np.max(level, initial=0) - GROUND, 4, 40)
+    return table
+
+
 def measure(number: int, seed: int) -> list[Table]:
     """All tables."""
     return [
         table_of_detection(number, seed),
         table_of_precision(max(number // 2, 10), seed),
+        table_of_profile(number, seed),
         table_of_basins(number, seed),
         table_of_lines(number, seed),
+        table_of_a_strip(number, seed),
     ]
 
 

@@ -8,10 +8,13 @@ its figure 6 shows: angles from fitted widths minus the true ones, with their pi
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from table import Table, main
 
 from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.physics.incidence import (
     angles_of_variance,
@@ -22,9 +25,11 @@ from wavebatch.kernels.physics.incidence import (
     spread_pulse,
     spread_variance,
 )
+from wavebatch.stages.chain_file import parse_chain
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
+from wavebatch.tools.simulate.render import record_counts
 
 HEIGHT, DIVERGENCE, LENGTH = 640.0, 1.1e-3, 1.5
 """Range [m], full divergence [rad] and length of the pulse [ns] of the paper's sensor, assumed."""
@@ -138,6 +143,55 @@ def fitted_angles(degrees: np.ndarray, snr: float, mode: str, rng: np.random.Gen
     return angles
 
 
+def strike_planes(degrees: float, snr: float, n: int, rng: np.random.Generator) -> WaveformBlock:
+    """Waveforms of a tilted plane, as sums of the pulses of 400,000 rays of the footprint; nothing else is put in.
+
+    The pulse is a Gaussian of PULSE_SIGMA, each ray has the distance at which it meets the plane. Samples every 0.5 ns.
+    """
+    x, y = rng.normal(0.0, HEIGHT * DIVERGENCE / 4, (2, 400_000)) / HEIGHT
+    distance = HEIGHT / (1.0 - np.tan(np.radians(degrees)) * x) * np.sqrt(x * x + y * y + 1.0)
+    step, start = 0.01, 2 * HEIGHT / C - 30.0
+    bins = np.bincount(np.rint((2 * distance / C - start) / step).astype(np.int64).clip(0, 5999), minlength=6000)
+    fine = np.arange(-500, 501) * step
+    signal = np.convolve(bins / len(x), np.exp(-0.5 * (fine / PULSE_SIGMA) ** 2), "same") * np.cos(np.radians(degrees))
+    recording = fine_recording(1.0, PULSE_SIGMA, n_samples=120, spacing=0.5)
+    phase = rng.uniform(-0.25, 0.25, (n, 1))
+    values = snr * FINE * np.interp(np.arange(120) * 0.5 + phase, np.arange(6000) * step, signal)
+    block = WaveformBlock.from_samples(record_counts(recording, values.astype(np.float32), rng), spacing=0.5)
+    # The middle of the footprint lies 30 ns after sample 0.
+    return replace(block, sensor=block.origin + [0.0, 0.0, HEIGHT - 15.0 * C])
+
+
+def table_of_rays(number: int, seed: int) -> Table:
+    """Angles of planes whose waveforms are summed ray by ray, by the chain that a user runs."""
+    table = Table("planes ray by ray: angle by decompose.gaussian and attribute.incidence_angle")
+    rng, n = np.random.default_rng(seed), max(number // 40, 30)
+    level = strike_planes(0.0, 200.0, 4 * n, rng)
+    recording = fine_recording(1.0, PULSE_SIGMA, n_samples=120, spacing=0.5)
+    names = ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.position")
+    chain = parse_chain("".join(f'[[chain]]\nstage = "{name}"\n' for name in names), "papers")
+    plain = known_system(recording)
+    widths = chain.run(level, plain).sigma
+    # The system pulse is what level ground shows, as a survey has it.
+    system = replace(plain, sigma_ref=float(np.median(widths)), divergence=1e3 * DIVERGENCE)
+    table.near("width of level ground over the pulse", system.sigma_ref / PULSE_SIGMA, 1.0, within=0.01)
+    angles = parse_chain(
+        "".join(f'[[chain]]\nstage = "{name}"\n' for name in (*names, "attribute.incidence_angle"))
+        + "max_error = 90.0\n",
+        "papers",
+    )
+    for degrees in (10, 20, 30, 45, 60):
+        found = angles.run(strike_planes(degrees, 200.0, n, rng), system).attributes
+        off, error = found["incidence_angle"] - degrees, found["incidence_angle_err"]
+        known = np.isfinite(off)
+        table.add(f"{degrees} deg: known [%]", 100 * known.mean(), 95)
+        within = 4 * float(np.median(error[known])) / np.sqrt(n) + 0.15
+        table.near(f"{degrees} deg: median less truth [deg]", np.median(off[known]), 0.0, within=within)
+        covered = 100 * np.mean(np.abs(off[known]) < error[known])
+        table.add(f"{degrees} deg: within one error [%]", covered, 48, 88, spec=68)
+    return table
+
+
 def figure_of_differences(number: int, seed: int) -> tuple[Table, str]:
     """Figure 6: angle from the fitted width minus the true one, of roofs of 0 to 60 degrees at SNR 100."""
     rng = np.random.default_rng(seed)
@@ -163,6 +217,7 @@ def measure(number: int, seed: int) -> list[Table | str]:
     return [
         table_of_widths(),
         table_of_footprints(number, seed),
+        table_of_rays(number, seed),
         table_of_errors(number, seed),
         *figure_of_differences(max(number // 2, 10), seed),
     ]

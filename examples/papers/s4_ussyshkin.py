@@ -15,13 +15,27 @@ import numpy as np
 from published import RETURN_TABLES
 from table import Table, main
 
+import wavebatch as wb
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.waveforms import Noise, SystemPulse
 from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
+from wavebatch.stages.decompose.fit import gaussian
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
+from wavebatch.tools.simulate.from_returns import SynthesisOptions, synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes
 
 CORN = {0.64: (1.13, 0.90), 0.67: (1.15, 0.92)}
 """Mean separation of the first and the second, the second and the third return [m], by dead zone [m]."""
+
+
+OF_PAPER = {"1-2": 1.305, "2-3": 1.025}
+"""Table 2: mean separations in corn [m], the middle of 1.25 to 1.36 and of 0.99 to 1.06."""
+MISSES = {"1-2": -0.195, "2-3": -0.12}
+"""By how much our corn, a layer of constant density, misses them; its real structure is not known."""
+MOST_OFF = {"orion-6": 2.2, "orion-20": 2.6, "orion-22": 2.6, "gemini-6": 1.8, "gemini-24": 2.2}
+"""Largest accepted sum of differences [points] by stand: what it is, and the scatter of 20,000 pulses."""
 
 
 def fly(stand: str, dead_zone: float, number: int, seed: int) -> ReturnStats:
@@ -42,7 +56,8 @@ def table_of_numbers(number: int, seed: int) -> Table:
         ours = [100 * stats.by_number.get(k, 0.0) for k in (1, 2, 3, 4)]
         for k, (mine, paper) in enumerate(zip(ours, shares, strict=True), 1):
             table.add(f"{stand} m, number {k}", mine, paper=paper)
-        table.add(f"{stand} m, sum of |differences| [points]", np.abs(np.subtract(ours, shares)).sum(), 0, 6)
+        most = MOST_OFF[stand] * max(np.sqrt(20_000 / number), 1.0)
+        table.add(f"{stand} m, sum of |differences| [points]", np.abs(np.subtract(ours, shares)).sum(), 0, most)
         per_pulse = np.dot((1, 2, 3, 4), exact) / 100
         table.near(f"{stand} m, returns per pulse", stats.returns_per_pulse, per_pulse, within=0.08, paper=per_pulse)
         table.near(f"{stand} m, dead zone [m]", stats.separations["all"].least, dead_zone, within=0.03)
@@ -57,8 +72,10 @@ def table_of_separations(number: int, seed: int) -> Table:
         for pair, spec, low, high in zip(("1-2", "2-3"), means, (0.635, 0.605), (0.69, 0.73), strict=True):
             found = stats.separations[pair]
             table.add(f"{dead_zone:g} m, least of {pair}", found.least, low, high, paper=0.65, spec=dead_zone)
-            paper = 1.3 if pair == "1-2" else 1.02
+            paper = OF_PAPER[pair]
             table.add(f"{dead_zone:g} m, mean of {pair}", found.mean, spec - 0.06, spec + 0.06, paper=paper, spec=spec)
+            miss = MISSES[pair]
+            table.near(f"{dead_zone:g} m, miss of the mean of {pair}", found.mean - paper, miss, within=0.04, paper=0.0)
         four = 100 * stats.by_count.get(4, 0.0)
         table.add(f"{dead_zone:g} m, pulses of four returns [%]", four, 0, 0.2, paper=0, spec=0.05)
     for dead_zone, third, low, high in ((1.5, 3, 0, 0), (2.5, 2, 0, 1.5)):
@@ -80,6 +97,48 @@ def table_of_the_equation() -> Table:
         half = receive_power(section, np.array(distance), divergence=3.5e-4, **figures)
         table.near(f"  with half the angle, {distance:g} m", half / short, 4.0, share=1e-6)
     return table
+
+
+def table_of_synthesis(number: int, seed: int) -> Table:
+    """`wavebatch synthesize` on a cloud of discrete returns: heights and distances of the echoes that it makes."""
+    table = Table("waveforms by `synthesize`, against the returns", 4)
+    with TemporaryDirectory() as folder:
+        cloud, strip = Path(folder) / "cloud.las", Path(folder) / "strip.las"
+        receiver = DiscreteReceiver(1.5)
+        simulate_returns("canopy.orion-6", cloud, pulses=max(number // 10, 300), seed=seed, receiver=receiver)
+        gain = 150.0 / float(np.quantile(wb.read_cloud(cloud, ["intensity"])["intensity"], 0.99))
+        synthesize_strip(cloud, strip, SynthesisOptions(gain=gain, bits=16, baseline=100.0))
+        intensity = wb.read_cloud(cloud, ["intensity"])["intensity"]
+        height, apart = [], []
+        with wb.open_strip(strip) as made:
+            for block in made.blocks():
+                returns = block.returns
+                count = np.bincount(returns.waveform, minlength=len(block))
+                noise = Noise(np.full(len(block), 100.0, np.float32), np.full(len(block), 0.3, np.float32))
+                system = SystemPulse(4.7 / FWHM_PER_SIGMA, baseline=100.0, noise_std=0.3)
+                found = gaussian(block, noise, system, maximum(block, noise, system))
+                echoes = found.count(len(block))
+                for number_of in (1, 2):
+                    rows = np.flatnonzero((count == number_of) & (echoes == number_of))
+                    mine = returns_of(returns.waveform, rows)
+                    ours = found.take(np.isin(found.waveform, rows))
+                    if number_of == 1:
+                        height.append(ours.amplitude / (gain * intensity[returns.point[mine]]))
+                    else:
+                        place = returns.xyz[mine].reshape(-1, 2, 3)
+                        true = np.linalg.norm(place[:, 1] - place[:, 0], axis=1)
+                        apart.append(HALF_C * np.diff(ours.time.reshape(-1, 2), axis=1)[:, 0] / true)
+    height, apart = np.concatenate(height), np.concatenate(apart)
+    table.near("height of lone echoes over gain times intensity", np.median(height), 1.0, within=0.01)
+    table.near("  95 % quantile", np.quantile(height, 0.95), 1.0, within=0.05)
+    table.near("distance of two echoes over that of the returns", np.median(apart), 1.0, within=0.01)
+    table.add("  waveforms with two", len(apart), 20)
+    return table
+
+
+def returns_of(waveform: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The returns of some waveforms, in order."""
+    return np.flatnonzero(np.isin(waveform, rows))
 
 
 def table_of_models(number: int, seed: int) -> Table:
@@ -108,6 +167,7 @@ def measure(number: int, seed: int) -> list[Table]:
         table_of_numbers(number, seed),
         table_of_separations(number, seed),
         table_of_the_equation(),
+        table_of_synthesis(number, seed),
         table_of_models(number, seed),
     ]
 

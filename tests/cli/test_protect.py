@@ -61,6 +61,7 @@ _CASES = [
     "slice s.las -o s.las --overwrite",
     "voxelize s.las -o link.las --size 1 --overwrite",
     "voxelize s.las -o hard.las --size 1 --overwrite",
+    "voxelize s.las -o v.las --profiles s.las --size 1 --overwrite",
 ]
 
 
@@ -92,5 +93,6 @@ def test_every_option_that_writes_is_known_as_such():
     assert found == {
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
+        "voxelize --profiles",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "bench --output",
     }  # fmt: skip

@@ -23,6 +23,10 @@ def test_the_list_has_every_stage_with_its_summary():
         assert any(line.split()[0] == stage.name and stage.summary in line for line in lines)
 
 
+PARTNERS = {"decompose.asdf_only": {"detect": "detect.asdf"}, "attribute.skew": {"decompose": "decompose.log_normal"}}
+"""Stages that refuse a chain without another one; their texts say which."""
+
+
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
     text = _invoke(name).stdout
@@ -31,11 +35,13 @@ def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
         assert parameter.meaning in text
     example = text[text.index("[[chain]]") :]
     others = {kind: next(s for s in STAGES if s.startswith(kind)) for kind in ("noise", "detect", "decompose")}
+    others |= PARTNERS.get(name, {})
     kind = name.split(".")[0]
     tables = [example if k == kind else f'[[chain]]\nstage = "{other}"\n' for k, other in others.items()]
     if kind == "attribute":
         makers = {s.name for column in STAGES[name].needs for s in STAGES.values() if column in s.makes}
         tables += [*(f'[[chain]]\nstage = "{maker}"\n' for maker in sorted(makers)), example]
+    assert all(other in text for other in PARTNERS.get(name, {}).values())
     chain = parse_chain("\n".join(tables), "example")
     assert example.strip() in effective(chain)
 

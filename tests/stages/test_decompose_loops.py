@@ -1,16 +1,20 @@
 """Wang's residual loop and ASDF without a fit, on isolated echoes and close pairs."""
 
-from dataclasses import fields
+import json
+from dataclasses import fields, replace
 
+import naive
 import numpy as np
 import pytest
 
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import Recording, known_noise, known_system, simulate_echoes
 
 RECORDING = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)
@@ -27,8 +31,9 @@ def record(n, *echoes, seed=1, width=2.0):
     return block, known_noise(RECORDING, n), phase
 
 
-def decompose(name, block, noise, **parameters):
-    candidates = STAGES["detect.maximum"].function(block, noise, SYSTEM)
+def decompose(name, block, noise, detector=None, **parameters):
+    detector = detector or ("detect.asdf" if name == "asdf_only" else "detect.maximum")
+    candidates = STAGES[detector].function(block, noise, SYSTEM)
     return STAGES[f"decompose.{name}"].function(block, noise, SYSTEM, candidates, **parameters)
 
 
@@ -109,3 +114,117 @@ def test_rendered_echoes_do_not_depend_on_their_parts(monkeypatch):
     for rows in (1, 3, 7, 60):
         monkeypatch.setattr(render, "ROWS", rows)
         np.testing.assert_array_equal(render.render_echoes(GAUSSIAN, 12, 40, waveform, *columns), whole)
+
+
+def parse(detector, decomposer, **parameters):
+    """A chain of this detector and decomposer; parameters of the detector have its name before them."""
+    lines = {"detect": [f'stage = "{detector}"'], "decompose": [f'stage = "decompose.{decomposer}"']}
+    for key, value in parameters.items():
+        kind, name = key.split("__")
+        lines[kind].append(f"{name} = {json.dumps(value)}")
+    tables = (['stage = "noise.pooled"'], lines["detect"], lines["decompose"])
+    return parse_chain("\n".join("[[chain]]\n" + "\n".join(table) for table in tables), "c")
+
+
+def test_asdf_only_keeps_the_echoes_of_the_detector_before_it():
+    """The paper's rule loses echoes below 30 % of the strongest, a mean pulse as reference shifts times a little."""
+    block, _, _ = record(300, (150, 20), (30, 45))
+    plain = parse("detect.asdf", "asdf_only").run(block, SYSTEM)
+    paper = parse("detect.asdf", "asdf_only", detect__rule="paper").run(block, SYSTEM)
+    assert (plain.count(300) == 2).mean() > 0.99 and (paper.count(300) == 1).mean() > 0.9
+    for rule, table in (("absolute", plain), ("paper", paper)):
+        noise = STAGES["noise.pooled"].function(block, SYSTEM)
+        given = STAGES["detect.asdf"].function(block, noise, SYSTEM, rule=rule)
+        np.testing.assert_array_equal(table.time, given.time)
+    pulse = " ".join(f"{np.exp(-0.5 * ((x - 7) / 2.4) ** 2):.6f}" for x in range(15))
+    mean = parse("detect.asdf", "asdf_only", detect__reference="given", detect__pulse=pulse).run(block, SYSTEM)
+    assert 0 < np.abs(mean.time - plain.time).max() < 0.2
+    for detector in ("detect.correlation", "detect.matched_filter"):
+        other = parse(detector, "asdf_only").run(block, SYSTEM)
+        assert len(other) == len(plain) and not np.array_equal(other.time, plain.time)
+
+
+def test_asdf_only_takes_amplitude_and_width_from_the_detector_if_told():
+    block, noise, _ = record(400, (150, 30), width=3.0)
+    given = STAGES["detect.asdf"].function(block, noise, SYSTEM)
+    found = decompose("asdf_only", block, noise, describe="detector")
+    np.testing.assert_array_equal(found.amplitude, given.amplitude)
+    np.testing.assert_array_equal(found.sigma, given.sigma)
+    # The reference is 2 ns wide: what it says of an echo of 3 ns is wrong, and its error says so.
+    assert (np.abs(found.sigma - 3) < 1.5 * found.sigma_err).mean() > 0.9
+    assert (np.abs(found.amplitude - 150) < 1.5 * found.amplitude_err).mean() > 0.9
+
+
+@pytest.mark.parametrize("detector", ["maximum", "wavelet", "threshold", "second_derivative", "richardson_lucy"])
+def test_asdf_only_refuses_detectors_without_a_reference(detector):
+    with pytest.raises(ConfigError, match="decompose.none"):
+        parse(f"detect.{detector}", "asdf_only")
+
+
+def test_the_error_of_the_parabola_covers_its_bias():
+    """Sigma 1 ns, strong echoes: the paper's parabola is wrong by 0.018 ns, eight times the bound."""
+    recording = Recording(n_samples=64, bits=16, baseline=20.0, baseline_spread=0.0)
+    rng = np.random.default_rng(5)
+    time = 30 + rng.uniform(-0.5, 0.5, (2000, 1))
+    block, _ = simulate_echoes(recording, time, np.array([500.0]), 1.0, rng)
+    system, noise = replace(SYSTEM, sigma_ref=1.0), known_noise(recording, 2000)
+    ratio = {}
+    for kind in ("parabola", "log"):
+        given = STAGES["detect.asdf"].function(block, noise, system, interpolation=kind)
+        found = STAGES["decompose.asdf_only"].function(block, noise, system, given)
+        error = found.time - time[found.waveform, 0]
+        error = error[np.abs(error) < 1]
+        ratio[kind] = np.sqrt(np.mean(error**2)) / np.median(found.time_err)
+    assert ratio["parabola"] == pytest.approx(1.0, abs=0.1) and ratio["log"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("model", ["skewed", "generalized", "learned"])
+def test_the_loop_knows_other_pulses_than_gaussians(model):
+    """Single echoes that are no Gaussians: with their model nothing is added, with Gaussians an echo to most."""
+    n, x = 300, np.arange(90.0)
+    rng = np.random.default_rng(6)
+    time = 30 + rng.uniform(-0.5, 0.5, n)
+    system = replace(SYSTEM, skew=0.3)
+    if model == "skewed":
+        y = np.stack([naive.pulse(x, t, 2.0, 0.3) for t in time])
+    elif model == "generalized":
+        y = naive.power_pulse(x, time[:, None], 4.0, 4.0)
+    else:
+        system = replace(SYSTEM, components=((1.0, 0.0, 2.0), (0.15, 7.0, 2.0)))
+        y = np.stack([naive.pulse(x, t, 2.0) + 0.15 * naive.pulse(x, t + 7, 2.0) for t in time])
+    counts = np.rint(20 + 150 * y + rng.standard_normal(y.shape)).astype(np.uint16)
+    block, noise = WaveformBlock.from_samples(counts), known_noise(RECORDING, n)
+    candidates = STAGES["detect.maximum"].function(block, noise, system)
+    loop = STAGES["decompose.residual_loop"].function
+    counted = {one: loop(block, noise, system, candidates, model=one).count(n) for one in ("gaussian", model)}
+    assert (counted["gaussian"] > 1).mean() > 0.5 and (counted[model] == 1).mean() > 0.95
+
+
+def test_the_unit_of_the_loops_threshold():
+    """2 % of the largest sample is 4 counts here; noise is 1.04: the same threshold in all units adds the same."""
+    block, noise, _ = record(300, (200, 28), (14, 40))
+    top = np.median((block.samples - 20.0).max(axis=1))
+    tables = [
+        decompose("residual_loop", block, noise, t_diff=value, t_unit=unit).count(300)
+        for unit, value in (("noise", 5.0), ("count", 5.0 * STD), ("amplitude", 5.0 * STD / top))
+    ]
+    np.testing.assert_array_equal(tables[0], tables[1])
+    assert (tables[0] == tables[2]).mean() > 0.9
+    never = decompose("residual_loop", block, noise, t_diff=1.0, t_unit="amplitude")
+    assert_same(never, decompose("gaussian", block, noise, tolerance=0.1))
+
+
+def test_widths_stay_in_their_box():
+    """Eq. 4: an echo of 12 ns, six widths of the pulse, is cut off at 4 of them unless the chain allows more."""
+    block, noise, _ = record(200, (300, 32), width=12.0)
+    for name in ("gaussian", "residual_loop", "adaptive", "closed_form", "generalized_gaussian"):
+        usual = decompose(name, block, noise)
+        alone = (usual.flags & EchoFlag.MERGED) == 0
+        assert usual.sigma[alone].max() <= 4 * 2.0 * (1 + 1e-5)
+        wide = decompose(name, block, noise, most_width=10.0)
+        strongest = wide.take(wide.amplitude > 200)
+        assert np.median(strongest.sigma) == pytest.approx(12, abs=0.5), name
+        bound = usual.take(usual.amplitude > 100)
+        assert (bound.flags & EchoFlag.AT_BOUND).astype(bool).mean() > 0.5, name
+        narrow = decompose(name, *record(50, (300, 32), width=1.0)[:2], least_width=0.3)
+        assert np.median(narrow.sigma[narrow.amplitude > 200]) == pytest.approx(1.0, abs=0.1), name

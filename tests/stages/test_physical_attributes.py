@@ -7,14 +7,17 @@ import pytest
 
 from wavebatch.core.echoes import COLUMNS as COLUMNS_TABLE
 from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.no_data import REASONS, NoData, count_reasons, explain
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_names import describe
 from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.physics.incidence import spread_of_angle
 from wavebatch.stages.chain import STAGES
-from wavebatch.stages.chain_file import load_profile
+from wavebatch.stages.chain_file import load_profile, parse_chain
+from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
 from wavebatch.surveying import survey_block
 from wavebatch.surveying.angle_limits import SLOPE, predict_angles
 from wavebatch.surveying.calibration import with_physics
@@ -321,3 +324,97 @@ def test_the_outlook_is_the_error_that_echoes_then_have():
     assert not predict_angles(SYSTEM, 1.0, 640.0, 0.05, 50.0).possible
     short = predict_angles(SYSTEM, 2.0, 640.0, 1.1, 50.0)
     assert not short.possible and "0.60 samples wide" in short.reason
+
+
+LEARNED = replace(SYSTEM, sigma_ref=1.35, components=((1.0, 0.0, 1.2), (0.2, 2.5, 1.8)))
+SKEWED = replace(SYSTEM, kappa=0.15)
+
+
+def chain_of(decomposer, mode, **parameters):
+    extra = "".join(f"{name} = {value!r}\n" for name, value in parameters.items())
+    return parse_chain(
+        f'[[chain]]\nstage = "noise.pooled"\n[[chain]]\nstage = "detect.maximum"\n'
+        f'[[chain]]\nstage = "decompose.{decomposer}"\n{extra}'
+        f'[[chain]]\nstage = "attribute.position"\n[[chain]]\nstage = "attribute.incidence_angle"\nmode = "{mode}"\n'
+        "max_error = 60.0\n",
+        "c",
+    )
+
+
+def planes(system, degrees, n=800, height=640.0, seed=3):
+    """Waveforms of planes that rays strike at an angle, with the system's own pulse broadened by them; noise 1."""
+    rng = np.random.default_rng(seed)
+    shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
+    width = np.hypot(limits.ref, spread_of_angle(np.radians(degrees), height, 1e-3 * system.divergence))
+    x, time = np.arange(120.0), 45 + rng.uniform(-0.5, 0.5, n)
+    pulse = evaluate_pulse(shape, np.tile(x, (n, 1)), time[:, None], np.full((n, 1), width))[0]
+    counts = np.rint(12 + 150 * pulse * limits.ref / width + rng.standard_normal(pulse.shape))
+    block = WaveformBlock.from_samples(np.clip(counts, 0, 65535).astype(np.uint16))
+    return replace(block, sensor=block.origin + [0, 0, height - 45 * HALF_C])
+
+
+@pytest.mark.parametrize(
+    ("decomposer", "mode", "system", "right"),
+    [
+        ("adaptive", "system", SYSTEM, True),
+        ("gaussian", "system", SYSTEM, True),
+        ("adaptive", "system", LEARNED, True),
+        ("reference", "system", LEARNED, True),
+        ("gaussian", "system", LEARNED, False),
+        ("closed_form", "system", LEARNED, False),
+        ("skewed", "system", replace(LEARNED, skew=0.2), False),
+        ("skewed", "system", SKEWED, True),
+        ("gaussian", "system", SKEWED, False),
+        ("adaptive", "pulse", SYSTEM, True),
+        ("adaptive", "pulse", LEARNED, False),
+        ("adaptive", "paper", SKEWED, False),
+    ],
+)
+def test_modes_and_decomposers_that_do_not_belong_together_say_nothing(decomposer, mode, system, right):
+    """Widths of Gaussians compared with another pulse gave angles 2 to 3 degrees off, a quarter within their errors."""
+    block = planes(system, 40.0)
+    found = chain_of(decomposer, mode).run(block, system)
+    angle = found.attributes["incidence_angle"]
+    codes = found.attributes["incidence_angle_reason"]
+    if not right:
+        assert np.isnan(angle).all() and (codes == NoData.OTHER_PULSE).all()
+        return
+    assert not (codes == NoData.OTHER_PULSE).any() and np.isfinite(angle).mean() > 0.9
+    if mode == "system":
+        off, error = angle - 40.0, found.attributes["incidence_angle_err"]
+        assert abs(np.nanmedian(off)) < 0.15
+        assert np.mean(np.abs(off[np.isfinite(off)]) < error[np.isfinite(off)]) == pytest.approx(0.68, abs=0.06)
+
+
+@pytest.mark.parametrize(("decomposer", "parameters"), [("log_normal", {}), ("skewed", {"kappa": "free"})])
+def test_widths_with_a_skew_per_echo_are_refused_before_a_run(decomposer, parameters):
+    with pytest.raises(ConfigError, match="decompose.adaptive"):
+        chain_of(decomposer, "system", **parameters)
+
+
+@pytest.mark.parametrize("system", [SYSTEM, LEARNED], ids=["gaussian", "learned"])
+@pytest.mark.parametrize("decomposer", ["adaptive", "reference"])
+def test_steep_slopes_have_angles_where_the_box_of_widths_lets_them(system, decomposer):
+    """70 degrees at 1500 m and 1.1 mrad: six widths of the pulse, all lost at the bound of four."""
+    block = planes(system, 70.0, height=1500.0)
+    usual = chain_of(decomposer, "system").run(block, system)
+    strongest = usual.amplitude > 20
+    assert np.isnan(usual.attributes["incidence_angle"][strongest]).mean() > 0.9
+    found = chain_of(decomposer, "system", most_width=12.0).run(block, system)
+    off = found.attributes["incidence_angle"] - 70.0
+    known = np.isfinite(off)
+    assert known.mean() > 0.85
+    assert abs(np.median(off[known])) < 0.3
+    error = found.attributes["incidence_angle_err"][known]
+    assert np.mean(np.abs(off[known]) < error) == pytest.approx(0.68, abs=0.08)
+
+
+def test_attributes_read_widths_as_the_pulse_that_was_fitted():
+    """On a skewed strip a Gaussian's width at half maximum is 2.3548 sigma, not that of the survey's pulse."""
+    block = planes(SKEWED, 0.0, n=50)
+    text = "".join(
+        f'[[chain]]\nstage = "{name}"\n'
+        for name in ("noise.pooled", "detect.maximum", "decompose.gaussian", "attribute.echo_width")
+    )
+    found = parse_chain(text, "c").run(block, SKEWED)
+    np.testing.assert_allclose(found.attributes["echo_width"], 2.354820 * found.sigma, rtol=1e-5)

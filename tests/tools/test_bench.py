@@ -2,14 +2,17 @@
 
 import json
 import os
+import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import wavebatch
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
@@ -20,6 +23,7 @@ from wavebatch.tools.bench import command, peers, report
 from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
 from wavebatch.tools.bench.cases import CASES, list_cases, make_scene
 from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.paired.compare import compare_runs, format_paired, simulate_strips
 from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
 from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures
@@ -308,3 +312,31 @@ def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     tally = Tally()
     tally.add(group, result.found)
     assert tally.figures()["completeness"].value == pytest.approx(38 / 40)
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of this wavebatch under another path."""
+    root = tmp_path / "copy"
+    shutil.copytree(Path(wavebatch.__file__).parent, root / "wavebatch", ignore=shutil.ignore_patterns("__pycache__"))
+    return root
+
+
+def test_two_checkouts_take_turns(tmp_path, checkout):
+    options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "--json", "-o", str(tmp_path / "out")]
+    missing = CliRunner().invoke(main, ["bench", "--against", str(tmp_path), *options])
+    assert missing.exit_code == 1 and "holds no wavebatch that Python can import" in missing.stderr
+    result = CliRunner().invoke(main, ["bench", "--against", str(checkout), *options])
+    assert result.exit_code == 0, result.output
+    (ratios,) = json.loads(result.stdout)["strips"].values()
+    for name in ("cpu", "wall", "peak"):
+        middle, low, high = ratios[name]
+        assert 0 < low <= middle <= high
+    assert "flat" in (tmp_path / "out" / "against.txt").read_text()
+
+
+def test_of_two_checkouts_the_slower_one_is_seen(tmp_path, checkout):
+    start = checkout / "wavebatch" / "__init__.py"
+    start.write_text(start.read_text() + "\nimport time\nwhile time.process_time() < 5:\n    pass\n")
+    (pair,) = compare_runs(checkout, simulate_strips(["flat"], 200, 0, tmp_path), 1, say=lambda text: None)
+    assert pair.ratio("cpu").low > 1.5 and "flat" in format_paired(checkout, [pair])

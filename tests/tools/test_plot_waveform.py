@@ -46,7 +46,8 @@ def simulate(shape, echoes, *, n=20, s=80, seed=1, top=255):
 
 def make_chain(decomposer, **parameters):
     attributes = [STAGES[f"attribute.{name}"] for name in ("amplitude", "echo_width")]
-    steps = [Step(STAGES["noise.pooled"]), Step(STAGES["detect.maximum"]), Step(STAGES[decomposer], parameters)]
+    detector = "detect.asdf" if decomposer == "decompose.asdf_only" else "detect.maximum"
+    steps = [Step(STAGES["noise.pooled"]), Step(STAGES[detector]), Step(STAGES[decomposer], parameters)]
     return Chain((*steps, *map(Step, attributes)), "test")
 
 
@@ -58,12 +59,11 @@ def test_curves_are_the_fit_of_every_decomposer(name):
     elif name == "decompose.reference":
         system, parameters = replace(PULSE, components=((1.0, 0.0, 2.0), (0.03, 8.0, 2.0))), {"model": "stretched"}
         shape = PulseShape(components=((0.03, 8.0, 0.0),))
-    elif name == "decompose.asdf_only":
-        parameters = {"refine": True} if "refine" in STAGES[name].parameters else {}
     block = simulate(shape, [(100.0, 30.3, 2.0)])
     views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
     assert len(views) == 20
-    worst = 4.0 if name == "decompose.asdf_only" else 1.25
+    # A log-normal that begins with the samples of the echo has a skew that this pulse has not.
+    worst = {"decompose.asdf_only": 4.0, "decompose.log_normal": 5.0}.get(name, 1.25)
     for view in views:
         assert len(view.echoes) == 1 and view.curves.shape == (1, len(view.fine))
         near = np.abs(view.time - 30) <= 5

@@ -177,3 +177,60 @@ def test_real_strip(riegl, tmp_path):
     assert result.exit_code == 0, result.output
     counts = json.loads(result.stdout)
     assert counts["lines"] > 50 and counts["segments"] > 50
+
+
+def ground_line(starts, n=240, spacing=0.5, tilt=0.0):
+    """A scan line over level ground 30 m below its highest sample; windows open `starts` [ns] after that height."""
+    count, speed = 90, 0.15
+    angle = np.radians(np.linspace(-6, 6, n) + tilt)
+    direction = speed * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
+    sensor = np.array([0.0, 0.0, 700.0])
+    top = sensor + direction * ((700.0 - 30.0) / -direction[:, 2])[:, None]
+    origin = top + direction * starts[:, None]
+    ground = (origin[:, 2] - 0.0) / -direction[:, 2]
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 60 * np.exp(-0.5 * ((sample * spacing - ground[row]) / 1.5) ** 2).astype(np.float32)
+    value += np.random.default_rng(1).normal(0, 1, len(value)).astype(np.float32)
+    place = (np.arange(n), np.arange(n) * 1e-5, origin, direction)
+    return ScanLine(0, *place, spacing, row, sample * spacing, value)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 25.0])
+def test_windows_that_open_at_different_heights_keep_the_relief(tilt):
+    """Counted from their own first samples, level ground was scattered over the image: no segment, or many."""
+    options = SliceOptions(geometry="time", sigma=1.5)
+    rng = np.random.default_rng(2)
+    # The ground lies 200 to 216 ns below the highest sample, so windows of 45 ns open 165 to 195 ns below it.
+    starts = rng.uniform(165, 195, 240)
+    starts[7] = 0.0
+    line = ground_line(starts, tilt=tilt)
+    segments = find_segments(cut_slice(line, options), options)
+    assert max(segment.pulses for segment in segments) > 100
+    for segment in segments:
+        assert segment.residual < (1.0 if tilt == 0 else 2.5)
+        for end in (segment.start, segment.end):
+            assert end[2] == pytest.approx(0.0, abs=0.35 if tilt == 0 else 1.0)
+        # What is drawn is what is placed: the time on the axis of the slice leads to the same height.
+        assert abs(segment.start[0] - segment.end[0]) > 2.5
+
+
+def test_the_axis_of_time_does_not_depend_on_where_windows_open():
+    options = SliceOptions(geometry="time", sigma=1.5)
+    starts = np.full(240, 170.0), np.r_[0.0, np.full(239, 170.0)]
+    together, apart = (cut_slice(ground_line(one), options) for one in starts)
+    # One pulse that sees 25 m higher moves the beginning of the axis for all, not the pulses against each other.
+    shift = apart.x[apart.line.row > 0] - together.x[together.line.row > 0]
+    assert shift == pytest.approx(np.full(len(shift), 170.0 / 0.5), abs=4) and np.ptp(shift) < 2.5
+    assert together.start.min() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_both_geometries_find_the_ground_of_a_strip(tmp_path_factory):
+    path = tmp_path_factory.mktemp("village") / "village.las"
+    simulate_strip("village", path, pulses=4000, seed=3)
+    found = {}
+    for geometry in ("plane", "time"):
+        options = SliceOptions(geometry=geometry, sigma=0.65)
+        found[geometry] = [s for line in read_all(path) for s in find_segments(cut_slice(line, options), options)]
+    assert len(found["time"]) >= 0.8 * len(found["plane"]) > 10
+    level = [segment for segment in found["time"] if abs(segment.slope) < 1 and segment.length > 10]
+    assert len(level) > 5

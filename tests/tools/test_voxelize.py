@@ -581,3 +581,75 @@ def test_memory_does_not_grow_with_the_strip(tmp_path):
         )
         peaks.append(int(result.stdout) / 1024)
     assert peaks[1] < 400 and peaks[1] < peaks[0] + 120
+
+
+def profiles_of(strip, folder, name="p", **options):
+    summary, found = voxelize(strip, folder / f"{name}.vox.npz", 1.0, profiles=folder / f"{name}.npz", **options)
+    return summary, found, load(folder / f"{name}.npz")
+
+
+def test_profiles_of_pulses_add_up_to_the_voxels(level, tmp_path):
+    summary, voxels, made = profiles_of(level, tmp_path, calibration=CALIBRATION)
+    assert len(made["point"]) == summary.with_signal and len(made["time"]) == summary.profile_samples
+    assert made["count"].sum() == len(made["energy"]) and (made["count"] > 0).all()
+    np.testing.assert_array_equal(made["first"], np.cumsum(made["count"]) - made["count"])
+    for name in ("energy", "cross_section"):
+        total = np.sum(voxels[name], dtype=np.float64)
+        assert np.sum(made[name], dtype=np.float64) == pytest.approx(total, rel=1e-3)
+    # Each pulse has the cross section of its one echo, and it lies on the ground.
+    truth = load(level.with_suffix(".npz"))
+    gamma = backscatter(2.5e-8, truth["range"], truth["amplitude"], truth["sigma"], 0.22)
+    each = np.add.reduceat(made["cross_section"].astype(float), made["first"])
+    assert np.median(each) == pytest.approx(np.median(cross_section(gamma, truth["range"], 0.5e-3)), rel=0.03)
+    pulse = np.repeat(np.arange(len(made["point"])), made["count"])
+    height = (made["start"][pulse] + made["step"][pulse] * made["time"][:, None])[:, 2]
+    centre = np.bincount(pulse, made["energy"] * height) / np.bincount(pulse, made["energy"])
+    assert np.ptp(centre) < 0.5
+    meta = json.loads(str(made["meta"]))
+    assert set(meta["columns"]) == set(made) - {"crs", "meta"} and meta["strip"] == level.name
+
+
+def test_two_surfaces_are_two_parts_of_one_profile(tmp_path):
+    strip = write_strip(tmp_path / "two.las", [[(104.0, 60.0), (101.0, 90.0)]] * 40)
+    _, _, made = profiles_of(strip, tmp_path)
+    assert len(made["point"]) == 40 and "cross_section" not in made
+    for pulse in range(40):
+        part = slice(made["first"][pulse], made["first"][pulse] + made["count"][pulse])
+        height = made["start"][pulse, 2] + made["time"][part] * made["step"][pulse, 2]
+        upper = height > 102.5
+        energy = [made["energy"][part][side].sum() for side in (upper, ~upper)]
+        assert np.array(energy) == pytest.approx(np.array([60, 90]) * 2.0 * SQRT_2PI, rel=0.1)
+
+
+def test_the_bytes_of_profiles_do_not_depend_on_blocks(forest, tmp_path):
+    for name, size in (("a", None), ("b", 137)):
+        profiles_of(forest[0], tmp_path, name, block_size=size)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_wrong_profiles_leave_nothing(level, tmp_path):
+    (tmp_path / "old.npz").write_text("x")
+    for path, kind, words in (
+        (tmp_path / "p.csv", ConfigError, ".npz"),
+        (tmp_path / "v.npz", ConfigError, "another name"),
+        (tmp_path / "old.npz", InputError, "exists"),
+        (tmp_path / "none" / "p.npz", InputError, "none"),
+    ):
+        with pytest.raises(kind, match=words):
+            voxelize(level, tmp_path / "v.npz", 1.0, profiles=path)
+    assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]
+
+
+def test_unknown_cross_sections_of_profiles_are_no_data(level, tmp_path):
+    """No position of the sensor for half of the flight: energy is known there, cross sections are not."""
+    path = tmp_path / "trajectory.txt"
+    with StripReader(level) as reader:
+        block, _ = next(reader.read_blocks(reader.read_unit(0, reader.scan()), 5000, True))
+    rows = ["time x y z"]
+    for time in np.linspace(block.gps_time.min() - 0.01, np.median(block.gps_time), 30):
+        ray = np.argmin(np.abs(block.gps_time - time))
+        rows.append(" ".join(map(repr, map(float, (time, *(block.origin[ray] - block.direction[ray] * 5000.0))))))
+    path.write_text("\n".join(rows) + "\n")
+    summary, _, made = profiles_of(level, tmp_path, calibration=CALIBRATION, sensor=SensorRequest(trajectory=path))
+    unknown = np.isnan(np.add.reduceat(made["cross_section"].astype(float), made["first"]))
+    assert unknown.sum() == summary.unknown > 100 and np.isfinite(made["energy"]).all()

@@ -5,7 +5,9 @@ Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
 
 from __future__ import annotations
 
+import json
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -43,10 +45,15 @@ from wavebatch.core.errors import InputError
 @click.option("--real", is_flag=True,
               help="Inject echoes into the waveforms of each STRIP and count those found, count false echoes, and "
               "compare surveys of parts of the strip (not with --no-stability).")
+@click.option("--against", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DIR",
+              help="Time whole runs of each STRIP or scene by the wavebatch in DIR, the top folder of another "
+              "checkout, and by this one, in turn; print the ratios and their range.")
 @output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
                folder=True)
 @common_options("json", "quiet")
-def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, **options: Any) -> None:
+def bench(
+    files: tuple[Path, ...], output: Path | None, tolerance: str | None, against: Path | None, **options: Any
+) -> None:
     """Measure error and run time of all shipped chains, of CHAIN files (.toml) and of other decomposers.
 
     Waveforms with known echoes are simulated like those of STRIP: its noise, baselines, pulse and echoes come from a
@@ -55,6 +62,9 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
 
     With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
     The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
+
+    With --against nothing but speed is measured, of this wavebatch and another: speeds of a shared machine change,
+    ratios of runs that take turns hardly do.
 
     Exit code: 0 done, 1 the strip cannot be read or the folder cannot be written, 2 wrong usage.
     """  # fmt: skip
@@ -69,6 +79,9 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
         if not strips or len(strips) < len(files):
             raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
         _bench_real(strips, output, options, say)
+        return
+    if against is not None:
+        _bench_against(against, strips, files, output, options, say)
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
@@ -86,6 +99,36 @@ def bench(files: tuple[Path, ...], output: Path | None, tolerance: str | None, *
         text += "\n\n" + format_promises(document["promises"])
     for line in write_outputs(document, text, output) if output else []:
         talk(line)
+    print_result(options["as_json"], document, [text])
+
+
+def _bench_against(
+    other: Path,
+    strips: Sequence[Path],
+    files: Sequence[Path],
+    output: Path | None,
+    options: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> None:
+    """Times runs of strips, or of simulated scenes, by two checkouts."""
+    from wavebatch.tools.bench.paired.compare import compare_runs, format_paired, simulate_strips, to_document
+
+    if len(strips) < len(files):
+        raise click.UsageError("--against compares runs of the automatic chain: leave chain files out")
+    if not strips and not options["pulses"]:
+        raise click.UsageError("--against times strips: --pulses must be more than 0")
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as folder:
+        named = {path.name: path for path in strips}
+        if not strips:
+            scenes = options["scenes"] or ("mixed", "open", "forest", "empty")
+            named = simulate_strips(scenes, options["pulses"], options["seed"], Path(folder))
+        found = compare_runs(other, named, options["repeats"], say=say)
+    text, document = format_paired(other, found), to_document(other, found)
+    if output:
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "against.txt").write_text(text + "\n")
+        (output / "against.json").write_text(json.dumps(document, indent=2) + "\n")
+        talk(f"wrote {output / 'against.txt'} and {output / 'against.json'}")
     print_result(options["as_json"], document, [text])
 
 

@@ -6,37 +6,54 @@ Only prints; the facts come from `wavebatch.surveying.inspect_strip`.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, print_result
-from wavebatch.cli.options import common_options, strip_argument, strip_options
+from wavebatch.cli.messages import count, print_json
+from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
 from wavebatch.files.inputs import find_files
-from wavebatch.surveying.inspect_strip import check_file, describe_strip
+from wavebatch.surveying.inspect_strip import check_file
+from wavebatch.tools.inspect.file_facts import describe_file
 
-EXIT_PROBLEMS = 1
-"""`check` found problems."""
+_SHOWN = 20
+"""Classes or sources of points that are printed; --json has more."""
+
+EXIT_PROBLEMS, EXIT_UNREADABLE = 1, 1
+"""`check` found problems; `info` could not read a file."""
 
 
 @click.command()
-@strip_argument
+@strips_argument
 @strip_options
 @click.option("-v", "--verbose", is_flag=True,
               help="Also survey the strip: its pulse, and the known sensor that it looks like.")
 @common_options("json")
-def info(strip: Path, direction: str, headerless: bool, verbose: bool, as_json: bool, debug: bool) -> None:
-    """Show points, wave packets, descriptors and sample values of a strip.
+def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool, debug: bool, **reading: Any) -> None:
+    """Show header, points, wave packets, descriptors and sample values of strips, and how clouds were made.
 
-    Reads all points and a few thousand waveforms.
+    STRIP is a LAS or LAZ file of any version, with or without waveforms, a glob, a folder, or @list.txt with one of
+    these per line. Reads all points and a few thousand waveforms. Of a cloud that wavebatch wrote it shows command,
+    chain, version and counts. --json prints one object for one file, else a list of them.
 
-    Exit code: 0 done, 1 the strip cannot be read, 2 wrong usage.
+    Exit code: 0 done, 1 a file cannot be read (the others are shown), 2 wrong usage.
     """
-    facts = describe_strip(strip, direction=direction, headerless=headerless)
-    if verbose and facts["packets"]["count"] and not facts["problems"]:
-        facts["pulse"] = _describe_pulse(strip, direction, headerless)
-    print_result(as_json, facts, _list_lines(facts))
+    paths = find_files(strips, recursive=recursive)
+
+    def show(path: Path) -> dict[str, Any]:
+        facts = describe_file(path, **reading)
+        if verbose and facts.get("packets", {}).get("count") and not facts["problems"]:
+            facts["pulse"] = _describe_pulse(path, **reading)
+        if not as_json:
+            click.echo("\n".join(["", *_list_lines(facts)][path == paths[0] :]))
+        return facts
+
+    results, failed = for_each(paths, show, debug=debug)
+    if as_json:
+        print_json(results[0] if len(paths) == 1 else results)
+    sys.exit(EXIT_UNREADABLE if failed else 0)
 
 
 def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
@@ -59,11 +76,12 @@ def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, A
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP_OR_CHAIN...")
+@recursive_option
 @strip_options
 @click.option("--strict", is_flag=True, help="Count notes as problems.")
 @common_options("json")
 def check(
-    files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, debug: bool
+    files: tuple[Path, ...], direction: str, headerless: bool, strict: bool, as_json: bool, debug: bool, recursive: bool
 ) -> None:
     """Check strips and chain files (.toml); print one line per problem, with its place and what to do.
 
@@ -73,7 +91,7 @@ def check(
     Exit code: 0 no problems, 1 problems found, 2 wrong usage.
     """
     clean, results = True, []
-    for path in find_files(map(str, files)):
+    for path in find_files(map(str, files), recursive=recursive):
         found = check_file(path, direction=direction, headerless=headerless)
         clean &= found.is_clean and not (strict and found.notes)
         results.append(found.to_json())
@@ -90,45 +108,103 @@ def check(
     sys.exit(0 if clean else EXIT_PROBLEMS)
 
 
-def _list_lines(facts: dict[str, Any]) -> list[str]:
-    packets, samples, vectors = facts["packets"], facts["samples"], facts["vectors"]
+def _list_lines(facts: dict[str, Any]) -> Iterator[str]:
     kind = "LAZ" if facts["compressed"] else "LAS"
+    yield f"file           {facts['file']} ({facts['bytes']} bytes)"
+    yield f"format         {kind} {facts['las_version']}, point format {facts['point_format']}"
+    made = [facts["system_identifier"], facts["generating_software"], facts["created"]]
+    yield f"made by        {', '.join(part for part in made if part) or 'not said'}"
+    for account in facts["provenance"]:
+        yield from _account_lines(account)
+    yield f"CRS            {_shorten(facts['crs'] or 'none')}"
+    yield f"points         {facts['points']}"
+    if "counts" in facts:
+        counts = facts["counts"]
+        yield f"echoes         {counts['echoes']}, added {counts['added']}, passed through {counts['passed_through']}"
+        flags = ", ".join(f"{name} {number}" for name, number in counts["flags"].items())
+        yield f"flags          {flags or 'none'}"
+    yield from _point_lines(facts)
+    if "packets" in facts:
+        yield from _packet_lines(facts)
+    for one in facts["extra_bytes"]:
+        scale = "" if one["scale"] is None else f", scale {one['scale']:g}"
+        empty = "" if one["no_data"] is None else f", no-data {' '.join(one['no_data'])}"
+        yield f"extra bytes    {one['name']} ({one['type']}{scale}{empty}) {one['description']}".rstrip()
+    yield from _record_lines(facts["records"])
+    yield from (f"note           {line}" for line in facts["notes"])
+    yield from (f"warning        {line}" for line in facts["warnings"])
+    yield from (f"problem        {line}" for line in facts["problems"])
+
+
+def _account_lines(account: dict[str, Any]) -> Iterator[str]:
+    yield f"command        {account['command']}  (wavebatch {account['version']})"
+    stages = [line.split('"')[1] for line in str(account["chain"] or "").splitlines() if line.startswith("stage =")]
+    if stages:
+        yield f"chain          {', '.join(stages)}; chosen by {account['chosen_by']}"
+    columns = [name if name == stored else f"{name} as {stored}" for name, stored in account["columns"].items()]
+    if columns:
+        yield f"columns        {', '.join(columns)}"
+
+
+def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
+    """Extent, times, returns and classes of the points."""
+    bounds, time = facts.get("bounds"), facts.get("gps_time")
+    for axis, name in enumerate("xyz"):
+        if bounds:
+            step, given = facts["scales"][axis], facts["header_bounds"]
+            low, high = bounds["least"][axis], bounds["largest"][axis]
+            wrong = max(abs(given["least"][axis] - low), abs(given["largest"][axis] - high)) > 1.5 * abs(step)
+            said = f"; the header says {given['least'][axis]:.3f} to {given['largest'][axis]:.3f}" if wrong else ""
+            yield f"{name}              {low:.3f} to {high:.3f}, steps of {step:g}{said}"
+    if time:
+        dates = f", {' to '.join(time['dates_gps'])} GPS" if "dates_gps" in time else ""
+        yield f"GPS time       {time['least']:.16g} to {time['largest']:.16g} s, {time['kind']}{dates}"
+    for key, name in (("returns", "returns"), ("numbers_of_returns", "of pulses"), ("classes", "classes"),
+                      ("point_sources", "sources")):  # fmt: skip
+        if facts.get(key):
+            pairs = [f"{k}: {n}" for k, n in facts[key].items()]
+            more = f" and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else ""
+            yield f"{name:15}{', '.join(pairs[:_SHOWN])}{more}"
+    if facts.get("scan_angle_deg"):
+        yield "scan angle     {:g} to {:g} degrees".format(*facts["scan_angle_deg"])
+        yield "intensity      {:g} to {:g}".format(*facts["intensity"])
+
+
+def _record_lines(records: list[dict[str, Any]]) -> Iterator[str]:
+    """A line per VLR; the descriptors of packets have lines of their own."""
+    for one in records:
+        if not (one["user"].startswith("LAS") and 100 <= one["id"] < 356):
+            kind = "EVLR" if one["extended"] else "VLR "
+            yield f"{kind}           {one['user']} {one['id']}: {one['bytes']} bytes {one['description']}".rstrip()
+
+
+def _packet_lines(facts: dict[str, Any]) -> Iterator[str]:
+    packets, samples, vectors = facts["packets"], facts["samples"], facts["vectors"]
     share = facts["share_with_waveform"]
     ratio = vectors["length_over_half_c"]
-    lines = [
-        f"file           {facts['file']} ({facts['bytes']} bytes)",
-        f"format         {kind} {facts['las_version']}, point format {facts['point_format']}",
-        f"CRS            {_shorten(facts['crs'] or 'none')}",
-        f"points         {facts['points']}",
-        f"with waveform  {facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})"),
-        f"without        {facts['points_without_waveform']}, broken {facts['points_broken']}",
-        f"packets        {packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)",
-    ]
+    yield f"with waveform  {facts['points_with_waveform']}" + ("" if share is None else f" ({share:.1%})")
+    yield f"without        {facts['points_without_waveform']}, broken {facts['points_broken']}"
+    yield f"packets        {packets['count']} in {packets['file'] or 'no file'} ({packets['bytes']} bytes)"
     for one in packets["descriptors"]:
         samples_text = f"{one['samples']} samples of {one['bits']} bits, {one['spacing_ns']:g} ns apart"
-        lines.append(f"descriptor {one['index']:<3} {samples_text}; {count(one['points'], 'point')}")
+        yield f"descriptor {one['index']:<3} {samples_text}; {count(one['points'], 'point')}"
     if packets["descriptors_unused"]:
-        lines.append(f"descriptors    {packets['descriptors_unused']} more, which no point uses")
+        yield f"descriptors    {packets['descriptors_unused']} more, which no point uses"
     if samples["waveforms_read"]:
         lengths = ", ".join(map(str, samples["lengths"][:8])) + (" ..." if len(samples["lengths"]) > 8 else "")
         read, limited = (count(samples[name], "waveform") for name in ("waveforms_read", "waveforms_at_limit"))
         values = f"{samples['least']} to {samples['largest']}"
-        lines.append(f"samples        {values} in {read} of {lengths} samples; {limited} at the limit")
+        yield f"samples        {values} in {read} of {lengths} samples; {limited} at the limit"
         if samples["waveforms_with_gaps"]:
             gaps = count(samples["waveforms_with_gaps"], "waveform")
-            lines.append(f"gaps           {gaps} with fill between recordings, which is no sample")
-    lines.append(f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}")
+            yield f"gaps           {gaps} with fill between recordings, which is no sample"
+    yield f"vectors        {vectors['direction']} the sensor: {vectors['evidence']}"
     if ratio is not None:
-        lines.append(f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else ""))
+        yield f"vector length  {ratio:.4f} of c/2" + (" (once divided)" if vectors["form"] == "range" else "")
     if "pulse" in facts:
         pulse = facts["pulse"]
         width = f"{pulse['full_width_ns']:.3g} ns at half maximum, noise {pulse['noise_dn']:.3g} DN"
-        lines.append(f"pulse          {width}; {pulse['sentence']}")
-    if facts["extra_dimensions"]:
-        lines.append(f"extra bytes    {', '.join(facts['extra_dimensions'])}")
-    lines += [f"note           {line}" for line in facts["notes"]]
-    lines += [f"warning        {line}" for line in facts["warnings"]]
-    return lines + [f"problem        {line}" for line in facts["problems"]]
+        yield f"pulse          {width}; {pulse['sentence']}"
 
 
 def _shorten(text: str, limit: int = 100) -> str:

@@ -45,6 +45,17 @@ class WrongUsage(click.ClickException):
         click.echo(f"error: {self.message}", file=file, err=file is None)
 
 
+class Unprinted(click.ClickException):
+    """stdout that cannot be written, such as a full disk, as one line."""
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(f"stdout: cannot be written: {error.strerror or error}")
+
+    def show(self, file: IO[Any] | None = None) -> None:
+        """The line on stderr."""
+        click.echo(f"error: {self.message}", file=file, err=file is None)
+
+
 class Interrupted(click.ClickException):
     """Ctrl-C or SIGTERM as one line and an exit code; click would say `Aborted!` and give 1."""
 
@@ -65,6 +76,10 @@ def _errors_in_one_line() -> Iterator[None]:
         if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2: the whole help
             raise
         raise WrongUsage(error) from error
+    except BrokenPipeError:
+        raise
+    except OSError as error:  # of help and version: commands report their own
+        raise Unprinted(error) from error
 
 
 class NearestGroup(click.Group):

@@ -9,15 +9,17 @@ from __future__ import annotations
 import functools
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
-from wavebatch.cli.messages import report_errors
-from wavebatch.core.errors import ConfigError
+from wavebatch.cli.messages import one_line, report_errors, talk
+from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
 if TYPE_CHECKING:
@@ -38,10 +40,10 @@ def file_option(*names: str, text: str, metavar: str = "FILE", **more: Any) -> C
 
 
 def output_option(
-    text: str, metavar: str = "FILE", *names: str, required: bool = True, folder: bool = False
+    text: str, metavar: str = "FILE", *names: str, required: bool = True, folder: bool | None = False
 ) -> Callable:
-    """`-o`, or the option of these names: the file or folder to write; text: its help."""
-    kind = OutputPath(dir_okay=folder, file_okay=not folder, path_type=Path)
+    """`-o`, or the option of these names: the file or folder to write; text: its help; folder: None for either."""
+    kind = OutputPath(dir_okay=folder is not False, file_okay=not folder, path_type=Path)
     return click.option(*(names or ("-o", "--output")), required=required, type=kind, metavar=metavar, help=text)
 
 
@@ -62,6 +64,24 @@ def together(*options: Callable) -> Callable:
 
 
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
+
+
+def _complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Lets the shell complete file names; `@` of a list is none of theirs."""
+    return [CompletionItem(incomplete, type="file")]
+
+
+def _complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    from wavebatch.stages.chain_file import list_profiles
+
+    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
+
+
+recursive_option = click.option("--recursive", is_flag=True, help="Also take the files in subfolders of folders.")
+strips_argument = together(
+    click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=_complete_files),
+    recursive_option,
+)
 clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
 
 direction_option = click.option(
@@ -87,8 +107,8 @@ calibration_option = file_option(
 )  # fmt: skip
 chain_options = together(
     file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
-    click.option("--profile", metavar="auto|fast|balanced|accurate", help="Run a shipped chain; auto surveys the strip "
-                 "and chooses the cheapest chain that suits it.  [default: auto]"),
+    click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=_complete_profiles,
+                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  [default: auto]"),
 )  # fmt: skip
 sensor_options = together(
     file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
@@ -189,6 +209,40 @@ def parse_floats(text: str, form: str) -> tuple[float, ...]:
     if len(numbers) != form.count(mark) + 1:
         raise click.BadParameter(f"{text!r} is not {form}")
     return numbers
+
+
+def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
+    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
+    if len(paths) == 1:
+        return [work(paths[0])], 0
+    results, failed = [], 0
+    for path in paths:
+        try:
+            results.append(work(path))
+        except (ConfigError, InputError) as error:
+            if debug:
+                traceback.print_exc()
+            failed += 1
+            talk(f"error: {one_line(error)}")
+    return results, failed
+
+
+def name_outputs(paths: Sequence[Path], output: Path, suffixes: Sequence[str], kind: str) -> dict[Path, Path]:
+    """The output of each strip: `output` itself for one strip, or `output`/<stem>.<kind>, a folder, for several.
+
+    suffixes: those of files. Raises ConfigError where several strips would get one file, or two of them one name.
+    """
+    is_file = output.suffix.lower() in suffixes and not output.is_dir()
+    if is_file or (len(paths) == 1 and not output.is_dir()):
+        if len(paths) > 1:
+            raise ConfigError(f"{output}: one file for {len(paths)} strips; give a folder, which gets a file for each")
+        refuse_input(output)
+        return {paths[0]: output}
+    named = {path: output / f"{path.stem}{kind}" for path in paths}
+    if len(set(named.values())) < len(named):
+        raise ConfigError(f"{output}: two strips have the same name, and so would their outputs; use two folders")
+    output.mkdir(parents=True, exist_ok=True)
+    return named
 
 
 def read_system(options: Mapping[str, Any]) -> SavedSurvey | None:

@@ -24,6 +24,7 @@ from wavebatch.cli.options import (
     read_sensor,
     sensor_options,
     strip_options,
+    strips_argument,
     system_option,
 )
 from wavebatch.core.errors import ConfigError, InputError
@@ -47,7 +48,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
 
 
 @click.command()
-@click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
+@strips_argument
 @output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
 @chain_options
 @click.option("--tolerance", metavar="LENGTH",
@@ -168,6 +169,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         tolerance=_read_tolerance(options["tolerance"]),
         system=options["system_file"],
         force=options["force"],
+        recursive=options["recursive"],
         survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],

@@ -44,9 +44,10 @@ def stages(name: str | None, as_json: bool, debug: bool) -> None:
 
 
 def _types(parameter: Parameter) -> str:
-    if parameter.choices:
-        return " or ".join(repr(choice) for choice in parameter.choices)
     words = {int: "integer", float: "number", bool: "true or false", str: "string", type(None): "nothing"}
+    if parameter.choices:
+        number = ["number"] if float in parameter.types else []
+        return " or ".join([*map(repr, parameter.choices), *number])
     return " or ".join(words.get(kind, kind.__name__) for kind in parameter.types)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import print_json, row, talk
-from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option
+from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option, recursive_option
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
@@ -35,6 +35,7 @@ SHOWN = 20
 
 @click.command()
 @clouds_argument
+@recursive_option
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
 @file_option("--polygons", text="Also count in the polygons of this GeoJSON file; where polygons overlap, the first "
@@ -43,7 +44,7 @@ SHOWN = 20
 @common_options("overwrite", "json")
 def stats(
     clouds: tuple[Path, ...], size: float | None, polygons: Path | None, output: Path | None, overwrite: bool,
-    as_json: bool, debug: bool,
+    as_json: bool, debug: bool, recursive: bool,
 ) -> None:
     """Count how many returns the pulses of CLOUDs have, how far apart they are, and which flags they have.
 
@@ -53,7 +54,7 @@ def stats(
 
     Exit code: 0 done, 1 a cloud cannot be read (the others are counted), 2 wrong usage.
     """  # fmt: skip
-    files = find_files(map(str, clouds))
+    files = find_files(map(str, clouds), recursive=recursive)
     if output is not None:
         check_target(output, overwrite=overwrite)
     divisions = [] if size is None else [Grid(size)]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, one_line, print_result, talk
-from wavebatch.cli.options import common_options, output_option, strip_options
+from wavebatch.cli.options import common_options, output_option, strip_options, strips_argument
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
@@ -26,7 +26,7 @@ EXIT_PROBLEMS = 1
 
 
 @click.command()
-@click.argument("strips", nargs=-1, required=True, metavar="STRIP...")
+@strips_argument
 @output_option("Write the survey, for --system of other commands.", "SYSTEM.toml", required=False)
 @output_option("Write the cheapest chain that suits the strip, with a reason for each part; for `run --chain`.",
                "CHAIN.toml", "--chain", "chain_file", required=False)
@@ -59,7 +59,7 @@ def survey(
     from wavebatch.surveying.system_file import format_survey
 
     overwrite = options["overwrite"]
-    paths = find_files(strips)
+    paths = find_files(strips, recursive=options["recursive"])
     for target in (output, chain_file):
         if target is not None:
             check_target(target, overwrite=overwrite)

@@ -5,24 +5,33 @@ Only reads options and prints; the work is in `wavebatch.tools.voxels`.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, counting, print_summary
+from wavebatch.cli.messages import count, counting, print_json, talk
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import refuse_input
+from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
     from wavebatch.tools.voxels.strip import VoxelSummary
+
+EXIT_SOME_FAILED = 1
+"""Some strips failed."""
 
 _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 
 
 @click.command()
-@shared.strip_argument
-@shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each.")
+@shared.strips_argument
+@shared.output_option("Voxels to write: .npz, or .las or .laz with a point at the centre of each; or a folder, which "
+                      "gets STEM.npz for each strip.", "FILE|DIR", folder=None)
 @click.option("--size", required=True, type=float, metavar="M",
               help="Edge of a voxel [m]; the faces of voxels lie at multiples of it.")
 @click.option("--method", type=click.Choice(["richardson_lucy", "gold", "wiener"]), default="richardson_lucy",
@@ -36,14 +45,19 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
               help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
               "from the highest return near it]")
+@click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
+              help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
+              "time.")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
 @shared.system_option
 @shared.calibration_option
 @shared.sensor_options
 @shared.strip_options
 @shared.common_options("overwrite", "json", "quiet")
-def voxelize(strip: Path, output: Path, **options: Any) -> None:
-    """Deconvolve the waveforms of STRIP and sum them in the voxels of a 3D grid.
+def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
+    """Deconvolve the waveforms of each STRIP and sum them in the voxels of a 3D grid.
+
+    STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line.
 
     \b
     Each voxel with signal has:
@@ -59,34 +73,47 @@ def voxelize(strip: Path, output: Path, **options: Any) -> None:
     (without --all-crossed) was seen to be empty.
 
     An .npz file holds index (n, 3), one array per value, origin, size, crs and meta; voxel i lies between origin + i
-    size and origin + (i + 1) size. Memory does not grow with the strip; large strips need room in TMPDIR. The options
+    size and origin + (i + 1) size. --profiles writes an .npz with the arrays point, gps_time, start, step, spacing,
+    anchored, clipped, first, count (one value per pulse with signal) and time, energy, cross_section (one per sample
+    with signal); the samples of pulse p are first[p] to first[p] + count[p] - 1, at start + time step.
+
+    Memory does not grow with the strip; large strips need room in TMPDIR. The options
     for the sensor position are for cross sections only.
 
-    Exit code: 0 done, 1 the strip cannot be read or the output cannot be written, 2 wrong usage.
+    Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.voxels.profile import Deconvolution
     from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
     _check_options(options)
-    sensor = shared.read_sensor(options)
     settings = shared.from_options(VoxelOptions, options, deconvolution=shared.from_options(Deconvolution, options))
-    with counting("waveforms", options["quiet"]) as bar:
+    names = ("direction", "headerless", "overwrite", "force", "profiles")
+    more: dict[str, Any] = {"sensor": shared.read_sensor(options), **{name: options[name] for name in names}}
+    more |= {"system": shared.read_system(options), "calibration": shared.read_calibration(options)}
+    paths = find_files(strips, recursive=options["recursive"])
+    if options["profiles"] is not None:
+        refuse_input(options["profiles"])
+    if len(paths) > 1 and options["profiles"] is not None:
+        raise ConfigError(f"--profiles {options['profiles']}: one file for {len(paths)} strips; make them one by one")
+    targets = shared.name_outputs(paths, output, (".npz", ".las", ".laz"), ".npz")
 
-        def show(done: int, total: int) -> None:
-            bar.total = total
-            bar.update(done)
+    def work(strip: Path) -> VoxelSummary:
+        with counting("waveforms", options["quiet"]) as bar:
 
-        summary = voxelize_strip(
-            strip,
-            output,
-            settings,
-            system=shared.read_system(options),
-            calibration=shared.read_calibration(options),
-            sensor=sensor,
-            progress=show,
-            **{name: options[name] for name in ("direction", "headerless", "overwrite", "force")},
-        )
-    print_summary(options, summary, _list_lines(summary))
+            def show(done: int, total: int) -> None:
+                bar.total = total
+                bar.update(done)
+
+            summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
+        if not options["quiet"]:
+            for line in _list_lines(summary):
+                talk(line)
+        return summary
+
+    summaries, failed = shared.for_each(paths, work, debug=options["debug"])
+    if options["as_json"]:
+        print_json(summaries[0] if len(paths) == 1 else [asdict(one) for one in summaries])
+    sys.exit(EXIT_SOME_FAILED if failed else 0)
 
 
 def _check_options(options: dict[str, Any]) -> None:
@@ -102,6 +129,8 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
         f"{summary.output}: {count(summary.voxels, 'voxel')} of {summary.size:g} m in {x} x {y} x {z}, "
         f"{summary.energy:.6g} DN ns from {summary.with_signal} of {count(summary.waveforms, 'waveform')}"
     )
+    if summary.profiles is not None:
+        yield f"{summary.profiles}: {count(summary.profile_samples, 'sample')} of {summary.with_signal} pulses"
     notes = {
         "without a return at the signal; placed by the raw return location": summary.with_signal - summary.anchored,
         "saturated; the energy is too low": summary.clipped,

@@ -65,6 +65,11 @@ class NoData(IntEnum):
     NO_RAY = 14, "its packet has no direction, or it is not a point of the cloud", "write --points echoes"
     FEW_NEIGHBOURS = 15, "fewer points around it than min_points", "raise radius"
     NO_PLANE = 16, "the points around it do not form a plane that it lies in", "lower radius; plants have no plane"
+    OTHER_PULSE = (
+        17,
+        "its width was fitted with another pulse than mode compares it with",
+        'fit the pulse of the survey (decompose.adaptive), or Gaussians with mode = "pulse"',
+    )
 
 
 REASONS: dict[NoData, tuple[str, str]] = {code: (code.meaning, code.remedy) for code in NoData if code.meaning}

@@ -241,6 +241,12 @@ class SystemPulse:
     """Skew of the system pulse; 0 for a Gaussian."""
     components: tuple[tuple[float, float, float], ...] = ()
     """Learned pulse: (weight, delay [ns], sigma [ns]) per component; empty when no pulse was learned."""
+    other_pulse: bool = False
+    """Whether the echoes of a block were fitted with another pulse than the survey's; set while a chain runs."""
+    skew: float | None = None
+    """Skew of the best skewed pulse, whichever pulse the survey chose; None where it was not measured."""
+    skew_spread: float = 0.0
+    """Standard deviation of the skews of single echoes about it: ground and plants differ; 0 where not measured."""
     pattern: tuple[float, ...] = ()
     """Offsets that repeat along the samples, of converters that take samples in turn [count]; empty for none."""
     slope_spread: float = 0.0

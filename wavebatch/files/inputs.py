@@ -17,28 +17,29 @@ from wavebatch.files.text_file import read_text
 SUFFIXES = (".las", ".laz")
 
 
-def find_files(arguments: Iterable[str]) -> list[Path]:
+def find_files(arguments: Iterable[str], *, recursive: bool = False) -> list[Path]:
     """Return the files of the arguments, each once, in the order of the arguments.
 
-    A folder gives its LAS and LAZ files by name, without those of subfolders. `@list.txt` holds one argument per line,
-    relative to the folder of the list; empty lines and lines that start with # are skipped. A file that does not exist
-    or a folder that cannot be read is kept: it fails in its turn, so that the other files are still processed.
+    A folder gives its LAS and LAZ files by name; recursive: with those of all its subfolders, but not of hidden ones.
+    `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
+    are skipped. A file that does not exist or a folder that cannot be read is kept: it fails in its turn, so that the
+    other files are still processed.
     Raises ConfigError if a folder, pattern or list gives no file.
     """
     files: dict[str, Path] = {}
     for argument in arguments:
-        for path in _expand(argument, Path()):
+        for path in _expand(argument, Path(), recursive):
             files.setdefault(_real_name(path), path)
     protect(files.values())
     return list(files.values())
 
 
-def find_strips(arguments: Iterable[str]) -> list[Path]:
+def find_strips(arguments: Iterable[str], *, recursive: bool = False) -> list[Path]:
     """Return the strips of the arguments, as `find_files` does.
 
     Raises ConfigError if there is none, or if two strips would get outputs of the same name.
     """
-    strips = find_files(arguments)
+    strips = find_files(arguments, recursive=recursive)
     if not strips:
         raise ConfigError("no strip given")
     stems: dict[str, Path] = {}
@@ -49,14 +50,14 @@ def find_strips(arguments: Iterable[str]) -> list[Path]:
     return strips
 
 
-def _expand(argument: str, folder: Path) -> Iterator[Path]:
+def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
     if argument.startswith("@"):
-        yield from _read_list(folder / argument[1:])
+        yield from _read_list(folder / argument[1:], recursive)
         return
     path = folder / argument
     if os.path.isdir(path):
         try:
-            names = os.listdir(path)
+            names = _walk(path) if recursive else os.listdir(path)
         except OSError:  # it fails in its turn
             yield path
             return
@@ -72,6 +73,16 @@ def _expand(argument: str, folder: Path) -> Iterator[Path]:
     yield from strips
 
 
+def _walk(folder: Path) -> list[str]:
+    """All files of a folder and its subfolders, relative to it; raises OSError where it cannot be read."""
+    os.listdir(folder)  # os.walk would say nothing
+    found = []
+    for place, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        found += [os.path.relpath(os.path.join(place, name), folder) for name in files]
+    return found
+
+
 def _real_name(path: Path) -> str:
     try:
         return os.path.realpath(path)
@@ -83,11 +94,11 @@ def _is_strip(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and os.path.isfile(path) and not path.name.startswith(".")
 
 
-def _read_list(path: Path) -> Iterator[Path]:
+def _read_list(path: Path, recursive: bool) -> Iterator[Path]:
     protect([path])
     for number, line in enumerate(read_text(path, "the list", 1 << 30).splitlines(), 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):
             if entry.startswith("@"):
                 raise ConfigError(f"{path}: line {number}: a list cannot name another list")
-            yield from _expand(entry, path.parent)
+            yield from _expand(entry, path.parent, recursive)

@@ -2,5 +2,5 @@
 
 from wavebatch.stages import noise  # noqa: F401
 from wavebatch.stages.attribute import basic, normal_angle, radiometry, width_angle  # noqa: F401
-from wavebatch.stages.decompose import fit, loops, models  # noqa: F401
+from wavebatch.stages.decompose import fit, loops, models, skew  # noqa: F401
 from wavebatch.stages.detect import classic, correlation, maximum, wavelet  # noqa: F401

@@ -12,7 +12,7 @@ import time
 import types
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +74,11 @@ class Stage:
     The kernel gets points (n, 3) [m], rays (n, 3), kernels.geometry.normals.Surroundings and the stage's parameters,
     of which `radius` [m] is the largest distance at which a point matters. It returns the columns' values and a
     kernels.geometry.normals.Gap for each point."""
+    fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None
+    """Of a decomposer: the strip's system with the pulse that it fits, from system and parameters. Attribute stages get
+    it, so that widths and areas are read as what they are. None: the survey's pulse."""
+    check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
+    """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
 
     @property
     def summary(self) -> str:
@@ -98,6 +103,8 @@ def stage(
     makes: tuple[str | Column, ...] = (),
     needs: tuple[str, ...] = (),
     second_pass: Callable[..., Any] | None = None,
+    fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
+    check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
 ) -> Callable[[Callable], Callable]:
     """Register the decorated function as stage `kind.<function name>`.
 
@@ -109,8 +116,8 @@ def stage(
         Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
     needs : tuple of str
         Attribute columns that earlier stages must have added.
-    second_pass : callable, optional
-        See `Stage.second_pass`.
+    second_pass, fits, check : callable, optional
+        See `Stage`.
 
     Returns
     -------
@@ -137,7 +144,7 @@ def stage(
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
-        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass)
+        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, check)
         return function
 
     return register
@@ -173,7 +180,11 @@ def _read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Ran
     if typing.get_origin(hint) is typing.Literal:
         choices = typing.get_args(hint)
         return tuple({type(choice) for choice in choices}), choices, None
-    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,), None, None
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        kinds, choices, limits = zip(*map(_read_hint, typing.get_args(hint)), strict=True)
+        chosen = next((choice for choice in choices if choice is not None), None)
+        return sum(kinds, ()), chosen, next((limit for limit in limits if limit is not None), None)
+    return (hint,), None, None
 
 
 def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:
@@ -224,6 +235,24 @@ class Chain:
                     "put the stage that makes it before"
                 )
             have.update(step.stage.makes)
+        self.check(None)
+
+    def check(self, system: SystemPulse | None) -> None:
+        """Ask every stage whether it works in this chain.
+
+        Parameters
+        ----------
+        system : SystemPulse or None
+            Pulse and noise of the strip; None before they are known.
+
+        Raises
+        ------
+        ConfigError
+            Where stages do not belong together.
+        """
+        for step in self.steps:
+            if step.stage.check is not None and (wrong := step.stage.check(step, self, system)):
+                raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {wrong}")
 
     @property
     def makes(self) -> tuple[str, ...]:
@@ -255,11 +284,12 @@ class Chain:
         Raises
         ------
         ConfigError
-            Where a stage refuses a parameter's value.
+            Where a stage refuses a parameter's value, or does not work with this strip's pulse.
         StageError
             Where a stage fails: a bug.
         """
         system = system.of(block)
+        self.check(system)
         data: dict[str, Any] = {"block": clean_block(block, system), "system": system}
         slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
         for step in self.steps:
@@ -275,6 +305,10 @@ class Chain:
                     f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
                 ) from error
             data[slot[step.stage.kind]] = result
+            if step.stage.fits is not None:
+                fitted = step.stage.fits(system, step.effective())
+                other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
+                data["system"] = replace(fitted, other_pulse=other)
             if timing is not None:
                 timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
         return data["echoes"]

@@ -142,7 +142,9 @@ def _read_value(stage: Stage, key: str, value: Any, where: str) -> Any:
     value = check_type(value, parameter.types, where)
     if parameter.choices is not None and value not in parameter.choices:
         choices = ", ".join(map(format_value, parameter.choices))
-        raise ConfigError(f"{where} must be one of {choices}, it is {format_value(value)}")
-    if parameter.range is not None:
+        if parameter.range is None or isinstance(value, str):
+            number = "" if parameter.range is None else " or a number"
+            raise ConfigError(f"{where} must be one of {choices}{number}, it is {format_value(value)}")
+    if parameter.range is not None and not isinstance(value, str):
         check_range(value, *parameter.range, where)
     return value

@@ -76,8 +76,17 @@ class ShapeLimits(NamedTuple):
     high: float
 
 
-def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
-    """Return the allowed widths: 0.7 to 4 times the system's, and positive for every component of a learned pulse.
+LEAST_WIDTH, MOST_WIDTH = 0.7, 4.0
+"""Widths that fits allow where a chain says nothing [widths of the system pulse] (docs/algorithms.md H3)."""
+
+BROADEST = 100.0
+"""Largest width that tables of learned pulses hold [widths of the system pulse]."""
+
+
+def shape_limits(
+    system: SystemPulse, spacing: float, least: float = LEAST_WIDTH, most: float = MOST_WIDTH
+) -> ShapeLimits:
+    """Return the allowed widths, positive for every component of a learned pulse.
 
     Parameters
     ----------
@@ -85,6 +94,8 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
         Result of the survey.
     spacing : float
         Time between two samples [ns].
+    least, most : float
+        Smallest and largest width [widths of the system pulse].
 
     Returns
     -------
@@ -98,10 +109,11 @@ def shape_limits(system: SystemPulse, spacing: float) -> ShapeLimits:
     shape = pulse_shape(system, spacing)
     ref = (system.components[0][2] if shape.components else system.sigma_ref) / spacing
     narrowest = min((extra for _, _, extra in shape.components), default=0.0)
-    return ShapeLimits(ref, max(0.7 * ref, float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))), 4.0 * ref)
+    positive = float(np.sqrt(max(0.05 * ref * ref - narrowest, 0.0)))
+    return ShapeLimits(ref, max(least * ref, positive), max(most * ref, positive))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=16)
 def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
     """Tabulate peak, delay and full width at half maximum by fitted width; cached, since each block needs it.
 
@@ -118,6 +130,21 @@ def pulse_measures(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
         The table.
     """
     return measure_pulse(shape, limits.low, limits.high)
+
+
+def _near_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of the usual widths."""
+    return pulse_measures(shape, limits._replace(high=min(limits.high, _usual(limits))))
+
+
+def _wide_table(shape: PulseShape, limits: ShapeLimits) -> PulseMeasures:
+    """The table of all widths above: one of both would be too coarse for the usual ones."""
+    usual = _usual(limits)
+    return pulse_measures(shape, ShapeLimits(limits.ref, usual, max(BROADEST * limits.ref, 1.01 * usual)))
+
+
+def _usual(limits: ShapeLimits) -> float:
+    return max(MOST_WIDTH * limits.ref, 1.01 * limits.low)
 
 
 @lru_cache(maxsize=8)
@@ -221,7 +248,18 @@ def describe_echoes(
     """
     if not shape.components:
         return parameters, errors
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    whole = _describe(near, parameters, errors)
+    beyond = parameters[:, 2] > near.width[-1]
+    if beyond.any():
+        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond])
+        for values, others in zip(whole, wide, strict=True):
+            values[beyond] = others
+    return whole
+
+
+def _describe(table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As describe_echoes, with one table."""
     amplitude, time, width = parameters.T
     peak = np.interp(width, table.width, table.peak)
     sigma = table.half_width / FWHM_PER_SIGMA
@@ -249,7 +287,16 @@ def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray)
     """
     if not shape.components:
         return echoes
-    table = pulse_measures(shape, limits)
+    near = _near_table(shape, limits)
+    inner = _invert(near, echoes)
+    beyond = echoes[:, 2] * FWHM_PER_SIGMA > near.half_width[-1] * (1 + 1e-5)
+    if limits.high > near.width[-1] and beyond.any():
+        inner[beyond] = _invert(_wide_table(shape, limits), echoes[beyond])
+    return inner
+
+
+def _invert(table: PulseMeasures, echoes: np.ndarray) -> np.ndarray:
+    """As model_parameters, with one table."""
     amplitude, time, sigma = echoes.T
     width = np.interp(sigma, table.half_width / FWHM_PER_SIGMA, table.width)
     delay = np.interp(width, table.width, table.delay)

@@ -26,7 +26,7 @@ from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.measure import FEW, FIRST_WIDTH, find_edge, measure_gaussian
 from wavebatch.surveying.survey import Level, Survey, compare_levels, describe_level, pool_blocks, survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, with_pulse
+from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse
 
 LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
@@ -282,7 +282,7 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
     if not kinds:
         return None
     block = pool_blocks(max(kinds.values(), key=lambda group: sum(map(len, group))))
-    plain = measure_gaussian(block, system.sigma_ref / block.spacing)
+    plain = measure_gaussian(block, system.sigma_ref / block.spacing, known=True)
     level = describe_level(block, plain)
     quiet = plain.noise_by_kind.get("quiet", 0.0)
     if quiet:
@@ -293,7 +293,7 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
         return Look(level, 0.0, 0.0, 0.0)
     width = find_edge(lone.sigma)
     steady = float(np.mean(np.abs(np.log(lone.sigma / width)) < SAME_WIDTH))
-    strong = find_lone(block, plain)
+    strong = take_strongest(lone)
     noise = level.std / strong.amplitude.astype(np.float64)
     left = np.quantile(fit_alone(block, with_pulse(plain, system), strong)[0] ** 2 - noise**2, 0.25)
     return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))

@@ -27,6 +27,9 @@ from wavebatch.stages.pulse_tables import clip_level, model_parameters, noise_fa
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
 
+FAR_OFF = 0.1
+"""Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
+
 SETTLED = 0.01
 """Change of the width, as a share of it, below which it stays."""
 
@@ -123,7 +126,10 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
         system, last = _gaussian_system(few, width, saturation), width
         width = _isolated_width(few, system)
     system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
-    return replace(system, sigma_ref=_isolated_width(block, system) * block.spacing)
+    last, width = width, _isolated_width(block, system)
+    if known and abs(width / last - 1) > FAR_OFF:
+        return measure_gaussian(block, width)
+    return replace(system, sigma_ref=width * block.spacing)
 
 
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:

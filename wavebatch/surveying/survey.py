@@ -32,6 +32,7 @@ from wavebatch.surveying.measure import (
     thin_block,
 )
 from wavebatch.surveying.systems.known_systems import find_source, take_pulse
+from wavebatch.surveying.systems.skew import measure_skew
 
 SAMPLE = 8192
 """Waveforms that a survey looks at."""
@@ -364,6 +365,7 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
         part = thin_block(block, RESIDUAL_LOOK)
         echoes = decompose_sample(part, system)
     system = replace(system, width_scatter=_measure_scatter(part, system, echoes))
+    system = measure_skew(part, system, echoes) if learn else system
     figures.update(_describe(part, system, echoes))
     decisions = (*_decide(system, block.spacing, figures), *_decide_defects(system))
     return Survey(system, len(block), figures, decisions)

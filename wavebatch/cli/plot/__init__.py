@@ -14,7 +14,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, talk
-from wavebatch.cli.plot.sections import flag_options, profile, section, select
+from wavebatch.cli.plot.sections import cube, flag_options, profile, section, select
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
@@ -157,6 +157,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
 @plot.command()
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", "columns", required=True, multiple=True,
               help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
@@ -183,7 +184,7 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
     """  # fmt: skip
     from wavebatch.tools.plots.histogram import is_flags
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     _check(output, options)
     columns = tuple(dict.fromkeys(columns))
     if any(is_flags(clouds[0], column) for column in columns):
@@ -244,6 +245,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 @plot.command(name="map")
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
@@ -263,7 +265,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     """  # fmt: skip
     from wavebatch.tools.plots.raster import grid_values
 
-    clouds = find_files(map(str, clouds))
+    clouds = find_files(map(str, clouds), recursive=options["recursive"])
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
@@ -281,3 +283,4 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
 
 plot.add_command(section)
 plot.add_command(profile)
+plot.add_command(cube)

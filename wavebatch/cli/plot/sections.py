@@ -37,16 +37,17 @@ def _read_line(context: click.Context, parameter: click.Parameter, text: str | N
     return None if text is None else shared.parse_floats(text, "X0,Y0,X1,Y1")
 
 
-def _find(clouds: Sequence[Path]) -> list[Path]:
+def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
     """Clouds, or one file of voxels."""
     voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
     if voxels and len(clouds) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
-    return list(clouds) if voxels else find_files(map(str, clouds))
+    return list(clouds) if voxels else find_files(map(str, clouds), recursive=options["recursive"])
 
 
 @click.command()
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--line", callback=_read_line, metavar="X0,Y0,X1,Y1",
               help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
@@ -67,7 +68,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import cut_section
 
-    paths = _find(clouds)
+    paths = _find(clouds, options)
     check_picture(output, overwrite=options["overwrite"])
     column = column or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
@@ -81,6 +82,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
 
 @click.command()
 @shared.clouds_argument
+@shared.recursive_option
 @_output
 @click.option("--column", help="Column for --statistic sum and mean, e.g. energy.")
 @click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
@@ -100,7 +102,7 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import measure_profile
 
-    paths = _find(clouds)
+    paths = _find(clouds, options)
     check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
@@ -111,3 +113,28 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
     if not options["quiet"]:
         total = found.total
         talk(f"{output}: {count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside")
+
+
+@click.command()
+@click.argument("cube_file", type=click.Path(path_type=Path), metavar="CUBE.npz")
+@_output
+@click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
+@click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
+@click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
+@shared.common_options("overwrite", "quiet")
+def cube(cube_file: Path, output: Path, **options: Any) -> None:
+    """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
+
+    Each given option adds a slice; without any, the middle ones are drawn, and the time with the most signal.
+
+    Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.slices.cube import cut_cube
+
+    check_picture(output, overwrite=options["overwrite"])
+    slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
+    from wavebatch.tools.slices.draw import draw_cube
+
+    draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
+    if not options["quiet"]:
+        talk(f"{output}: {', '.join(one.title for one in slices)}")

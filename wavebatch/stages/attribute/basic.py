@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
@@ -14,14 +15,26 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
-from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.chain import Chain, Range, Step, stage
+from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
 
 @stage("attribute", makes=("amplitude", "amplitude_err"))
 def amplitude(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Peak of each echo above the baseline [DN], and its error."""
     return echoes.with_attributes(amplitude=echoes.amplitude, amplitude_err=echoes.amplitude_err)
+
+
+def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse a chain in which no echo has a skew of its own."""
+    decomposer = chain.steps[2]
+    free = decomposer.stage.name == "decompose.skewed" and decomposer.effective()["kappa"] == "free"
+    if free or decomposer.stage.name == "decompose.log_normal" or "skew" in decomposer.stage.makes:
+        return ""
+    return (
+        f'{decomposer.stage.name} fits no skew per echo; use decompose.skewed with kappa = "free" or '
+        "decompose.log_normal before it"
+    )
 
 
 @stage("attribute", makes=("echo_width", "echo_width_err"))
@@ -31,24 +44,65 @@ def echo_width(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: 
     2.354820 sigma of a Gaussian, 2 sinh(1.17741 kappa) / kappa sigma of a skewed pulse. Of a learned pulse it is the
     width of the main lobe.
     """
-    factor = np.float32(_width_factor(system.kappa))
+    factor = _width_factor(_skew_of(system, echoes))
     return echoes.with_attributes(echo_width=echoes.sigma * factor, echo_width_err=echoes.sigma_err * factor)
 
 
-def _width_factor(kappa: float) -> float:
+def _skew_of(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Skew of the pulses that were fitted: one per echo where each has its own, else that of the system."""
+    return np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
+
+
+def _width_factor(kappa: np.ndarray) -> np.ndarray:
     """Full width at half maximum per sigma of a skewed pulse (docs/algorithms.md 0); 2.354820 without skew."""
     half = FWHM_PER_SIGMA / 2
-    return FWHM_PER_SIGMA if abs(kappa) < 1e-6 else float(2 * np.sinh(half * kappa) / kappa)
+    small = np.abs(kappa) < 1e-6
+    safe = np.where(small, 1.0, kappa)
+    return np.where(small, FWHM_PER_SIGMA, 2 * np.sinh(half * safe) / safe).astype(np.float32)
+
+
+@stage("attribute", makes=("skew", "skew_err"), check=_need_free_skew)
+def skew(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
+    """Skew of each echo and its error: after decompose.skewed with kappa = "free", or decompose.log_normal.
+
+    Ground and plants differ in it. 0 is a Gaussian; of a log-normal it is the sigma of its logarithm.
+
+    References
+    ----------
+    Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
+    """
+    unknown = np.full(len(echoes), np.nan, np.float32)
+    return echoes.with_attributes(**{name: echoes.attributes.get(name, unknown) for name in ("skew", "skew_err")})
 
 
 @stage("attribute", makes=("energy",))
 def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse."""
-    factor = np.float32(SQRT_2PI * np.exp(0.5 * system.kappa**2))
+    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse.
+
+    Of a generalized Gaussian it is that of its exponent.
+    """
+    factor = (SQRT_2PI * np.exp(0.5 * _skew_of(system, echoes) ** 2)).astype(np.float32)
+    if "power" in echoes.attributes:
+        factor = _area_factor(echoes.attributes["power"].astype(np.float64)).astype(np.float32)
     return echoes.with_attributes(energy=echoes.amplitude * echoes.sigma * factor)
 
 
-@stage("attribute", makes=("pulse_deviation",))
+def _area_factor(power: np.ndarray) -> np.ndarray:
+    """Area of exp(-|z|^p / 2) over its full width at half maximum, times 2.354820; sqrt(2 pi) for p = 2."""
+    half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
+    return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width
+
+
+def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse decomposers that give every echo a pulse of its own: none is common to compare with."""
+    decomposer = chain.steps[2]
+    own = decomposer.effective().get("kappa") == "free" or decomposer.effective().get("model") == "generalized"
+    if own or decomposer.stage.name in ("decompose.log_normal", "decompose.generalized_gaussian"):
+        return f"{decomposer.stage.name} gives every echo a shape of its own; use it after decompose.adaptive"
+    return ""
+
+
+@stage("attribute", makes=("pulse_deviation",), check=_need_one_pulse)
 def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
     """Deviation of each echo from the fitted pulse: sqrt(h3^2 + h4^2) of its residual, per unit of A/std sqrt(s/T).
 
@@ -61,7 +115,7 @@ def pulse_deviation(block: WaveformBlock, noise: Noise, system: SystemPulse, ech
     """
     s, spacing = block.samples.shape[1], block.spacing
     time, sigma = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing, most=BROADEST)
     whole = np.stack([echoes.amplitude, time, sigma], axis=1).astype(np.float64)
     model = model_parameters(shape, limits, whole)
     std = noise.std[echoes.waveform].astype(np.float64)

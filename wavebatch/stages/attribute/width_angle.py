@@ -10,6 +10,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import NO_SKEW
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
     angles_of_variance,
@@ -18,8 +19,8 @@ from wavebatch.kernels.physics.incidence import (
     spread_variance,
 )
 from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
-from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.chain import Chain, Range, Step, stage
+from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
 NARROW_ERRORS = 3.0
 """An echo whose variance is negative by so many errors is flagged as narrower than the system pulse."""
@@ -38,7 +39,28 @@ _UNCLEAN = {
 _REASON = f"incidence_angle{SUFFIX}"
 
 
-@stage("attribute", makes=("incidence_angle", "incidence_angle_err"), needs=("x", "y", "z"))
+def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse decomposers whose widths never are those of one pulse."""
+    decomposer = chain.steps[2]
+    name = decomposer.stage.name
+    if name == "decompose.log_normal" or decomposer.effective().get("kappa") == "free":
+        return f"{name} fits a skew per echo, which takes part of the width; use decompose.adaptive"
+    return ""
+
+
+def _other_pulse(system: SystemPulse, mode: str) -> bool:
+    """Whether widths were fitted with another pulse than a mode compares them with: angles would be off by degrees."""
+    if mode == "system":
+        return system.other_pulse
+    return bool(system.components) or abs(system.kappa) >= NO_SKEW
+
+
+@stage(
+    "attribute",
+    makes=("incidence_angle", "incidence_angle_err"),
+    needs=("x", "y", "z"),
+    check=_check_widths,
+)
 def incidence_angle(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["system", "pulse", "paper"] = "system",
@@ -54,13 +76,15 @@ def incidence_angle(
     have the flag NARROW.
 
     No-data where the system pulse is shorter than 0.85 samples, where sensor or divergence are not known, and where the
-    error exceeds max_error: with a narrow beam and a long pulse that is everywhere.
+    error exceeds max_error: with a narrow beam and a long pulse that is everywhere. No-data also where the decomposer
+    fits another pulse than the mode compares widths with: Gaussians on a strip whose pulse is none, for example.
 
     Parameters
     ----------
     mode : {"system", "pulse", "paper"}
-        `system` takes the pulse that the strip was fitted with, `pulse` a Gaussian fitted to t^2 exp(-t / tau) at the
-        sampling of the file, `paper` the printed formulas, whose angles are too large.
+        `system` takes the pulse of the survey, which the decomposer must have fitted (`decompose.adaptive`), `pulse`
+        a Gaussian fitted to t^2 exp(-t / tau) at the sampling of the file (`decompose.gaussian`), `paper` the printed
+        formulas, whose angles are too large.
     divergence : float
         Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
     max_error : float
@@ -90,6 +114,7 @@ def incidence_angle(
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_DIVERGENCE, not beam),
+        (NoData.OTHER_PULSE, _other_pulse(system, mode)),
         (NoData.SHORT_PULSE, short),
         (NoData.SHARED_PULSE, ~is_alone(block, echoes) & alone),
         *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
@@ -141,7 +166,7 @@ def _model_width(
     spacing: float, system: SystemPulse, sigma: np.ndarray, error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Width of the part of the fitted pulse that a target widens as a Gaussian [ns], its error, the system's width."""
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing, most=BROADEST)
     if not shape.components:
         return sigma, error, system.sigma_ref
     one = np.ones_like(sigma)

@@ -1,37 +1,24 @@
-"""Decomposers that fit a pulse model to clusters of candidates, and the steps that all fitting decomposers share.
+"""Decomposers that fit the strip's pulse or Gaussians to clusters of candidates, with or without growth.
 
-Path of a block: candidates in ns, clusters in samples (`find_clusters`), fits (kernels), flagged table in ns
-(`describe_solutions`).
+Path of a block: candidates in ns, clusters in samples (`group`), fits (kernels), flagged table in ns (`solve`).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import SQRT_PI
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
-from wavebatch.kernels.fit.cluster import Clusters
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import WidthPrior
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
-from wavebatch.kernels.signal.runs import gap_distance
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
-from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
-from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
-from wavebatch.stages.pulse_tables import (
-    ShapeLimits,
-    clip_level,
-    describe_echoes,
-    error_factors,
-    pulse_shape,
-    shape_limits,
-)
+from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_candidates, fit_gaussian, make_settings
+from wavebatch.stages.flags import flag_echoes
+from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 
 
 @stage("decompose")
@@ -40,12 +27,14 @@ def none(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTa
     return flag_echoes(block, noise, system, echoes)
 
 
-@stage("decompose")
+@stage("decompose", fits=fit_gaussian)
 def closed_form(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     fraction: Annotated[float, Range(0.0, 1.0)] = 0.2,
     steps: Annotated[int, Range(0, 100)] = 2,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """One Gaussian for every candidate alone: a closed form and a few Gauss-Newton steps.
 
@@ -60,26 +49,35 @@ def closed_form(
         Gauss-Newton steps after it.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
     Guo (2011); docs/algorithms.md 4.1.
     """
-    start = _start_closed_form(block, noise, system, echoes, fraction)
-    settings = make_settings(block, system, GAUSSIAN, tolerance=0.1, max_iterations=steps + 1, grow=False)
+    widths = least_width, most_width
+    start = _start_closed_form(block, noise, system, echoes, fraction, widths)
+    settings = make_settings(
+        block, system, GAUSSIAN, widths=widths, tolerance=0.1, max_iterations=steps + 1, grow=False
+    )
     return fit_candidates(block, noise, system, start, settings, significance=significance, most=1)
 
 
-@stage("decompose")
+@stage("decompose", fits=fit_gaussian)
 def gaussian(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
-    Batched Levenberg-Marquardt. Widths stay within 0.7 and 4 system widths, times within the window. No echo is added.
+    Batched Levenberg-Marquardt. Widths stay within their limits, times within the window. No echo is added.
 
     Parameters
     ----------
@@ -90,12 +88,19 @@ def gaussian(
         standard deviation of the minimum.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
     Wagner et al. (2007) eq. 3; docs/algorithms.md 2.3.
     """
-    settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    settings = make_settings(
+        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
+        max_iterations=max_iterations, grow=False,
+    )  # fmt: skip
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
@@ -110,6 +115,8 @@ def adaptive(
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 4.5,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """As many echoes as the waveform needs: a fit grows only where a test of its residual asks for it.
 
@@ -137,6 +144,10 @@ def adaptive(
         standard deviation of the minimum.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse]; steep slopes need more than 4.
 
     References
     ----------
@@ -148,6 +159,7 @@ def adaptive(
         block,
         system,
         shape,
+        widths=(least_width, most_width),
         tolerance=tolerance,
         max_iterations=max_iterations,
         grow=True,
@@ -161,138 +173,13 @@ def adaptive(
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
-def make_settings(block: WaveformBlock, system: SystemPulse, shape: PulseShape, **options: Any) -> Settings:
-    """Collect what a decomposition with this pulse may do: the strip's widths, digitizer and noise.
-
-    Parameters
-    ----------
-    block, system
-        As for a stage.
-    shape : PulseShape
-        The pulse to fit.
-    **options
-        Further fields of Settings.
-
-    Returns
-    -------
-    Settings
-        For `fit_candidates`.
-    """
-    limits = shape_limits(system if shape.components else replace(system, components=()), block.spacing)
-    return Settings(*limits, shape=shape, clip=clip_level(block, system), noise_gain=system.noise_gain, **options)
-
-
-def fit_candidates(
+def _start_closed_form(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
     echoes: EchoTable,
-    settings: Settings,
-    *,
-    significance: float,
-    most: int = MOST_JOINED,
-) -> EchoTable:
-    """Run a decomposer: candidates in ns, clusters, fits, flagged table in ns.
-
-    Parameters
-    ----------
-    block, noise, system, echoes
-        As for a stage.
-    settings : Settings
-        Pulse, limits and options of the fit.
-    significance : float
-        Least energy of an echo [standard deviations].
-    most : int
-        Most candidates that are fitted together.
-
-    Returns
-    -------
-    EchoTable
-        Fitted echoes with errors and flags.
-    """
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
-    solutions = decompose_clusters(
-        block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
-    )
-    return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
-
-
-def describe_solutions(
-    block: WaveformBlock,
-    noise: Noise,
-    system: SystemPulse,
-    clusters: Clusters,
-    solutions: list[Solution],
-    settings: Settings,
-    significance: float,
-) -> EchoTable:
-    """Turn fits in samples into a flagged table in ns.
-
-    Echoes that noise explains or that lie outside the waveform are dropped, unresolved ones are merged.
-
-    Parameters
-    ----------
-    block, noise, system
-        As for a stage.
-    clusters : Clusters
-        The fitted clusters.
-    solutions : list of Solution
-        Their fits.
-    settings : Settings
-        Pulse and limits of the fit.
-    significance : float
-        Least energy of an echo [standard deviations].
-
-    Returns
-    -------
-    EchoTable
-        Fitted echoes with errors and flags.
-    """
-    if not solutions:
-        return EchoTable.empty()
-    flat = [_flatten(clusters, solution) for solution in solutions]
-    waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
-    limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
-    errors *= error_factors(system, block.spacing, parameters[:, 2])
-    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
-    amplitude, time, width = parameters.T
-    energy = amplitude * amplitude * width * SQRT_PI
-    last = block.samples.shape[1] - 1
-    keep = (energy >= (significance * noise.std[waveform]) ** 2) & (time >= -0.5 * width) & (time <= last + 0.5 * width)
-    keep &= np.isfinite(errors).all(axis=1)
-    if block.missing is not None:
-        keep &= gap_distance(block.missing, waveform, time) >= -0.5 * width
-    amplitude, time, width = parameters[keep].T
-    amplitude_err, time_err, width_err = errors[keep].T
-    spacing = block.spacing
-    table = EchoTable.build(
-        waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
-        amplitude_err=amplitude_err, sigma_err=width_err * spacing, residual=misfit[keep], flags=flags[keep],
-    )  # fmt: skip
-    table = merge_unresolved(drop_twins(table))
-    if settings.shape.components:
-        table = drop_unproven(table, system, clip_level(block, system) - system.baseline)
-    return flag_echoes(block, noise, system, clear_lone(table))
-
-
-def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
-    """One row per echo: waveform, parameters (m, 3), errors (m, 3), misfit, flags."""
-    k = solution.parameters.shape[2]
-    flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
-    flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
-    if k > 1:
-        flags |= int(EchoFlag.OVERLAPPED)
-    return (
-        np.repeat(clusters.waveform[solution.cluster], k),
-        solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
-        solution.errors.transpose(0, 2, 1).reshape(-1, 3),
-        np.repeat(solution.misfit, k),
-        flags.reshape(-1),
-    )
-
-
-def _start_closed_form(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, fraction: float
+    fraction: float,
+    widths: tuple[float, float],
 ) -> EchoTable:
     """Candidates with amplitude, time and width of the closed form, where it is valid."""
     ref = system.sigma_ref / block.spacing
@@ -307,7 +194,7 @@ def _start_closed_form(
     if block.missing is not None:
         inside &= ~block.missing[row, at]
     amplitude, shift, width, holds = fit_closed_form(np.where(inside, y, 0.0), fraction)
-    holds &= (width > 0.7 * ref) & (width < 4.0 * ref)
+    holds &= (width > widths[0] * ref) & (width < widths[1] * ref)
     return replace(
         echoes,
         amplitude=np.where(holds, amplitude, echoes.amplitude).astype(np.float32),

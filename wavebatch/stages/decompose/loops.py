@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -11,114 +12,178 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
 from wavebatch.kernels.fit.closed_form import estimate_starts, start_errors
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.kernels.signal.signal import smooth_121
-from wavebatch.stages.chain import Range, stage
+from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
+from wavebatch.stages.decompose.models import generalized_gaussian, reference
+from wavebatch.stages.decompose.rebuild import loop_shape, render_table
+from wavebatch.stages.decompose.skew import skewed, system_skew
+from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
-from wavebatch.stages.detect.correlation import asdf
+from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.flags import flag_echoes
+from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH
 
 
-@stage("decompose")
+def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+    """The system with the pulse that `residual_loop` fits."""
+    model = parameters["model"]
+    if model == "learned":
+        return system
+    return replace(system, components=(), kappa=system_skew(system)) if model == "skewed" else fit_gaussian(system, {})
+
+
+@stage("decompose", fits=_fit_loop)
 def residual_loop(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    model: Literal["gaussian", "skewed", "generalized", "learned"] = "gaussian",
     t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
+    t_unit: Literal["noise", "count", "amplitude"] = "noise",
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
-    """Gaussians, with one more at the largest residual of the waveform while that exceeds a threshold.
+    """Pulses of a model, with one more at the largest residual of the waveform while that exceeds a threshold.
 
-    Only their residual supports the added echoes: on pulses that are not Gaussian there are many.
+    Only their residual supports the added echoes: on pulses that are not those of the model there are many. On a real
+    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2).
 
     Parameters
     ----------
+    model : {"gaussian", "skewed", "generalized", "learned"}
+        Gaussians, skewed pulses with the skew of the survey, generalized Gaussians, or the pulse of the survey.
     t_diff : float
-        Largest residual that adds no echo [standard deviations of the noise].
+        Largest residual that adds no echo, T_diff of the paper, in the unit below.
+    t_unit : {"noise", "count", "amplitude"}
+        Standard deviations of the noise, counts of the digitizer, or shares of the waveform's largest sample above the
+        baseline.
     max_echoes : int
         Most echoes per waveform up to which echoes are added.
     max_iterations : int
         Of each fit; an echo that has not converged after so many is flagged.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo, of the paper's eq. 4 [widths of the system pulse].
+    most_width : float
+        Largest width of an echo, of the paper's eq. 4 [widths of the system pulse].
 
     References
     ----------
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
+    shape = loop_shape(system, block.spacing, model)
+    options = {"max_iterations": max_iterations, "tolerance": 0.1, "significance": significance}
+    options |= {"least_width": least_width, "most_width": most_width}
+    limit = _residual_limit(block, noise, t_diff, t_unit)
     rows = np.arange(len(block))
     before = np.full(len(block), -1)
     varies = find_varying(block.samples)
     parts: list[EchoTable] = []
-    while len(rows):
-        found = gaussian(
-            block, noise, system, echoes, max_iterations=max_iterations, tolerance=0.1, significance=significance
-        )
-        residual = _residual(block, noise, found)
-        height = residual.max(axis=1)
+    while len(rows) or not parts:
+        found = _LOOP_FITS[model](block, noise, system, echoes, **options)
+        residual = _residual(block, noise, system, shape, found)
+        height = residual.max(axis=1, initial=0)
         number = found.count(len(rows))
-        grows = (height > t_diff * noise.std) & (number < max_echoes) & (number > before) & varies
+        grows = (height > limit) & (number < max_echoes) & (number > before) & varies
         at, goes_on = np.flatnonzero(grows), grows[found.waveform]
         final, kept = found.take(np.flatnonzero(~goes_on)), found.take(np.flatnonzero(goes_on))
         parts.append(_renumber(final, rows[final.waveform]))
         new = residual[at].argmax(axis=1) * block.spacing
         added = EchoTable.build(at, new, height[at], np.full(len(at), system.sigma_ref))
-        echoes = join_tables(kept, added)
+        echoes = join_tables(replace(kept, attributes={}), added)
         echoes = _renumber(echoes, np.searchsorted(at, echoes.waveform))
-        rows, before, varies, block = rows[at], number[at], varies[at], block.rows(at)
-        noise = noise.rows(at)
+        rows, before, varies, limit = rows[at], number[at], varies[at], limit[at]
+        block, noise = block.rows(at), noise.rows(at)
     return join_tables(*parts)
+
+
+_LOOP_FITS: dict[str, Callable[..., EchoTable]] = {
+    "gaussian": gaussian,
+    "skewed": skewed,
+    "generalized": generalized_gaussian,
+    "learned": reference,
+}
+"""The decomposer that fits each model of a residual loop; none of them adds an echo."""
+
+
+def _residual_limit(block: WaveformBlock, noise: Noise, t_diff: float, unit: str) -> np.ndarray:
+    """Largest residual of each waveform that adds no echo [count]; never below the noise."""
+    if unit == "noise":
+        return t_diff * noise.std
+    if unit == "count":
+        return np.maximum(t_diff, noise.std)
+    top = np.max(block.samples - noise.level, axis=1, initial=0)
+    return np.maximum(t_diff * top, noise.std)
 
 
 def _renumber(table: EchoTable, waveform: np.ndarray) -> EchoTable:
     return replace(table, waveform=waveform.astype(np.int32))
 
 
-def _residual(block: WaveformBlock, noise: Noise, table: EchoTable) -> np.ndarray:
+def _residual(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, shape: PulseShape, table: EchoTable
+) -> np.ndarray:
     """Waveforms without their echoes, float32 (n, s)."""
-    n, s = block.samples.shape
-    residual = block.samples - noise.level
-    sigma = table.sigma / np.float32(block.spacing)
-    residual -= render_echoes(GAUSSIAN, n, s, table.waveform, table.time / block.spacing, table.amplitude, sigma)
+    residual = block.samples - noise.level - render_table(shape, block, system, table)
     if block.missing is not None:
         residual[block.missing] = 0
     return residual.astype(np.float32)
 
 
-@stage("decompose")
+_ASDF_LIKE = ("detect.asdf", "detect.correlation", "detect.matched_filter")
+"""Detectors whose times are those of the best place of a reference pulse: their error is known without a fit."""
+
+
+def _need_asdf(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Refuse detectors whose times have another error than that of a reference pulse."""
+    name = chain.steps[1].stage.name
+    if name in _ASDF_LIKE:
+        return ""
+    return (
+        f"it keeps the times of a detector that compares the waveform with a reference pulse ({', '.join(_ASDF_LIKE)}) "
+        f"and knows their errors only; after {name} use decompose.none, which keeps its echoes, or a fit"
+    )
+
+
+@stage("decompose", fits=fit_gaussian, check=_need_asdf)
 def asdf_only(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     mode: Literal["shortcut", "mixed"] = "shortcut",
+    describe: Literal["samples", "detector"] = "samples",
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    threshold: Annotated[float, Range(0.0, 1e6)] = 4.0,
 ) -> EchoTable:  # fmt: skip
-    """Echoes of the ASDF with amplitudes and widths from the samples around them: no fit, or one where needed.
+    """Echoes of the detector before it, with its times and without a fit; or a fit where detectors disagree.
 
-    Mixed: waveforms in which the chain's detector and the ASDF disagree in the number or the times of the echoes are
-    fitted with Gaussians, from the detector's candidates. Errors without a fit are those expected of isolated echoes.
+    The detector is `detect.asdf` with any rule and reference, `detect.correlation` or `detect.matched_filter`. Errors
+    are those expected of isolated echoes. Mixed: waveforms in which the detector and `detect.maximum` disagree in the
+    number or the times of the echoes are fitted with Gaussians, from the maxima.
 
     Parameters
     ----------
     mode : {"shortcut", "mixed"}
         `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
+    describe : {"samples", "detector"}
+        Amplitude and width: a log-parabola through five samples at the detector's time, or what the detector says. An
+        ASDF says the width of its reference, and an amplitude that is too low for echoes that are broader.
     tolerance : float
         Largest distance in time of echoes that agree [widths of the system pulse].
-    threshold : float
-        Of the ASDF [standard deviations of the filtered noise].
 
     References
     ----------
     Wagner et al. (2007); docs/algorithms.md 1.1.
     """
-    quick = _describe(block, noise, system, asdf(block, noise, system, threshold=threshold))
+    quick = _describe(block, noise, system, echoes, describe)
     if mode == "shortcut":
         return quick
-    differ = _disagree(len(block), echoes, quick, tolerance * system.sigma_ref)
+    maxima = maximum(block, noise, system)
+    differ = _disagree(len(block), maxima, quick, tolerance * system.sigma_ref)
     rows = np.flatnonzero(differ)
-    chosen = echoes.take(np.flatnonzero(differ[echoes.waveform]))
+    chosen = maxima.take(np.flatnonzero(differ[maxima.waveform]))
     chosen = _renumber(chosen, np.searchsorted(rows, chosen.waveform))
     fitted = gaussian(block.rows(rows), noise.rows(rows), system, chosen)
     agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
@@ -133,25 +198,33 @@ def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> 
     return differ
 
 
-def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Describe echoes by a log-parabola through five samples, with the expected errors and the misfit."""
+def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, source: str) -> EchoTable:
+    """Give echoes amplitude, width, the expected errors and the misfit; their times stay."""
     spacing, last = block.spacing, block.samples.shape[1] - 1
     sample = np.clip(np.rint(echoes.time / spacing), 0, last).astype(np.int64)
     waveform = echoes.waveform.astype(np.int64)
     smoothed = smooth_121(signal_above(block, noise))
     amplitude, _, width = estimate_starts(smoothed, waveform, sample, system.sigma_ref / spacing)
-    table = candidate_table(block, system, waveform, echoes.time / spacing, amplitude, width)
+    measured = candidate_table(block, system, waveform, echoes.time / spacing, amplitude, width)
     std = noise.std[waveform]
-    height, width = np.maximum(table.amplitude, std).astype(np.float64), table.sigma.astype(np.float64)
+    height, width = np.maximum(measured.amplitude, std).astype(np.float64), measured.sigma.astype(np.float64)
     # A reference whose width is not the echo's loses this much of the bound (Schwarz's inequality of the slopes).
     loss = ((width * width + system.sigma_ref**2) / (2.0 * width * system.sigma_ref)) ** 1.5
+    time_err = np.hypot(loss * bound_time(height, width, std, spacing), np.nan_to_num(echoes.time_err))
     amplitude_err, width_err = start_errors(height, width / spacing, std)
+    table = replace(measured, time_err=time_err.astype(np.float32))
+    if source == "detector":
+        sigma = np.maximum(echoes.sigma, np.float32(LEAST_WIDTH * system.sigma_ref))
+        # What the detector says of them may be wrong by its distance from what the samples say.
+        amplitude_err = np.hypot(amplitude_err, measured.amplitude - echoes.amplitude)
+        width_err = np.hypot(width_err, (measured.sigma - sigma) / spacing)
+        table = replace(table, amplitude=np.maximum(echoes.amplitude, 0), sigma=sigma)
+    residual = _residual(block, noise, system, GAUSSIAN, table)
     table = replace(
         table,
-        time_err=(loss * bound_time(height, width, std, spacing)).astype(np.float32),
         amplitude_err=amplitude_err.astype(np.float32),
         sigma_err=(spacing * width_err).astype(np.float32),
-        residual=_misfit(_residual(block, noise, table), waveform, sample, 3 * system.sigma_ref / spacing) / std,
+        residual=_misfit(residual, waveform, sample, 3 * system.sigma_ref / spacing) / std,
     )
     close = (np.diff(waveform) == 0) & (np.diff(table.time) < 4 * system.sigma_ref)
     overlapped = np.append(close, False) | np.append(False, close) if len(table) else np.zeros(0, bool)

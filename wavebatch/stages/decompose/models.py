@@ -2,82 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters, cut_windows
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import batch_size, evaluate_model
+from wavebatch.kernels.fit.least_squares import evaluate_model
 from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.decompose.fit import describe_solutions, fit_candidates, make_settings
 from wavebatch.stages.decompose.group import find_clusters
-from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
+from wavebatch.stages.decompose.solve import (
+    LeastWidth,
+    MostWidth,
+    alike_clusters,
+    cut_alike,
+    describe_solutions,
+    fit_candidates,
+    fit_gaussian,
+    make_settings,
+)
+from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
 POWERS = (1.4, 1.7, 2.0, 2.4, 3.0, 4.0)
 """Exponents of the generalized Gaussian that are tried for every cluster."""
 
 
-@stage("decompose")
-def skewed(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    kappa: Annotated[float, Range(-1.0, 1.0)] = 0.0,
-    max_iterations: Annotated[int, Range(1, 1000)] = 40,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-) -> EchoTable:  # fmt: skip
-    """Sum of skewed pulses: the log-normal of Wang et al. with one skew for the sensor, in its stable form.
-
-    The time is that of the peak.
-
-    Parameters
-    ----------
-    kappa : float
-        Skew; 0 takes the value of the survey.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-
-    References
-    ----------
-    Wang, Wang and Tseng eq. 2; docs/algorithms.md 0, 1.2.
-    """
-    shape = skewed_shape(system, kappa)
-    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
-    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+def _fit_reference(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
+    """The system with the pulse that `reference` fits; of a stretched one the width is that at half maximum."""
+    return system if parameters["model"] == "broadened" else replace(system, components=(), kappa=0.0)
 
 
-def skewed_shape(system: SystemPulse, kappa: float) -> PulseShape:
-    """Return the pulse that `skewed` fits.
-
-    Parameters
-    ----------
-    system : SystemPulse
-        Result of the survey.
-    kappa : float
-        Skew; 0 takes the value of the survey.
-
-    Returns
-    -------
-    PulseShape
-        Skewed, or Gaussian where the skew is negligible.
-    """
-    return pulse_shape(replace(system, components=(), kappa=kappa or system.kappa), 1.0)
-
-
-@stage("decompose")
+@stage("decompose", fits=_fit_reference)
 def reference(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     model: Literal["broadened", "stretched", "given"] = "broadened",
@@ -85,6 +49,8 @@ def reference(
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """Sum of system pulses, broadened by a Gaussian target or stretched in time; no echo is added.
 
@@ -103,13 +69,20 @@ def reference(
         A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     docs/algorithms.md R1; Mallet and Bretar (2009).
     """
     shape = reference_shape(system, block.spacing, model, pulse)
-    settings = make_settings(block, system, shape, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    settings = make_settings(
+        block, system, shape, widths=(least_width, most_width), tolerance=tolerance, max_iterations=max_iterations,
+        grow=False,
+    )  # fmt: skip
     if model != "broadened":
         system = replace(system, components=())
     return fit_candidates(block, noise, system, echoes, settings, significance=significance)
@@ -153,12 +126,14 @@ def _tabulate_system(system: SystemPulse, shape: PulseShape, spacing: float) -> 
     return PulseShape(table=tabulate_pulse(x, value))
 
 
-@stage("decompose")
+@stage("decompose", fits=fit_gaussian)
 def generalized_gaussian(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 40,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """Sum of generalized Gaussians exp(-|z|^p / 2); the exponent is chosen for each cluster of echoes.
 
@@ -173,12 +148,19 @@ def generalized_gaussian(
         A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     Chauve et al. (2007), eq. 4.
     """
-    plain = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    plain = make_settings(
+        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
+        max_iterations=max_iterations, grow=False,
+    )  # fmt: skip
     candidates, clusters = find_clusters(block, noise, system, echoes, plain)
     best = np.full(len(clusters.number), np.inf)
     chosen = np.zeros(len(best), np.int64)
@@ -195,12 +177,13 @@ def generalized_gaussian(
             better = solution.cost < best[solution.cluster]
             best[solution.cluster[better]] = solution.cost[better]
             chosen[solution.cluster[better]] = number
-    kept = [
-        solution.take(np.flatnonzero(chosen[solution.cluster] == number))
-        for number, solutions in enumerate(found)
-        for solution in solutions
-    ]
-    return describe_solutions(block, noise, system, clusters, kept, plain, significance)
+    kept, power = [], [np.empty(0, np.float32)]
+    for number, solutions in enumerate(found):
+        for solution in solutions:
+            kept.append(solution.take(np.flatnonzero(chosen[solution.cluster] == number)))
+            power.append(np.full(kept[-1].parameters[:, 0].size, POWERS[number], np.float32))
+    columns = {"power": np.concatenate(power)}
+    return describe_solutions(block, noise, system, clusters, kept, plain, significance, columns)
 
 
 def half_width_factor(power: float) -> float:
@@ -219,12 +202,14 @@ def half_width_factor(power: float) -> float:
     return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
-@stage("decompose")
+@stage("decompose", fits=fit_gaussian)
 def gauss_newton(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
     max_iterations: Annotated[int, Range(1, 1000)] = 20,
     tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
     significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
+    least_width: LeastWidth = LEAST_WIDTH,
+    most_width: MostWidth = MOST_WIDTH,
 ) -> EchoTable:  # fmt: skip
     """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
 
@@ -238,36 +223,29 @@ def gauss_newton(
         A fit ends with the step that promises a smaller fall of chi2.
     significance : float
         Least energy of an echo [standard deviations of the noise's energy].
+    least_width : float
+        Smallest width of an echo [widths of the system pulse].
+    most_width : float
+        Largest width of an echo [widths of the system pulse].
 
     References
     ----------
     Jutzi and Stilla (2005); docs/algorithms.md 1.3.
     """
-    settings = make_settings(block, system, GAUSSIAN, tolerance=tolerance, max_iterations=max_iterations, grow=False)
+    settings = make_settings(
+        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
+        max_iterations=max_iterations, grow=False,
+    )  # fmt: skip
     candidates, clusters = find_clusters(block, noise, system, echoes, settings)
-    found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in _alike(clusters, block)]
+    groups = alike_clusters(clusters, np.arange(len(clusters.number)), block)
+    found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in groups]
     return describe_solutions(block, noise, system, clusters, found, settings, significance)
-
-
-def _alike(clusters: Clusters, block: WaveformBlock) -> Iterator[np.ndarray]:
-    """Batches of clusters with the same number of echoes and windows of about the same length."""
-    length = np.minimum(-(-(clusters.high - clusters.low) // 8) * 8, block.samples.shape[1])
-    kind = clusters.number * (1 << 32) + length
-    order = np.argsort(kind, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else []:
-        size = batch_size(int(clusters.number[group[0]]), int(length[group[0]]))
-        yield from (group[begin : begin + size] for begin in range(0, len(group), size))
 
 
 def _solve_undamped(
     block: WaveformBlock, noise: Noise, candidates: Candidates, clusters: Clusters, rows: np.ndarray, settings: Settings
 ) -> Solution:
-    low, high = clusters.low[rows], clusters.high[rows]
-    length = min(-(-int((high - low).max()) // 8) * 8, block.samples.shape[1])
-    windows, begin = cut_windows(
-        block.samples, noise.for_fits, noise.std, clusters.waveform[rows], low, high, length, settings.clip,
-        missing=block.missing,
-    )
+    windows, begin = cut_alike(block, noise, clusters, rows, settings._replace(noise_gain=0.0))
     member = clusters.first[rows][:, None] + np.arange(clusters.number[rows[0]])
     start = np.stack([candidates.amplitude[member], candidates.time[member], candidates.width[member]], axis=1)
     start[:, 1] -= begin[:, None]

@@ -2,34 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.free_skew import evaluate_skewed, render_skewed
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.stages.chain import Step
-from wavebatch.stages.decompose.models import reference_shape, skewed_shape
-from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.stages.decompose.models import POWERS, half_width_factor, reference_shape
+from wavebatch.stages.decompose.skew import skewed_shape
+from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
+
+
+def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
+    """Return the pulse that a residual loop fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    spacing : float
+        Time between two samples [ns].
+    model : {"gaussian", "skewed", "generalized", "learned"}
+        As for `decompose.residual_loop`.
+
+    Returns
+    -------
+    PulseShape
+        Pulse in samples; of the generalized model echoes carry their exponents.
+    """
+    if model == "learned":
+        return pulse_shape(system, spacing)
+    return skewed_shape(system, 0.0) if model == "skewed" else GAUSSIAN
+
 
 MODELS: dict[str, Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape] | None] = {
     "decompose.adaptive": lambda system, spacing, _: pulse_shape(system, spacing),
     "decompose.reference": lambda system, spacing, given: reference_shape(
         system, spacing, given["model"], given["pulse"]
     ),
-    "decompose.skewed": lambda system, _, given: skewed_shape(system, given["kappa"]),
+    "decompose.skewed": lambda system, _, given: (
+        GAUSSIAN if given["kappa"] == "free" else skewed_shape(system, given["kappa"])
+    ),
+    "decompose.residual_loop": lambda system, spacing, given: loop_shape(system, spacing, given["model"]),
     **dict.fromkeys(
-        [f"decompose.{name}" for name in ("asdf_only", "closed_form", "gauss_newton", "gaussian", "residual_loop")],
+        [
+            f"decompose.{name}"
+            for name in ("asdf_only", "closed_form", "gauss_newton", "gaussian", "generalized_gaussian", "log_normal")
+        ],
         lambda *_: GAUSSIAN,
     ),
-    "decompose.generalized_gaussian": None,
     "decompose.none": None,
 }
-"""The pulse that a decomposer fits, from system, spacing and parameters; None where nothing is fitted, or each cluster
-has an exponent of its own."""
+"""The pulse that a decomposer fits, from system, spacing and parameters; None where nothing is fitted. Echoes with a
+skew or an exponent of their own carry it as a column."""
 
 
 def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> PulseShape | None:
@@ -47,7 +77,7 @@ def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> Pulse
     Returns
     -------
     PulseShape or None
-        Pulse in samples; None where there is not one for all echoes, or a plugin does not say.
+        Pulse in samples; None where nothing is fitted, or a plugin does not say.
     """
     shape_of = MODELS.get(decomposer.stage.name)
     return None if shape_of is None else shape_of(system, spacing, decomposer.effective())
@@ -72,13 +102,96 @@ def rebuild_waveforms(
     Returns
     -------
     float32 array, shape (n, s), or None
-        Signal above the baseline [count]; None for decomposers without one pulse model.
+        Signal above the baseline [count]; None for decomposers without a pulse model.
     """
-    spacing = block.spacing
-    shape = fitted_pulse(decomposer, system, spacing)
-    if shape is None:
-        return None
-    described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
-    amplitude, time, width = model_parameters(shape, shape_limits(system, spacing), described.astype(np.float64)).T
+    shape = fitted_pulse(decomposer, system, block.spacing)
+    return None if shape is None else render_table(shape, block, system, echoes)
+
+
+def render_table(shape: PulseShape, block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Add up the pulses of the echoes of a block; echoes with a skew or an exponent of their own are drawn with it.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        The pulse that was fitted.
+    block : WaveformBlock
+        n waveforms of s samples.
+    system : SystemPulse
+        As the chain used it.
+    echoes : EchoTable
+        What a decomposer found in the block.
+
+    Returns
+    -------
+    float32 array, shape (n, s)
+        Signal above the baseline [count].
+    """
+    amplitude, time, width = _parameters(shape, system, block.spacing, echoes)
     n, s = block.samples.shape
-    return render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
+    if "skew" in echoes.attributes:
+        return render_skewed(n, s, echoes.waveform, time, amplitude, width, echoes.attributes["skew"])
+    if "power" not in echoes.attributes:
+        return render_echoes(shape, n, s, echoes.waveform, time, amplitude, width)
+    total = np.zeros((n, s), np.float32)
+    for power, rows in _by_power(echoes):
+        scaled = width[rows] / half_width_factor(power)
+        pulse = PulseShape(power=power)
+        total += render_echoes(pulse, n, s, echoes.waveform[rows], time[rows], amplitude[rows], scaled)
+    return total
+
+
+def echo_pulses(
+    shape: PulseShape, system: SystemPulse, spacing: float, echoes: EchoTable
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the fitted pulses of echoes as a function of time.
+
+    Parameters
+    ----------
+    shape : PulseShape
+        The pulse that was fitted.
+    system : SystemPulse
+        As the chain used it.
+    spacing : float
+        Time between two samples [ns].
+    echoes : EchoTable
+        k echoes.
+
+    Returns
+    -------
+    callable
+        From times [ns], shape (q,), to the pulse of each echo [count], float64 (k, q).
+    """
+    amplitude, time, width = (values[:, None] for values in _parameters(shape, system, spacing, echoes))
+
+    def evaluate(at: np.ndarray) -> np.ndarray:
+        if not len(echoes):
+            return np.zeros((0, len(at)))
+        x = np.tile(at / spacing, (len(echoes), 1))
+        if "skew" in echoes.attributes:
+            skew = echoes.attributes["skew"].astype(np.float64)[:, None]
+            return amplitude * evaluate_skewed(x, time, width, skew)[0]
+        if "power" not in echoes.attributes:
+            return amplitude * evaluate_pulse(shape, x, time, width)[0]
+        curves = np.zeros(x.shape)
+        for power, rows in _by_power(echoes):
+            scaled = width[rows] / half_width_factor(power)
+            curves[rows] = amplitude[rows] * evaluate_pulse(PulseShape(power=power), x[rows], time[rows], scaled)[0]
+        return curves
+
+    return evaluate
+
+
+def _parameters(shape: PulseShape, system: SystemPulse, spacing: float, echoes: EchoTable) -> np.ndarray:
+    """Amplitude, time and width of the fitted pulses in samples, float64 (3, k)."""
+    described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
+    limits = shape_limits(system, spacing, most=BROADEST)
+    return model_parameters(shape, limits, described.astype(np.float64)).T
+
+
+def _by_power(echoes: EchoTable) -> Iterator[tuple[float, np.ndarray]]:
+    """Exponents, and the echoes that have them."""
+    for power in np.unique(echoes.attributes["power"]):
+        # As it was tried: a column holds it in single precision.
+        exact = min(POWERS, key=lambda value, power=power: abs(value - power))
+        yield exact, np.flatnonzero(echoes.attributes["power"] == power)

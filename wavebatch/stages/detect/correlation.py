@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -145,7 +147,34 @@ def asdf(
         inside = (time >= 0) & (time <= len(signal) - 1) & (peaked | (rule == "paper"))
         return kept.waveform[inside], time[inside], amplitude[inside]
 
-    return candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))
+    table = candidate_table(block, system, *_in_parts(signal_above(block, noise), noise.std, detect))
+    if interpolation == "log":
+        return table
+    bias = block.spacing * parabola_bias(system.sigma_ref / block.spacing)
+    return replace(table, time_err=np.full(len(table), bias, np.float32))
+
+
+@lru_cache(maxsize=8)
+def parabola_bias(width: float) -> float:
+    """Find the error that a parabola through a Gaussian's square differences has without noise.
+
+    Parameters
+    ----------
+    width : float
+        Of the system pulse [samples].
+
+    Returns
+    -------
+    float
+        Root mean square over the phases of the samples [samples].
+
+    References
+    ----------
+    docs/algorithms.md 1.1, item 3.
+    """
+    phase = np.linspace(-0.5, 0.5, 41)
+    near = [-np.exp(-((lag - phase) ** 2) / (4 * width * width)) for lag in (-1, 0, 1)]
+    return float(np.sqrt(np.mean((parabola_shift(*near) - phase) ** 2)))
 
 
 def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -107,8 +107,12 @@ def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES
     echoes = echoes.take(rows)
     good = echoes.amplitude > LEAST_SNR * system.noise_std
     good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    rows = np.flatnonzero(keep_lone(good, echoes.amplitude, second))
-    return echoes.take(np.sort(rows[np.argsort(-echoes.amplitude[rows], kind="stable")[:most]]))
+    return take_strongest(echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second))), most)
+
+
+def take_strongest(echoes: EchoTable, most: int = MOST_ECHOES) -> EchoTable:
+    """Return at most `most` echoes, the strongest ones, in their order."""
+    return echoes.take(np.sort(np.argsort(-echoes.amplitude, kind="stable")[:most]))
 
 
 def fit_alone(block: WaveformBlock, system: SystemPulse, lone: EchoTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

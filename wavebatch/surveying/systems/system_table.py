@@ -36,6 +36,8 @@ QUANTITIES: dict[str, Quantity] = {
     "noise_std_dn": Quantity("noise_std", 1e-3, 1e10, "noise of one sample, for thresholds and errors"),
     "noise_gain": Quantity("noise_gain", 0.0, 1e6, "growth of the noise's variance per count of signal"),
     "kappa": Quantity("kappa", -0.9, 0.9, "skew of the pulse; 0 is a Gaussian"),
+    "skew": Quantity("skew", -0.9, 0.9, "of the best skewed pulse, whichever pulse was chosen", optional=True),
+    "skew_spread": Quantity("skew_spread", 0.0, 10.0, "of the skews of single echoes about it", optional=True),
     "slope_spread_dn_ns": Quantity("slope_spread", 0.0, 1e9, "of baselines within a waveform, taken off", True),
     "spikes": Quantity("spikes", 0.0, 1e6, "of one sample, per waveform, taken off", optional=True),
     "transient_ns": Quantity("transient", 0.0, 1e9, "at the start of waveforms, left out", optional=True),

@@ -57,6 +57,7 @@ def run(
     block_size: int | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    recursive: bool = False,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> BatchResult:
     """Write a point cloud and a report for every strip; what `wavebatch run` does.
@@ -121,6 +122,8 @@ def run(
         Replace existing outputs.
     resume : bool
         Keep outputs that are complete and up to date, make all others again.
+    recursive : bool
+        Take the strips in subfolders of folders too.
     on_event : callable, optional
         Called with a dictionary when a strip starts, advances, is written, skipped or fails.
 
@@ -139,7 +142,7 @@ def run(
         calibration=calibration, columns=columns, points=points, format=format, point_format=point_format,
         las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
-        memory=memory, block_size=block_size, overwrite=overwrite, resume=resume,
+        memory=memory, block_size=block_size, overwrite=overwrite, resume=resume, recursive=recursive,
     )  # fmt: skip
     return run_batch(*plan, on_event)
 
@@ -162,6 +165,7 @@ def plan_run(
     block_size: int | None = None,
     overwrite: bool = False,
     resume: bool = False,
+    recursive: bool = False,
     **output: Any,
 ) -> tuple[list[StripJob], BatchOptions]:
     """Check the options of `run` and turn them into jobs; nothing is started or written.
@@ -170,7 +174,7 @@ def plan_run(
     ----------
     strips, out, chain, tolerance, system, force, survey, sensor, calibration, columns, jobs, scheduler, memory
         As for `run`.
-    block_size, overwrite, resume
+    block_size, overwrite, resume, recursive
         As for `run`.
     **output
         The remaining ones: fields of RunOptions.
@@ -206,7 +210,7 @@ def plan_run(
         found = template.extend(found)
     _check_use(found, sensor, known)
     options = RunOptions(columns=choose_columns(found, columns), **output)
-    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips))
+    paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips), recursive=recursive)
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
     batch_options = BatchOptions(Path(out), processes, scheduler, block_size or block, overwrite, resume)
     plan = [replace(template, path=path, chain=found, options=options) for path in paths]

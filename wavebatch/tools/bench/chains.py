@@ -52,12 +52,16 @@ def find_twin(chosen: Sequence[Mapping[str, Chain]]) -> str | None:
     return None
 
 
+DETECTORS = {"decompose.asdf_only": "detect.asdf"}
+"""Detectors of decomposers that refuse `detect.maximum`."""
+
+
 def list_methods() -> dict[str, Chain]:
-    """A chain per detector, without a fit, and per decomposer, after `detect.maximum`; by the name of the stage."""
+    """A chain per detector, without a fit, and per decomposer, after a detector that serves it; by stage."""
     names = {kind: sorted(name for name in STAGES if STAGES[name].kind == kind) for kind in ("detect", "decompose")}
     chains = {name: _build_chain(name, name, "decompose.none") for name in names["detect"]}
     others = (name for name in names["decompose"] if name != "decompose.none")
-    return chains | {name: _build_chain(name, "detect.maximum", name) for name in others}
+    return chains | {name: _build_chain(name, DETECTORS.get(name, "detect.maximum"), name) for name in others}
 
 
 def _build_chain(name: str, detector: str, decomposer: str) -> Chain:

@@ -102,6 +102,9 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         elif np.nanmin(found.values) >= 0:
             axes.set_xlim(left=0)
         axes.set_ylim(found.edges[0], found.edges[-1])
+        if not log:
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+            axes.xaxis.get_major_locator().set_params(nbins=6)
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlabel(fit_text(figure, plain_text(f"{found.label} of {found.edges[1] - found.edges[0]:.4g} "
                                                     f"{found.unit}", 300), 5.0, size=9.5))  # fmt: skip

@@ -6,7 +6,7 @@ run`; only the curves of the fitted pulses are computed again here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +16,9 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.stages.decompose.rebuild import fitted_pulse
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, shape_limits
+from wavebatch.stages.decompose.rebuild import echo_pulses, fitted_pulse
+from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.sensor import SensorRequest, find_sensor
 from wavebatch.tools.plots.detector_signals import DetectorSignal, choose_step, describe_step, see_block
 from wavebatch.tools.plots.packets import Place
@@ -181,7 +180,7 @@ def build_views(
         fine = np.linspace(0.0, time[-1], max(len(time), min(FINE * (len(time) - 1) + 1, MOST_POINTS)))
         curves, residual = np.zeros((0, len(fine))), None
         if shape is not None:
-            pulses = _place_pulses(shape, table, system, block.spacing)
+            pulses = echo_pulses(shape, system, block.spacing, table)
             curves = pulses(fine)
             residual = _residual(samples - noise.level[row], pulses(time).sum(axis=0), clipped, std, system.noise_gain)
         returns = np.empty(0) if block.returns is None else block.returns.time[block.returns.waveform == row]
@@ -193,22 +192,6 @@ def build_views(
             )  # fmt: skip
         )
     return views
-
-
-def _place_pulses(
-    shape: PulseShape, echoes: EchoTable, system: SystemPulse, spacing: float
-) -> Callable[[np.ndarray], np.ndarray]:
-    """A function of times [ns] (q,) that gives the pulse of each echo [DN], f8 (k, q)."""
-    described = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1)
-    amplitude, time, width = model_parameters(shape, shape_limits(system, spacing), described.astype(np.float64)).T
-
-    def evaluate(at: np.ndarray) -> np.ndarray:
-        if not len(echoes):
-            return np.zeros((0, len(at)))
-        x = np.tile(at / spacing, (len(echoes), 1))
-        return amplitude[:, None] * evaluate_pulse(shape, x, time[:, None], width[:, None])[0]
-
-    return evaluate
 
 
 def _residual(signal: np.ndarray, fit: np.ndarray, clipped: np.ndarray, std: float, noise_gain: float) -> np.ndarray:

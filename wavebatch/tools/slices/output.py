@@ -113,7 +113,7 @@ def draw_slice(
         axes.set_xlim(extent[:2])
         axes.set_ylim(extent[2:])
         axes.yaxis.get_major_locator().set_params(nbins=int(np.clip(width * tall / 0.3, 1, 8)))
-        axes.set_xlabel("along the slice [m]" if plane else "time after the first sample [ns]")
+        axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")
         parts = [plain_text(strip), f"scan line {piece.line.number}", f"{len(piece.line)} pulses"]
         parts.append(f"{len(segments)} segment" + "s" * (len(segments) != 1))

@@ -25,7 +25,7 @@ class SliceOptions:
     """How slices are cut and searched."""
 
     geometry: str = "plane"
-    """`plane`: vertical plane, in metres; `time`: rows are pulses, columns are samples; flat surfaces then bend."""
+    """`plane`: vertical plane, in metres; `time`: rows are pulses, columns are times on one axis for all pulses."""
     std: float = 2.0
     """Samples above this many standard deviations of their slice are searched."""
     sigma: float = 2.0
@@ -60,6 +60,8 @@ class Slice:
     """Plane: its horizontal direction (3,), of length 1."""
     roi: np.ndarray
     """Samples that are searched, bool (m,)."""
+    start: np.ndarray
+    """Time: where the first sample of each pulse lies on the common axis, f8 (n,) [ns]."""
 
     def locate(self, end: tuple[float, float]) -> tuple[float, float, float]:
         """Position in space of a point of the slice [m]."""
@@ -67,7 +69,8 @@ class Slice:
             place = self.base + self.pixel * (end[0] * self.axis + np.array([0.0, 0.0, end[1]]))
         else:
             rows = np.arange(len(self.line))
-            lines = self.line.origin + end[0] * self.pixel * self.line.direction
+            after = end[0] * self.pixel - self.start
+            lines = self.line.origin + after[:, None] * self.line.direction
             place = np.array([np.interp(end[1], rows, lines[:, axis]) for axis in range(3)])
         return tuple(float(value) for value in place)
 
@@ -114,15 +117,53 @@ def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
     """The slice of a scan line."""
     limit = options.std * float(line.value.std(dtype=np.float64))
     roi = line.value > limit
-    zero = np.zeros(3)
+    zero, start = np.zeros(3), np.zeros(len(line))
     if options.geometry == "time":
-        x, y, pixel, base, axis = line.time / line.spacing, line.row.astype(np.float64), line.spacing, zero, zero
+        start = align_times(line)
+        x, y = (line.time + start[line.row]) / line.spacing, line.row.astype(np.float64)
+        pixel, base, axis = line.spacing, zero, zero
     else:
         pixel = line.spacing * HALF_C
         base, axis = _find_plane(line, roi)
         place = line.origin[line.row] - base + line.time[:, None] * line.direction[line.row]
         x, y = place @ axis / pixel, place[:, 2] / pixel
-    return Slice(line, options.geometry, x, y, pixel, base, axis, roi)
+    return Slice(line, options.geometry, x, y, pixel, base, axis, roi, start)
+
+
+def align_times(line: ScanLine) -> np.ndarray:
+    """Find where the windows of pulses begin on one axis of time.
+
+    Windows open when the receiver sees an echo, at another height for every pulse: counted from their own first
+    samples, the relief is lost. The axis begins at the plane across the mean ray of the line through the sample that is
+    nearest to the sensor; every pulse passes it, wherever its window is.
+
+    Parameters
+    ----------
+    line : ScanLine
+        n pulses.
+
+    Returns
+    -------
+    float64 array, shape (n,)
+        Two-way time from that plane to the first sample of each pulse [ns], 0 and above.
+
+    References
+    ----------
+    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
+    """
+    along = np.linalg.norm(line.direction, axis=1)
+    unit = line.direction / along[:, None]
+    mean = unit.mean(axis=0)
+    length = np.linalg.norm(mean)
+    if not length > 0:
+        return np.zeros(len(line))
+    mean /= length
+    speed = line.direction @ mean
+    depth = (line.origin - line.origin.mean(axis=0)) @ mean
+    # Rays across the mean one never pass the plane; none of a scan line is.
+    known = speed > 1e-3 * along
+    depth -= depth[known].min(initial=np.inf) if known.any() else 0.0
+    return np.where(known, depth / np.where(known, speed, 1.0), 0.0)
 
 
 def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:

@@ -32,6 +32,7 @@ from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
+from wavebatch.tools.voxels.profile_file import ProfileWriter, open_profiles
 from wavebatch.tools.voxels.rays import trace_profiles
 
 BLOCK_SAMPLES = 1 << 20
@@ -95,6 +96,10 @@ class VoxelSummary:
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
     """Waveforms with signal of unknown cross section."""
+    profiles: str | None = None
+    """File with the profiles of single pulses."""
+    profile_samples: int = 0
+    """Samples with signal in that file."""
 
 
 def voxelize_strip(
@@ -109,6 +114,7 @@ def voxelize_strip(
     direction: str = "auto",
     headerless: bool = False,
     overwrite: bool = False,
+    profiles: Path | None = None,
     progress: Callable[[int, int], object] | None = None,
     block_size: int | None = None,
     held: int = HELD,
@@ -116,33 +122,41 @@ def voxelize_strip(
     """Deconvolves the waveforms of a strip and writes the sums of every voxel, in the format of the target's suffix.
 
     system: a saved survey, instead of a survey of this strip. force: also where the strip contradicts it. calibration:
-    for cross sections; it or the survey must have the divergence of the beam. progress: called with the number of
-    waveforms done since the last call, and the total. block_size, held: waveforms at a time, and sums in memory; the
-    output does not depend on them.
+    for cross sections; it or the survey must have the divergence of the beam. profiles: an .npz for those of single
+    pulses. progress: called with the number of waveforms done since the last call, and the total. block_size, held:
+    waveforms at a time, and sums in memory; the output does not depend on them.
     Raises ConfigError for wrong options, InputError where the strip cannot be read or the output not be written.
     """
     strip, target = Path(strip), Path(target)
     check_target(target, strip)
     refuse_existing(target, overwrite)
+    if profiles is not None and Path(profiles).absolute() == target.absolute():
+        raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         check_saved(reader, scan, system and system.survey, force=force)
         pulse = _find_pulse(reader, scan, system, calibration)
         source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
         middle = _find_middle(reader, scan, options)
         ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
-        with _open_grid(reader, middle, options, calibration is not None, held) as grid:
+        with (
+            _open_grid(reader, middle, options, calibration is not None, held) as grid,
+            open_profiles(profiles, strip, calibration is not None, overwrite) as writer,
+        ):
             counts: Counter[str] = Counter()
             for block in _read_blocks(reader, scan, block_size):
-                _add_block(grid, counts, source.fill(block), pulse, options, ceiling)
+                _add_block(grid, counts, source.fill(block), pulse, options, ceiling, writer)
                 if progress is not None:
                     progress(len(block), scan.packets)
             meta = _describe(strip, options, pulse, calibration)
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
+            voxels = _write_both(target, space, grid, writer, overwrite)
             return VoxelSummary(
                 **counts,
                 strip=str(strip),
                 output=str(target),
-                voxels=write_voxels(target, space, grid.pieces(), overwrite=overwrite),
+                voxels=voxels,
+                profiles=None if profiles is None else str(profiles),
+                profile_samples=0 if writer is None else writer.samples,
                 size=grid.size,
                 shape=tuple(grid.shape.tolist()),
                 origin=tuple((grid.low * grid.size).tolist()),
@@ -154,6 +168,21 @@ def voxelize_strip(
                 noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
             )
+
+
+def _write_both(
+    target: Path, space: VoxelSpace, grid: VoxelGrid, writer: ProfileWriter | None, overwrite: bool
+) -> int:
+    """Writes profiles and voxels, or neither; the number of voxels."""
+    if writer is None:
+        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
+    meta = {name: value for name, value in space.meta.items() if name not in ("columns", "size_m", "headroom_m")}
+    writer.publish(meta, space.facts.crs or "")
+    try:
+        return write_voxels(target, space, grid.pieces(), overwrite=overwrite)
+    except BaseException:
+        writer.withdraw()
+        raise
 
 
 def _find_pulse(
@@ -236,6 +265,7 @@ def _add_block(
     pulse: SystemPulse,
     options: VoxelOptions,
     ceiling: Ceiling | None,
+    writer: ProfileWriter | None,
 ) -> None:
     profiles = deconvolve_block(block, pulse, options.deconvolution)
     rays = trace_profiles(
@@ -245,6 +275,8 @@ def _add_block(
         system=pulse if pulse.calibration is not None else None,
     )
     grid.add(rays, block.spacing)
+    if writer is not None:
+        writer.add(block, profiles, rays)
     anchored = int((profiles.seen & profiles.anchored).sum())
     counts.update(with_signal=int(profiles.seen.sum()), anchored=anchored, clipped=int(profiles.clipped.sum()))
     counts["waveforms"] += len(block)

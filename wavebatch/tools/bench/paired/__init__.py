@@ -1,0 +1,1 @@
+"""`wavebatch bench --against`: this wavebatch and another one take turns on the same strips."""

@@ -1,0 +1,1 @@
+"""What any LAS or LAZ file holds, for `wavebatch info`."""

@@ -1,0 +1,237 @@
+"""Header, records and points of any LAS or LAZ file, and how wavebatch made it.
+
+`wavebatch info` prints it; strips with waveforms add what `surveying.inspect_strip` finds of their packets. All points
+are read once, in bounded memory, because headers are often wrong.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import fields
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.batch.unit import RunOptions
+from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
+from wavebatch.core.errors import InputError
+from wavebatch.core.no_data import without_nan
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.files.cloud.provenance import read_accounts
+from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.crs import read_crs
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
+from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, split_numbers
+from wavebatch.surveying.inspect_strip import describe_strip
+
+_GPS_EPOCH = datetime(1980, 1, 6)
+_ADJUSTED = 1e9
+"""Seconds that adjusted standard GPS time leaves out."""
+_STANDARD_TIME = 0b1
+"""Bit of the global encoding: times are adjusted standard GPS time, not seconds of the week."""
+_MOST_SOURCES = 20
+
+
+def describe_file(path: Path, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
+    """Return everything that `wavebatch info` shows of a file, as plain values.
+
+    direction, headerless: as for `describe_strip`, for files with waveforms. Raises InputError where the file cannot be
+    read.
+    """
+    checked = read_checked_header(path, waveforms=False)
+    header = checked.header
+    if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
+        facts = describe_strip(path, direction=direction, headerless=headerless)
+    else:
+        facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
+    facts |= _describe_header(path, checked)
+    accounts = read_accounts(header)
+    facts["provenance"] = [_describe_account(account) for account in accounts]
+    try:
+        facts |= _describe_points(path, header, bool(accounts))
+    except InputError as error:
+        facts["problems"] = [*facts["problems"], " ".join(str(error).split()).removeprefix(f"{path}: ")]
+    return without_nan(facts)
+
+
+def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
+    header = checked.header
+    evlrs, _ = find_evlrs(path, header, 1000)
+    day, year = header.creation
+    return {
+        "las_version": "{}.{}".format(*header.version),
+        "point_format": header.point_format,
+        "compressed": header.compressed,
+        "crs": read_crs(path, header)[0],
+        "scales": list(header.scales),
+        "offsets": list(header.offsets),
+        "system_identifier": decode_text(header.system_identifier),
+        "generating_software": decode_text(header.generating_software),
+        "created": f"day {day} of {year}" if day or year else None,
+        "file_source_id": header.file_source_id,
+        "points": header.point_count,
+        "header_bounds": {"least": list(header.mins), "largest": list(header.maxs)},
+        "records": [
+            *({"user": one.user, "id": one.record_id, "bytes": len(one.payload), "extended": False,
+               "description": decode_text(one.description)} for one in header.vlrs),
+            *({"user": one.user, "id": one.record_id, "bytes": one.length, "extended": True, "description": ""}
+              for one in evlrs),
+        ],
+        "extra_dimensions": [record.name for record in checked.records],
+        "extra_bytes": [_describe_extra(record) for record in checked.records],
+    }  # fmt: skip
+
+
+def _describe_extra(record: ExtraRecord) -> dict[str, Any]:
+    dtype, no_data = record.dtype, record.no_data
+    return {
+        "name": record.name,
+        "type": dtype.base.name + (f"[{dtype.shape[0]}]" if dtype.shape else ""),
+        "description": record.description,
+        "scale": None if record.scaling is None else record.scaling[0],
+        "no_data": None if no_data is None else [str(value) for value in no_data.tolist()],
+    }
+
+
+def _describe_account(account: Mapping[str, Any]) -> dict[str, Any]:
+    """What made a cloud: version, command, chain, input; what the account does not hold is None."""
+    options, request, source = (_table(account.get(name)) for name in ("options", "request", "input"))
+    return {
+        "version": account.get("wavebatch"),
+        "command": _name_command(options, request, source),
+        "input": source.get("file"),
+        "chain": account.get("chain"),
+        "chosen_by": _table(account.get("choice")).get("by"),
+        "columns": _table(account.get("columns")),
+    }
+
+
+def _table(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _name_command(options: Mapping[str, Any], request: Mapping[str, Any], source: Mapping[str, Any]) -> str:
+    """A command that makes this cloud, where the files that it names are at hand."""
+    parts = ["wavebatch run", str(source.get("file", "STRIP")), "-o DIR"]
+    by = str(request.get("chain", ""))
+    if by.startswith("tolerance"):
+        parts.append(f"--tolerance {by.removeprefix('tolerance ').replace(' ', '')}")
+    elif by != "auto":
+        parts.append("--chain CHAIN.toml")
+    sensor = _table(request.get("sensor"))
+    trajectory = _table(sensor.get("trajectory"))
+    parts += [f"--trajectory {trajectory.get('file', 'FILE')}"] if trajectory else []
+    parts += [f"--flight-height {sensor['height']}"] if sensor.get("height") else []
+    parts += ["--survey flight"] if request.get("survey") == "flight" else []
+    parts += ["--system SYSTEM.toml"] if request.get("system") and request.get("survey") != "flight" else []
+    parts += ["--calibration CAL.toml"] if request.get("calibration") else []
+    for field in fields(RunOptions):
+        value = options.get(field.name, field.default)
+        if field.name == "columns":
+            continue  # the columns that were written are listed by themselves
+        if value != field.default:
+            name = f"--{field.name.replace('_', '-')}"
+            parts.append(name if value is True else f"{name} {value}")
+    return " ".join(parts)
+
+
+class _Totals:
+    """Sums over the points of a file."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.extremes: dict[str, tuple[float, float]] = {}
+        self.returns, self.totals = np.zeros(16, np.int64), np.zeros(16, np.int64)
+        self.classes: Counter[int] = Counter()
+        self.sources: Counter[int] = Counter()
+        self.flags: Counter[str] = Counter()
+        self.passed = 0
+
+    def widen(self, name: str, values: np.ndarray) -> None:
+        values = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+        if len(values):
+            least, largest = self.extremes.get(name, (np.inf, -np.inf))
+            self.extremes[name] = min(least, float(values.min())), max(largest, float(values.max()))
+
+    def add(self, raw: np.ndarray, header: LasHeader, flags: np.ndarray | None) -> None:
+        self.count += len(raw)
+        for name, values in zip("xyz", locate(raw, header).T, strict=True):
+            self.widen(name, values)
+        modern = "classification_flags" in raw.dtype.names
+        angle = raw["scan_angle"] * ANGLE_UNIT if modern else raw["scan_angle_rank"]
+        self.widen("scan_angle_deg", angle)
+        self.widen("intensity", raw["intensity"])
+        if "gps_time" in raw.dtype.names:
+            self.widen("gps_time", raw["gps_time"])
+        number, total = split_numbers(raw)
+        self.returns += np.bincount(number, minlength=16)
+        self.totals += np.bincount(total, minlength=16)
+        kinds = raw["classification"] if modern else raw["raw_classification"] & 31
+        _count(self.classes, kinds)
+        _count(self.sources, raw["point_source_id"])
+        if flags is not None:
+            self.flags.update({one.name: int(np.count_nonzero(flags & np.uint16(one))) for one in EchoFlag})
+            self.passed += int(np.count_nonzero(flags & np.uint16(PASSED_THROUGH)))
+
+
+def _count(counter: Counter[int], values: np.ndarray) -> None:
+    found, numbers = np.unique(values, return_counts=True)
+    counter.update(dict(zip(found.tolist(), numbers.tolist(), strict=True)))
+
+
+class _RawReader(ColumnReader):
+    """A ColumnReader whose pieces are the raw records."""
+
+    def flags_of(self, raw: np.ndarray) -> np.ndarray | None:
+        """EchoFlag bits; None without such a column."""
+        return raw[self._sources["echo_flags"].name].astype(np.uint16) if self.has_flags else None
+
+    def _convert(self, raw: np.ndarray) -> np.ndarray:
+        return raw
+
+
+def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, Any]:
+    """Sums over all points; counts of echoes only of a cloud with an account, whose flags are known to be ours."""
+    totals = _Totals()
+    with _RawReader(path, None) as reader:
+        has_flags = reader.has_flags and is_ours
+        for raw in reader.read_pieces():
+            totals.add(raw, header, reader.flags_of(raw) if has_flags else None)
+    found = totals.extremes
+    bounds = {}
+    if found:
+        bounds = {name: [found[axis][end] for axis in "xyz"] for end, name in enumerate(("least", "largest"))}
+    echoes = {}
+    if has_flags:
+        flags = {name: number for name, number in totals.flags.items() if number}
+        number = totals.count - totals.passed
+        added = totals.flags[EchoFlag.ADDED.name]
+        echoes = {"counts": {"echoes": number, "added": added, "passed_through": totals.passed, "flags": flags}}
+    sources = totals.sources.most_common(_MOST_SOURCES)
+    return {
+        "bounds": bounds or None,
+        "gps_time": _describe_time(header, found.get("gps_time")),
+        "scan_angle_deg": list(found["scan_angle_deg"]) if found else None,
+        "intensity": list(found["intensity"]) if found else None,
+        "returns": {str(k): int(n) for k, n in enumerate(totals.returns) if n},
+        "numbers_of_returns": {str(k): int(n) for k, n in enumerate(totals.totals) if n},
+        "classes": {str(k): n for k, n in sorted(totals.classes.items())},
+        "point_sources": {str(k): n for k, n in sorted(sources)},
+        **echoes,
+    }
+
+
+def _describe_time(header: LasHeader, found: tuple[float, float] | None) -> dict[str, Any] | None:
+    """First and last GPS time, its kind, and the dates; None for a point format without times."""
+    if found is None:
+        return None
+    standard = bool(header.global_encoding & _STANDARD_TIME)
+    times = {"least": found[0], "largest": found[1], "kind": "adjusted standard" if standard else "seconds of the week"}
+    if standard and -_ADJUSTED < found[0] <= found[1] < 4 * _ADJUSTED:
+        dates = [_GPS_EPOCH + timedelta(seconds=value + _ADJUSTED) for value in found]
+        times["dates_gps"] = [date.isoformat(sep=" ", timespec="seconds") for date in dates]
+    return times
