@@ -72,7 +72,7 @@ def plot() -> None:
 @click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
               "threshold; detector: that of the chain's own detector.")
 @click.option("--echoes", "table", is_flag=True,
-              help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes them instead.")
+              help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes only them.")
 @shared.chain_options
 @shared.system_option
 @shared.strip_options

@@ -159,9 +159,9 @@ def _see_correlation(
     energy = float(np.sum(given.taps**2))
     values = slide_taps(pad_samples(signal_above(block, noise), given.middle), given.taps) / np.float32(energy)
     rule = f"maxima above {threshold:g} std, coefficient at least {similarity:g}"
-    found = DetectorSignal("correlation [DN]", rule, _times(block, values, given.peak - given.middle), values.T,
-                           threshold * noise.std.astype(np.float64) / np.sqrt(energy))  # fmt: skip
-    return found
+    least = threshold * noise.std.astype(np.float64) / np.sqrt(energy)
+    time = _times(block, values, given.peak - given.middle)
+    return DetectorSignal("correlation [DN]", rule, time, values.T, least)
 
 
 def _see_asdf(

@@ -38,9 +38,8 @@ def draw_histograms(
 ) -> None:
     """Writes a picture of histograms, one below the other, each with an axis of its own unit.
 
-    Several series in one histogram are drawn as shares of their values, so that a small one can be compared with a large
-    one. counts: as numbers of values all the same. log: logarithmic axis of counts. Raises as
-    figure_file.open_picture does.
+    Several series in one histogram are drawn as shares of their values, so that small and large ones can be compared.
+    counts: as numbers of values all the same. log: logarithmic axis of counts. Raises as figure_file.open_picture does.
     """
     lines = sum(len(found.names) + (len(found.names) == 1) for found in every)
     with open_picture(target, (8.0, 3.9 * len(every) + 0.3 + 0.2 * lines), overwrite=overwrite) as figure:
@@ -128,7 +127,8 @@ def draw_flags(
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
         name = name_clouds(names)
-        title = f"{name}   {plain_text(found.facts.name, 40)}\n{found.total.values:,} points; a point may have several flags"
+        title = f"{name}   {plain_text(found.facts.name, 40)}\n"
+        title += f"{found.total.values:,} points; a point may have several flags"
         axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
 
@@ -171,7 +171,7 @@ def add_colorbar(
     axes: Axes, shown: Any, values: np.ndarray, limits: tuple[float, float], label: str, *, length: float, flat: bool,
     place: Axes | None = None,
 ) -> None:  # fmt: skip
-    """Scales the colours to the limits and adds their scale; length: of it [inches]; flat: below the axes; place: axes for it.
+    """Scales the colours to the limits and adds their scale, of a length [inches], below the axes if flat, or in place.
 
     Arrows at its ends show that some values lie beyond.
     """
@@ -179,9 +179,10 @@ def add_colorbar(
     shown.set_clim(low, high)
     known = values[np.isfinite(values)]
     ends = (known.min(initial=low) < low) + 2 * (known.max(initial=high) > high)
+    shape = {"aspect": 40} if flat else {} if place else {"pad": 0.02}
     bar = axes.figure.colorbar(
         shown, ax=None if place else axes, cax=place, extend=("neither", "min", "max", "both")[ends], extendfrac=0.03,
-        orientation="horizontal" if flat else "vertical", **({"aspect": 40} if flat else {} if place else {"pad": 0.02}),
+        orientation="horizontal" if flat else "vertical", **shape,
     )  # fmt: skip
     bar.set_label(fit_text(axes.figure, plain_text(label, 300), max(length, 2.0), size=9.5))
     bar.outline.set_visible(False)

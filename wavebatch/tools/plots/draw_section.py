@@ -12,8 +12,11 @@ import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.draw_cloud import SERIES, add_colorbar, name_clouds
-from wavebatch.tools.plots.labels import fit_parts, fit_text
+from wavebatch.tools.plots.labels import fit_parts, fit_text, space_ticks
 from wavebatch.tools.plots.section_data import Profile, Section
+
+_NARROW = 3.0
+"""Sections less wide have the scale of colours beside them [inches]: below, its numbers would not fit."""
 
 _LONG, _LEAST, _MOST = 10.0, 0.6, 8.0
 """Longer side, least and largest height of the axes of a section [inches]."""
@@ -28,19 +31,25 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
     tall = aspect * (high - low) / length
     width = min(_LONG, _MOST / tall)
     with open_picture(target, (max(width + 1.0, 6.0), max(width * tall, _LEAST) + 2.3), overwrite=overwrite) as figure:
-        # As tall as the axes with equal scales are: constrained layout would leave them alone in the middle.
-        figure.set_layout_engine("compressed")
-        axes = figure.subplots()
+        flat = width > _NARROW
+        if flat:
+            # As tall as the axes with equal scales are: constrained layout would leave them alone in the middle.
+            figure.set_layout_engine("compressed")
+        axes, place = (figure.subplots(), None) if flat else figure.subplots(1, 2, width_ratios=(1, 0.05))
+        axes.set_anchor("C" if flat else "E")
         shown, values = _draw_voxels(axes, found) if found.voxel else _draw_points(axes, found)
         axes.set_xlim(0.0, length)
         axes.set_ylim(low, high)
         axes.set_aspect(aspect)
         axes.set_xlabel(f"along the line [{found.unit}]")
         axes.set_ylabel(f"height [{found.unit}]")
-        axes.yaxis.get_major_locator().set_params(nbins=int(np.clip(width * tall / 0.3, 1, 8)))
         axes.ticklabel_format(useOffset=False)
+        space_ticks(axes.yaxis, width * tall, 0.3)
         label = ("mean of " if found.voxel else "") + found.facts.label
-        add_colorbar(axes, shown, values, found.shown, label, length=max(width, 3.0), flat=True)
+        length = width if flat else width * tall
+        add_colorbar(axes, shown, values, found.shown, label, length=length, flat=flat, place=place)
+        if not flat:
+            space_ticks(axes.xaxis, width, 0.4)
         title = fit_parts(figure, _parts(found, aspect), figure.get_figwidth() - 0.2, size=10.0)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10.0)
 

@@ -51,8 +51,8 @@ def draw_waveforms(
 ) -> None:
     """Writes a picture of one waveform, or of several as small multiples.
 
-    strip, chain: for the title. times: part to show [ns]; None: each waveform's part with signal. table: list the echoes
-    below; those of a single waveform always are. Raises as figure_file.open_picture does.
+    strip, chain: for the title. times: part to show [ns]; None: each waveform's part with signal. table: list the
+    echoes below; those of a single waveform always are. Raises as figure_file.open_picture does.
     """
     columns = len(views) if len(views) <= 3 else math.ceil(math.sqrt(len(views)))
     rows = -(-len(views) // columns)

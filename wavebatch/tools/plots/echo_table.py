@@ -33,7 +33,8 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
     """A table of the echoes, for a monospaced font: time, amplitude, width, range if it is known, and flags."""
     ranged = any(np.isfinite(_column(view, "range")).any() for view in views)
     several = len(views) > 1
-    head = f"{'packet':>8}  " * several + f"{'echo':>4}  {'time [ns]':>15}  {'amplitude [DN]':>15}  {'width [ns]':>15}  "
+    head = f"{'packet':>8}  " * several + f"{'echo':>4}  "
+    head += "".join(f"{name:>15}  " for name in ("time [ns]", "amplitude [DN]", "width [ns]"))
     lines = [head + f"{'range [m]':>20}  " * ranged + "flags"]
     every = [(view, row) for view in views for row in range(len(view.echoes))]
     for view, row in every[:most]:

@@ -20,6 +20,9 @@ PLACES = (
 )  # fmt: skip
 """Offsets of labels from their points [typographic points], the best first."""
 
+_LEAST_LETTERS = 8
+"""Texts are not shortened below this."""
+
 _TOUCHING = 1e-6
 """Area that rounding leaves [pixels]."""
 
@@ -36,10 +39,15 @@ def fit_text(figure: Figure, text: str, inches: float, *, size: float, weight: s
     """The text, with lines that are too long for the room shortened in the middle."""
     lines = []
     for line in text.split("\n"):
-        most = len(line)
-        while most > 8 and text_width(figure, plain_text(line, most), size, weight) > inches:
-            most -= 1
-        lines.append(line if most == len(line) else plain_text(line, most))
+        if text_width(figure, line, size, weight) <= inches:
+            lines.append(line)
+            continue
+        low, high = _LEAST_LETTERS, max(len(line), _LEAST_LETTERS + 1)
+        while high - low > 1:
+            most = (low + high) // 2
+            fits = text_width(figure, plain_text(line, most), size, weight) <= inches
+            low, high = (most, high) if fits else (low, most)
+        lines.append(plain_text(line, low))
     return "\n".join(lines)
 
 
@@ -76,21 +84,35 @@ def place_labels(
     for text, x, y in labels:
         note = axes.annotate(text, (x, y), textcoords="offset points", xytext=(6, 5), annotation_clip=False, **look)
         note.set_in_layout(False)
-        covered = [_cover(note, place, taken, frame) for place in PLACES]
+        first = note.get_window_extent()
+        places = [_box_at(first.width, first.height, axes, (x, y), place) for place in PLACES]
+        covered = [_cover(box, taken, frame) for box in places]
         best = covered.index(min(covered))
         if covered[best] > _TOUCHING and not keep:
             note.remove()
             continue
         _move(note, PLACES[best])
-        taken.append(note.get_window_extent())
+        taken.append(places[best])
         written.append(note)
     return written
 
 
-def _cover(note: Any, place: tuple[float, float], taken: Sequence[Any], frame: Any) -> float:
-    """Area of a label at this place that covers other things or lies outside of the axes [pixels]."""
-    _move(note, place)
-    box = note.get_window_extent()
+def _box_at(
+    width: float, height: float, axes: Axes, point: tuple[float, float], place: tuple[float, float]
+) -> Any:
+    """The box of a label of this size [pixels] at an offset [points] from its point, as `_move` puts it."""
+    from matplotlib.transforms import Bbox
+
+    x, y = axes.transData.transform(point)
+    scale = axes.figure.dpi / 72
+    sides = [(offset > 0) - (offset < 0) for offset in place]
+    left = x + place[0] * scale - 0.5 * width * (1 - sides[0])
+    low = y + place[1] * scale - 0.5 * height * (1 - sides[1])
+    return Bbox.from_bounds(left, low, width, height)
+
+
+def _cover(box: Any, taken: Sequence[Any], frame: Any) -> float:
+    """Area of a label that covers other things or lies outside of the axes [pixels]."""
     return sum(_overlap(box, other) for other in taken) + box.width * box.height - _overlap(box, frame)
 
 
@@ -105,3 +127,12 @@ def _overlap(a: Any, b: Any) -> float:
     """Area that two boxes share [pixels]."""
     both = a.intersection(a, b)
     return both.width * both.height if both else 0.0
+
+
+def space_ticks(axis: Any, length: float, each: float) -> None:
+    """Places as many ticks as fit, or one at the beginning; length: of the axis, each: room of a tick [inches]."""
+    if length < 2 * each:
+        axis.set_ticks([axis.get_view_interval()[0]])
+    else:
+        axis.get_major_locator().set_params(nbins=int(min(length / each, 8)))
+    axis.set_major_formatter(lambda value, _: f"{value:.10g}")

@@ -115,8 +115,8 @@ def grid_values(
 
     size: side of a cell [m], by default for about POINTS_PER_CELL points per cell. bounds: west, south, east, north
     [m], by default all points but far outliers.
-    Raises InputError if there is nothing to draw, ConfigError for wrong options, for more than MOST_CELLS cells, and for
-    clouds that are far apart or differ in their CRS.
+    Raises InputError if there is nothing to draw, ConfigError for wrong options, more than MOST_CELLS cells, and clouds
+    that are far apart or differ in their CRS.
     """
     _check(statistic, size, bounds)
     clouds = Clouds(paths, selection)

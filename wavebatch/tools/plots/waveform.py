@@ -6,7 +6,7 @@ run`; only the curves of the fitted pulses are computed again here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,7 +90,7 @@ class WaveformView:
 
     @property
     def span(self) -> tuple[float, float]:
-        """The part that holds all that is to be seen [ns]: echoes, returns, and samples or residuals above the noise."""
+        """The part that holds all that can be seen [ns]: echoes, returns, and samples or residuals above the noise."""
         seen = (self.samples > self.level + VISIBLE * self.std) | self.clipped
         if self.residual is not None:
             seen |= np.abs(np.nan_to_num(self.residual)) > VISIBLE

@@ -72,7 +72,7 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
     times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
     if len(lines) * pulses * times > MOST_VALUES:
         raise ConfigError(
-            f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many; choose fewer --lines"
+            f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
         )
     shape = (len(lines), pulses)
     values = np.full((*shape, times), np.nan, np.float32)
@@ -149,8 +149,10 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
         title = f"y = {int(wanted['y'])} (scan line)"
         found.append(CubeSlice(values[row[0]].T, (*x_edges, *t_edges), x_label, t_label, title, True))
     if wanted["t"] is not None:
-        place = _check("--t", round((wanted["t"] - float(time[0])) / spacing), len(time), f"{time[0]:g} to {time[-1]:g} ns")
-        found.append(CubeSlice(values[:, :, place], (*x_edges, *y_edges), x_label, y_label, f"t = {time[place]:.4g} ns"))
+        sample = round((wanted["t"] - float(time[0])) / spacing)
+        place = _check("--t", sample, len(time), f"{time[0]:g} to {time[-1]:g} ns")
+        title = f"t = {time[place]:.4g} ns"
+        found.append(CubeSlice(values[:, :, place], (*x_edges, *y_edges), x_label, y_label, title))
     return found
 
 

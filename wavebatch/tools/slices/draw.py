@@ -50,15 +50,29 @@ def draw_segments(
         space = figure.add_subplot(1, 2, 2, projection="3d")
         tubes = space.add_collection3d(Line3DCollection(ends - base, cmap="viridis", linewidths=0.9))
         tubes.set_array(height)
-        for axis, name, first, last in zip("xyz", names, low - base, high - base, strict=True):
+        for axis, first, last in zip("xyz", low - base, high - base, strict=True):
             getattr(space, f"set_{axis}lim")(first, max(last, first + 1e-3))
-            getattr(space, f"set_{axis}label")(name, fontsize=8)
+            getattr(space, f"set_{axis}label")(axis, fontsize=8, labelpad=8)
             space.tick_params(axis=axis, labelsize=7)
-            getattr(space, f"{axis}axis").get_major_locator().set_params(nbins=5)
         tall = max(extent[2], _LEAST_HEIGHT * extent.max())
-        space.set_box_aspect((max(extent[0], 0.05 * extent.max()), max(extent[1], 0.05 * extent.max()), tall), zoom=0.85)
+        sides = np.append(np.maximum(extent[:2], 0.05 * extent.max()), tall)
+        space.set_box_aspect(sides, zoom=0.85)
+        for axis, side in zip("xyz", sides / sides.max(), strict=True):
+            _place_ticks(getattr(space, f"{axis}axis"), 5.0 * side)
+        for axis, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
+            _place_ticks(axis, 7.0 * side)
         factor = tall / extent[2]
-        space.set_title("equal scales" if factor < 1.01 else f"heights {factor:.2g} times exaggerated", fontsize=9)
+        scales = "equal scales" if factor < 1.01 else f"heights {factor:.2g} times exaggerated"
+        space.set_title(f"{scales}; z above {base[2]:.10g} m", fontsize=9)
+
+
+def _place_ticks(axis, number: float) -> None:
+    """Sets about so many ticks, or only one at the beginning of a short axis: more would cover each other."""
+    if number < 1.5:
+        axis.set_ticks([axis.get_view_interval()[0]])
+        axis.set_major_formatter("{x:.3g}")
+    else:
+        axis.get_major_locator().set_params(nbins=max(int(number), 2))
 
 
 def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite: bool = False) -> None:

@@ -15,7 +15,7 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.geojson_crs import GeoJsonCrs
-from wavebatch.tools.plots.labels import fit_parts
+from wavebatch.tools.plots.labels import fit_parts, space_ticks
 from wavebatch.tools.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")
@@ -112,7 +112,7 @@ def draw_slice(
             axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
         axes.set_xlim(extent[:2])
         axes.set_ylim(extent[2:])
-        axes.yaxis.get_major_locator().set_params(nbins=int(np.clip(width * tall / 0.3, 1, 8)))
+        space_ticks(axes.yaxis, width * tall, 0.3)
         axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")
         parts = [plain_text(strip), f"scan line {piece.line.number}", f"{len(piece.line)} pulses"]
