@@ -17,7 +17,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, shown_limits
+from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, shown_limits
 
 FEWEST, MOST_CHOSEN = 20, 120
 """Least and largest number of bins that are chosen if the user gives none."""
@@ -220,7 +220,7 @@ def _name_series(key: _Key, columns: Sequence[Clouds], paths: Sequence[Path], ea
     column, cloud, group = key
     parts = [columns[column].facts.name] if len(columns) > 1 else []
     if each and len(paths) > 1:
-        parts.append(paths[cloud].name)
+        parts.append(name_paths(paths)[cloud])
     if by is not None:
         parts.append(_name_group(columns[0].other_facts[0].name, group))
     return " ".join(parts) or (paths[0].name if len(paths) == 1 else f"{len(paths)} clouds")

@@ -21,7 +21,7 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.raster import check_crs
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
+from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, robust_limits
 from wavebatch.tools.voxels.grid import COLUMNS
 
 MOST_POINTS = 200_000
@@ -245,7 +245,7 @@ def measure_profile(
         sums[row] += np.bincount(at[good], rows["value"][good], minlength=len(edges) - 1)
     with np.errstate(invalid="ignore", divide="ignore"):
         values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
-    names = tuple(path.name for path in paths)
+    names = name_paths(paths)
     names = names if each or len(paths) == 1 else (f"{len(paths)} clouds",)
     return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit)
 

@@ -62,6 +62,12 @@ class Tally:
         return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
 
+def name_paths(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of files for legends and titles, with their folders where names are equal."""
+    names = [path.name for path in paths]
+    return tuple(str(path) if names.count(path.name) > 1 else path.name for path in paths)
+
+
 def read_flags(names: Sequence[str]) -> int:
     """The bits of flags given by names, also several separated by commas; ConfigError for an unknown name."""
     bits = 0
