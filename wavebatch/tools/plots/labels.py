@@ -5,6 +5,7 @@ All modules that draw use it. Texts are measured with the renderer, not estimate
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -130,9 +131,13 @@ def _overlap(a: Any, b: Any) -> float:
 
 
 def space_ticks(axis: Any, length: float, each: float) -> None:
-    """Places as many ticks as fit, or one at the beginning; length: of the axis, each: room of a tick [inches]."""
-    if length < 2 * each:
-        axis.set_ticks([axis.get_view_interval()[0]])
-    else:
+    """Places as many ticks as fit, or one in the middle; length: of the axis, each: room of a tick [inches]."""
+    if length >= 2 * each:
         axis.get_major_locator().set_params(nbins=int(min(length / each, 8)))
-    axis.set_major_formatter(lambda value, _: f"{value:.10g}")
+        axis.set_major_formatter(lambda value, _: f"{value:.10g}")
+        return
+    low, high = axis.get_view_interval()
+    # A round place within a hundredth of the axis, so that its number is short.
+    digits = 2 - math.floor(math.log10(high - low)) if high > low else 3
+    axis.set_ticks([round(low + 0.5 * (high - low), digits)])
+    axis.set_major_formatter(lambda value, _: f"{value:.{max(digits, 0)}f}")
