@@ -4,6 +4,7 @@
 #   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
+#   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
@@ -11,8 +12,10 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := demo
 BENCH  := bench
+MINUTES ?= 10
+SEED   ?= 1
 
-.PHONY: demo test test-all papers bench docs lint clean
+.PHONY: demo test test-all papers bench fuzz docs lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -65,6 +68,9 @@ ifdef BASE
 else
 	$(BIN)/wavebatch bench --scene mixed --scene open --scene forest --scene empty --promises -o $(BENCH)
 endif
+
+fuzz: $(VENV)/.test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/fuzzing.py --minutes $(MINUTES) --seed $(SEED)
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

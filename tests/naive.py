@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.stats import f as f_distribution
 
 
 def smooth_121(waveform):
@@ -296,3 +297,34 @@ def crlb_joint(time, amplitude, sigma, noise_std, spacing, n_samples):
     variance = (vectors**2 / values[:, None, :]).sum(axis=2).T
     std = np.sqrt(np.where(np.isnan(variance), np.inf, variance)) / scale * noise_std
     return std[:k], std[k : 2 * k], std[2 * k :]
+
+
+def compare_halves(xyz):
+    """Smallest chance of two planes over six cuts of points around 0: (chance, gain in the sum of squares)."""
+    centre = xyz.mean(axis=0)
+    axes = np.linalg.svd(xyz - centre, full_matrices=False)[2]
+    u, v = xyz @ axes[0], xyz @ axes[1]
+    r = (xyz - centre) @ axes[2]
+    angle = np.arctan2(v, u)
+
+    def left(rows):
+        terms = np.stack([np.ones(len(u)), u, v], axis=1)[rows]
+        return np.sum((r[rows] - terms @ np.linalg.lstsq(terms, r[rows], rcond=None)[0]) ** 2)
+
+    whole, best = left(np.ones(len(r), bool)), np.inf
+    for cut in range(6):
+        one = (angle + np.pi - cut * np.pi / 6) % (2 * np.pi) < np.pi
+        if min(one.sum(), (~one).sum()) >= 4:
+            best = min(best, left(one) + left(~one))
+    noise = best + len(r) * 1e-6
+    return min(6 * f_distribution.sf((whole - best) / 3 / (noise / (len(r) - 6)), 3, len(r) - 6), 1.0), whole - best
+
+
+def fit_slope(across, along, shared):
+    """Slope (2,) of `along` over places across (k, 2), and its covariance: points share an error within a scan line."""
+    table = np.column_stack([across, np.ones(len(across))])
+    solution, *_ = np.linalg.lstsq(table, along, rcond=None)
+    left = along - table @ solution
+    noise = left @ left / (len(along) - 3)
+    spread = np.cov(across.T, bias=True)
+    return solution[:2], np.linalg.inv(spread) * (noise / len(along) + shared**2 / 4)

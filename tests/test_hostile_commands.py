@@ -4,6 +4,7 @@ import json
 import os
 import random
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -104,3 +105,68 @@ def test_names_of_files_may_hold_anything(tmp_path, name):
     strip.write_bytes(b"nothing")
     done = CliRunner().invoke(main, ["run", str(strip), *out, "--overwrite"])
     assert done.exit_code == 4 and done.stderr.count("\n") == 1 and done.stderr.startswith("error: /")
+
+
+def test_names_of_columns_are_read_in_linear_time(tmp_path):
+    """A pattern took 40 s for 100 kB of brackets."""
+    strip, path = tmp_path / "a.las", tmp_path / "t.txt"
+    simulate_strip("flat", strip, pulses=60, seed=1)
+    path.write_text("[" * 1_000_000 + ",time,x,y,z\n")
+    start = time.process_time()
+    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--trajectory", str(path)])
+    assert done.exit_code == 4 and "t.txt" in done.stderr and time.process_time() - start < 10
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("{", "no JSON at line 1, column 2"),
+        ('{"features": 3}', 'needs "features"'),
+        ('{"features": [3]}', "feature 1: not GeoJSON of a polygon"),
+        ('{"features": [{"geometry": {"type": "Point", "coordinates": []}}]}', "feature 1 is a Point"),
+        ('{"features": [{"geometry": {"type": "Polygon", "coordinates": [[["x", 1]]]}}]}', "feature 1: not GeoJSON"),
+        ('{"features": [{"geometry": {"type": "Polygon", "coordinates": [[]]}}]}', "no corner"),
+        ("[" * 100_000, "list of polygons"),
+    ],
+)
+def test_polygons_that_are_none_are_told_without_the_words_of_python(tmp_path, text, why):
+    strip, path = tmp_path / "a.las", tmp_path / "p.geojson"
+    simulate_strip("flat", strip, pulses=60, seed=1)
+    path.write_text(text)
+    done = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(path)])
+    assert done.exit_code == 2 and why in done.stderr and done.stderr.count("\n") == 1
+    assert "Error:" not in done.stderr and "object" not in done.stderr
+
+
+def test_stats_writes_no_table_that_lacks_a_cloud(tmp_path):
+    simulate_strip("flat", tmp_path / "a.las", pulses=60, seed=1)
+    (tmp_path / "b.las").write_bytes(b"nothing")
+    table = tmp_path / "t.csv"
+    done = CliRunner().invoke(main, ["stats", str(tmp_path / "a.las"), str(tmp_path / "b.las"), "-o", str(table)])
+    assert done.exit_code == 1 and not table.exists()
+    assert "t.csv: not written, because 1 cloud of 2 cannot be read" in done.stderr and "a.las" in done.stdout
+
+
+def test_check_goes_on_past_a_strip_that_cannot_be_read(tmp_path, monkeypatch):
+    from wavebatch.surveying import inspect_strip
+
+    simulate_strip("flat", tmp_path / "a.las", pulses=60, seed=1)
+    (tmp_path / "b.las").write_bytes((tmp_path / "a.las").read_bytes())
+
+    class Reader(inspect_strip.StripReader):
+        def __init__(self, path, **options):
+            if path.name == "a.las":
+                raise PermissionError(13, "Permission denied", str(path))
+            super().__init__(path, **options)
+
+    monkeypatch.setattr(inspect_strip, "StripReader", Reader)
+    done = CliRunner().invoke(main, ["check", str(tmp_path / "a.las"), str(tmp_path / "b.las")])
+    assert done.exit_code == 1 and "Permission denied" in done.stdout and "b.las: ok" in done.stdout
+
+
+def test_names_are_printed_without_escapes_of_the_terminal(tmp_path):
+    strip = tmp_path / "red \x07\x1b[31m.las"  # click itself takes colours off where the output is no terminal
+    simulate_strip("flat", strip, pulses=60, seed=1)
+    for words in (["info"], ["check"], ["stats"], ["run", "--dry-run", "-o", str(tmp_path / "out")]):
+        done = CliRunner().invoke(main, [*words, str(strip)])
+        assert done.exit_code == 0 and "red \\x07\\x1b[31m" in done.stdout, words

@@ -17,9 +17,7 @@ Examples
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # not from typing: Ctrl-C must find this import done (core/interrupts.py)
 if TYPE_CHECKING:
     from wavebatch.batch.run import BatchResult, Outcome
     from wavebatch.core.echoes import COLUMNS, Column, EchoFlag, EchoTable
@@ -83,10 +81,12 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name when it is first used."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
     value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
     globals()[name] = value
     return value

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -33,12 +34,12 @@ class Dask:
         self.wait_until(lambda: file.exists() and file.stat().st_size)
         self.address = json.loads(file.read_text())["address"]
 
-    def start_worker(self):
+    def start_worker(self, **env):
         # A function of this file travels as "tests.batch.test_dask_cluster": the worker must be able to import that.
         tests = Path(__file__).parents[1]
         path = os.pathsep.join(filter(None, (str(tests.parent), str(tests), os.environ.get("PYTHONPATH"))))
         common = ("--nthreads", "1", "--no-dashboard", "--no-nanny", "--memory-limit", "0")
-        return self._start(*_WORKER, self.address, *common, PYTHONPATH=path)
+        return self._start(*_WORKER, self.address, *common, PYTHONPATH=path, **env)
 
     def _start(self, *command, **env):
         with open(self.folder / f"log{len(self.processes)}", "wb") as log:
@@ -152,7 +153,9 @@ def _spool_as_ever():
     return spool.made
 
 
-@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://none.invalid:8786", "tcp://", "a:b"])
+@pytest.mark.parametrize(
+    "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
+)
 def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
     monkeypatch.setattr("wavebatch.batch.dask_cluster._CONNECT", 0.5)
     done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
@@ -241,3 +244,81 @@ def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path):
     assert process.returncode == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} <= {"a.laz", "a.report.json", "b.laz", "b.report.json"}
+
+
+@pytest.mark.parametrize("address", ["", " "])
+def test_an_empty_address_is_wrong_usage(strips, tmp_path, address):
+    done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
+    assert done.exit_code == 2 and "--scheduler: the address is empty" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_peer_that_is_no_scheduler_is_one_line_within_seconds(strips, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "wavebatch", "run", str(strips), "-o", str(tmp_path / "out")]
+        start = time.monotonic()
+        done = subprocess.run([*command, "--scheduler", address], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached")
+    assert time.monotonic() - start < 12  # 5 s, and the start of Python and dask
+
+
+def test_strips_that_a_worker_does_not_see_are_named_before_anything_starts(dask, strips, tmp_path):
+    out = tmp_path / "out"
+    with distributed.Client(dask.address, set_as_default=False) as client:
+        client.wait_for_workers(2)
+        worker = sorted(client.nthreads())[0]
+        try:
+            client.run(_blind, "b.las", workers=[worker])
+            code, said = run(strips, "-o", out, "--scheduler", dask.address)
+            client.run(_blind, "out", workers=[worker])
+            code2, said2 = run(strips, "-o", out, "--scheduler", dask.address)
+        finally:
+            client.run(_blind, None, workers=[worker])
+    assert code == code2 == 2 and said.count("\n") == said2.count("\n") == 1
+    assert f"worker {worker} does not see {strips / 'b.las'}" in said
+    assert f"worker {worker} does not see {out};" in said2
+    assert list(out.iterdir()) == []
+
+
+def _blind(part):
+    """Let a worker not see what has this in its path; None: let it see everything."""
+    from wavebatch.batch import worker_check
+
+    worker_check._size = lambda file: -1 if part and part in file else worker_check.os.path.getsize(file)
+
+
+def test_a_worker_on_another_kind_of_processor_is_refused_by_name(tmp_path, strips, monkeypatch):
+    """Other bits of sums give other surveys: 1,370, 1,371 and 1,366 echoes on one strip."""
+    cluster = Dask(tmp_path)
+    try:
+        cluster.start_worker(OPENBLAS_CORETYPE="Prescott")
+        code, said = run(strips, "-o", tmp_path / "out", "--scheduler", cluster.address)
+    finally:
+        cluster.stop()
+    assert code == 2 and said.count("\n") == 1
+    assert "has another kind of processor (" in said and "tcp://127.0.0.1" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path, strips):
+    from wavebatch.batch.dask_cluster import Cluster
+
+    events, dask = [], Dask(tmp_path)
+    try:
+        fit = dask.start_worker()
+        with Cluster(dask.address, tmp_path, tell=events.append) as cluster:
+            dask.start_worker(OPENBLAS_CORETYPE="Prescott")
+            cluster._client.wait_for_workers(2)
+            futures = [cluster.submit(pow, 2, number) for number in range(40)]
+            left = list(futures)
+            while left:
+                left = [future for future in left if future not in cluster.wait(left)]
+            assert [future.result() for future in futures] == [2**number for number in range(40)]
+        assert fit.poll() is None
+    finally:
+        dask.stop()
+    (event,) = events
+    assert event["event"] == "worker" and "another kind of processor" in event["warning"]
+    assert event["warning"].endswith("it gets no work")

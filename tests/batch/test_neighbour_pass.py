@@ -135,8 +135,8 @@ def test_only_the_error(strips, clouds, tmp_path):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("radius = 0.0", "radius must lie between 0.001 and 1000"),
-        ("radius = 1e9", "radius must lie between 0.001 and 1000"),
+        ("radius = -1.0", "radius must lie between 0 and 1000"),
+        ("radius = 1e9", "radius must lie between 0 and 1000"),
         ("min_points = 3", "min_points must lie between 4 and 10000"),
         ("max_error = 0.0", "max_error must lie between 0.001 and 180"),
     ],

@@ -152,6 +152,41 @@ def test_an_interrupt_that_python_drops_is_seen_by_the_loop(strip, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+_IN_START = """
+import multiprocessing.util, os, signal
+from wavebatch.__main__ import main
+
+spawn = multiprocessing.util.spawnv_passfds
+
+def spawn_and_signal(path, args, passfds):
+    pid = spawn(path, args, passfds)
+    if b"spawn_main" in b"".join(map(os.fsencode, args)):  # a worker, which still waits for what it shall do
+        os.kill(os.getpid(), signal.SIGTERM)
+    return pid
+
+multiprocessing.util.spawnv_passfds = spawn_and_signal
+if __name__ == "__main__":
+    main()
+"""
+
+
+def test_a_signal_while_a_worker_starts_leaves_no_process_that_complains(strip, tmp_path):
+    script = tmp_path / "start.py"
+    script.write_text(_IN_START)
+    out = tmp_path / "out"
+    command = [sys.executable, str(script), "run", str(strip), "-o", str(out), "--profile", "fast", "--jobs", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130, done.stderr
+    assert done.stderr.startswith("interrupted: finished") and done.stderr.count("\n") == 1
+    assert list(out.iterdir()) == []
+
+
+def test_hardly_anything_is_imported_before_signals_are_handled():
+    code = "import sys; import wavebatch.core.interrupts; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True)
+    assert not {"typing", "click", "numpy", "multiprocessing"} & set(done.stdout.split())
+
+
 def test_a_draft_that_is_left_open_goes_with_its_process(tmp_path):
     code = "import sys; from wavebatch.files.disk.publish import Draft; Draft(sys.argv[1], overwrite=False)"
     subprocess.run([sys.executable, "-c", code, tmp_path / "a"], check=True)

@@ -94,5 +94,6 @@ def test_every_option_that_writes_is_known_as_such():
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
         "voxelize --profiles",
-        "waveform --output", "histogram --output", "map --output", "calibrate --output", "bench --output",
+        "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
+        "calibrate --plot", "bench --output",
     }  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli import main
-from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import effective, parse_chain
 
 
@@ -39,8 +39,9 @@ def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
     kind = name.split(".")[0]
     tables = [example if k == kind else f'[[chain]]\nstage = "{other}"\n' for k, other in others.items()]
     if kind == "attribute":
-        makers = {s.name for column in STAGES[name].needs for s in STAGES.values() if column in s.makes}
-        tables += [*(f'[[chain]]\nstage = "{maker}"\n' for maker in sorted(makers)), example]
+        makers = {s.name for column in Step(STAGES[name]).needs for s in STAGES.values() if column in s.makes}
+        ordered = sorted(makers, key=lambda maker: maker != "attribute.position")
+        tables += [*(f'[[chain]]\nstage = "{maker}"\n' for maker in ordered), example]
     assert all(other in text for other in PARTNERS.get(name, {}).values())
     chain = parse_chain("\n".join(tables), "example")
     assert example.strip() in effective(chain)

@@ -7,7 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from wavebatch.cli import main
-from wavebatch.surveying.calibration import Calibration, format_calibration
+from wavebatch.surveying.calibrating.calibration_file import format_calibration
+from wavebatch.surveying.calibration import Calibration
 from wavebatch.tools.simulate import simulate_strip
 
 

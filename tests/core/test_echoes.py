@@ -19,7 +19,8 @@ def test_to_numpy_has_a_field_per_column():
     table = make_table([0, 1, 1], x=np.array([1.0, 2.0, 3.0]), echo_flags=np.array([1, 2, 3], np.uint16))
     rows = table.to_numpy()
     assert rows.dtype.names == (
-        "waveform", "time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "residual", "flags",
+        "waveform", "time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err",
+        "relative_energy_err", "residual", "flags",
         "x", "echo_flags",
     )  # fmt: skip
     assert len(rows) == 3

@@ -275,7 +275,9 @@ def test_records_are_kept_to_the_byte(tmp_path):
         write(layout, tmp_path / f"out{suffix}", layout.rows(points))
         header = read_header(tmp_path / f"out{suffix}")
         assert (header.padding, header.project_id) == (b"\xdd\xcc", bytes(range(16)))
-        expected = [vlr.encode() for vlr in vlrs if vlr.record_id not in (100, 101) and vlr.user != "copc"]
+        # laspy opens no file with ids that are not UTF-8.
+        shown = [dataclasses.replace(vlr, user_id=vlr.user_id.replace(b"\xe9", b"?")) for vlr in vlrs]
+        expected = [vlr.encode() for vlr in shown if vlr.record_id not in (100, 101) and vlr.user != "copc"]
         assert [vlr.encode() for vlr in header.vlrs][: len(expected)] == expected
         users = [vlr.user for vlr in header.vlrs[len(expected) :]]
         assert users == ["wavebatch", "LASF_Spec", "laszip encoded"][: 3 if suffix == ".laz" else 2]
@@ -354,7 +356,17 @@ def test_provenance_is_json_that_keeps_the_history(tmp_path):
     assert json.dumps(json.loads(vlrs[0].payload), sort_keys=True, separators=(",", ":")).encode() == vlrs[0].payload
     assert read_provenance(path) == []
     with pytest.raises(ConfigError, match="account of the run takes .* a VLR holds at most 65535"):
-        CloudWriter(layout, tmp_path / "d.las", provenance={"long": "x" * 70000})
+        CloudWriter(layout, tmp_path / "d.las", provenance={f"k{i}": i for i in range(10_000)})
+
+
+def test_what_a_record_cannot_hold_is_left_out_and_named(tmp_path):
+    points = write_source(tmp_path / "a.las", 9, (1, 4))
+    layout = plan_output(tmp_path / "a.las", [])
+    provenance = {"long": list(range(20_000)), "table": {"longer": "x" * 90_000, "short": "y"}, "input": "a.las"}
+    write(layout, tmp_path / "b.las", layout.rows(points), provenance=provenance)
+    (account,) = read_provenance(tmp_path / "b.las")
+    assert account["input"] == "a.las" and account["long"] is None
+    assert account["table"] is None and set(account["left_out"]["sha256"]) == {"long", "table"}
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
@@ -679,3 +691,18 @@ def test_every_format_and_suffix_in_hand_made_combinations(tmp_path):
         for backend in BACKENDS:
             assert read_raw(target, backend).tobytes() == rows.tobytes()
         check_truth(target, rows)
+
+
+def test_records_whose_ids_are_no_text_do_not_keep_laspy_from_opening_the_cloud(tmp_path):
+    path = tmp_path / "a.las"
+    points = write_source(path, 9, (1, 4))
+    layout = plan_output(path, [])
+    layout.source.header.vlrs.append(Vlr(b"caf\xe9", 7, b"x", b"\xff\xfe text"))
+    layout.source.header.vlrs.append(Vlr("é".encode(), 8, b"y", b"fine\0\xff"))
+    cloud = write(layout, tmp_path / "b.las", layout.rows(points))
+    found = {vlr.record_id: vlr for vlr in read_header(tmp_path / "b.las").vlrs}
+    assert found[7].user_id.rstrip(b"\0") == b"caf?" and found[7].description.rstrip(b"\0") == b"?? text"
+    assert found[8].user_id.rstrip(b"\0") == "é".encode() and found[8].payload == b"y"
+    assert list(cloud.dropped) == ["VLR caf? 7"]
+    with laspy.open(tmp_path / "b.las") as reader:
+        assert len(reader.header.vlrs) >= 2

@@ -14,9 +14,13 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.files.las.crs import METRES, CrsUnits, parse_geotiff, parse_wkt
+from wavebatch.files.las.crs import METRES, CrsUnits, looks_geocentric, parse_geotiff, parse_wkt
+from wavebatch.files.las.epsg_units import find_unit
+from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.basic import position
+from wavebatch.tools.simulate import simulate_strip
+from wavebatch.tools.simulate.geometry import Flight
 from wavebatch.tools.simulate.strip import WKT
 
 US = 1200 / 3937
@@ -89,6 +93,11 @@ def short(key, value):
         (keys(short(1024, 3)), b"", b"", CrsUnits("geocentric")),
         (keys(short(1024, 1), short(3072, 2263)), b"", b"NAD83 / New York (ftUS)|", CrsUnits("projected", US)),
         (keys(short(1024, 1)), b"", b"State plane, feet|", CrsUnits("projected", 0.3048)),
+        (keys(short(1024, 1), short(3072, 2263)), b"", b"", CrsUnits("projected", US)),
+        (keys(short(1024, 1), short(3072, 2222)), b"", b"", CrsUnits("projected", 0.3048)),
+        (keys(short(1024, 1), short(3072, 25832), short(4096, 6360)), b"", b"", CrsUnits("projected", None, US)),
+        (keys(short(1024, 1), short(3072, 2263), short(3076, 9001)), b"", b"", CrsUnits("projected", 1.0)),
+        (keys(short(1024, 1), short(3072, 32767), short(4096, 32767)), b"", b"", CrsUnits("projected")),
         (keys(short(1024, 1)), b"", b"UTM zone 32N, Fort Lee|", CrsUnits("projected")),
         (keys(short(3076, 32767), (3077, 34736, 1, 1)), struct.pack("<2d", 7.0, 0.5), b"", CrsUnits(None, 0.5)),
         (keys(short(1024, 1), short(3076, 32632), short(4099, 9001)), b"", b"", CrsUnits("projected", None, 1.0)),
@@ -113,6 +122,37 @@ def test_units_that_nobody_knows_are_no_metres(directory, doubles):
     units = parse_geotiff(directory, doubles)
     assert not units.is_metric
     assert "an unknown unit" in units.describe()
+
+
+@pytest.mark.parametrize(
+    ("code", "unit"),
+    # NAD27 / New York, NAD83(2011) / Oregon (both), Palestine 1923, ETRS89 / UTM, Web Mercator, Texas, and no code.
+    [(32017, US), (6886, None), (6885, 0.3048), (28191, None), (25832, None), (3857, None), (2277, US), (0, None)],
+)
+def test_codes_of_crs_give_their_unit(code, unit):
+    assert find_unit(code) == (None if unit is None else pytest.approx(unit, rel=1e-7))
+
+
+def test_heights_have_codes_of_their_own():
+    assert find_unit(6360, vertical=True) == pytest.approx(US) and find_unit(5703, vertical=True) is None
+    assert find_unit(8228, vertical=True) == 0.3048 and find_unit(6360) is None
+
+
+@pytest.mark.parametrize(
+    ("directory", "citation", "crs"),
+    [
+        (keys(short(1024, 1), short(3072, 2263), short(4096, 6360)), b"x|", "EPSG:2263+6360"),
+        (keys(short(1024, 1), short(3072, 25832)), b"", "EPSG:25832"),
+        (keys(short(1024, 2), short(2048, 4326)), b"", "EPSG:4326"),
+        (keys(short(1024, 1), short(3072, 32767)), b"mine|", "GeoTIFF: mine"),
+        (keys(short(1024, 1)), b"", "GeoTIFF keys"),
+    ],
+)
+def test_the_code_of_geotiff_keys_is_the_name_of_the_crs(tmp_path, directory, citation, crs):
+    raw = make_raw(60)
+    raw.vlrs = [descriptor(1), projection(34735, directory), projection(34737, citation)]
+    with StripReader(raw.write(tmp_path / "s.las")) as reader:
+        assert reader.facts.crs == crs
 
 
 def test_more_keys_than_bytes_are_cut():
@@ -178,3 +218,72 @@ def test_errors_along_the_ray_are_metres_in_any_unit(scale):
     noise = Noise(np.zeros(1, np.float32), np.ones(1, np.float32))
     done = position(block, noise, SystemPulse(1.0), echoes)
     assert done.attributes["range_err"][0] == pytest.approx(0.1 * HALF_C, rel=1e-3)
+
+
+def in_feet(source, target):
+    """A strip without CRS whose coordinates are feet, but whose packet vectors are metres."""
+    content = bytearray(source.read_bytes())
+    for place in (131, 155, 179):
+        values = struct.unpack_from("<6d" if place > 155 else "<3d", content, place)
+        struct.pack_into(f"<{len(values)}d", content, place, *(value / 0.3048 for value in values))
+    target.write_bytes(content)
+    return target
+
+
+@pytest.mark.parametrize("scene", ["urban", "flat"])
+def test_feet_with_metric_vectors_and_no_crs_are_found(tmp_path, scene):
+    simulate_strip(scene, tmp_path / "m.las", pulses=30_000, seed=3, flight=Flight(pulse_rate=50_000))
+    feet = in_feet(tmp_path / "m.las", tmp_path / "feet.las")
+    chain = tmp_path / "chain.toml"
+    stages = ("noise.pooled", "detect.maximum", "decompose.closed_form", "attribute.position", "attribute.range")
+    chain.write_text("".join(f'[[chain]]\nstage = "{name}"\n' for name in stages))
+    done = {
+        strip.stem: CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out"), "--chain", str(chain)])
+        for strip in (tmp_path / "m.las", feet)
+    }
+    assert done["m"].exit_code == 0 and "in feet" not in done["m"].stderr
+    with StripReader(feet) as reader, reader.scan() as scan:
+        scale = measure_scale(reader, scan)
+    if scene == "urban":
+        assert scale == pytest.approx(1 / 0.3048, rel=0.001)
+        assert done["feet"].exit_code == 4
+        assert "coordinates are in feet, packet vectors in metres" in done["feet"].stderr
+    else:  # single returns show no distance: only the flight does
+        assert scale is None and done["feet"].exit_code == 0
+        assert "197 m/s" in done["feet"].stderr and "are they in feet?" in done["feet"].stderr
+
+
+@pytest.mark.parametrize(
+    ("middle", "geocentric"),
+    [
+        ((4_194_000, 1_162_000, 4_647_000), True),  # Munich
+        ((-2_700_000, -4_290_000, 3_855_000), True),  # San Francisco
+        ((-4_646_000, 2_553_000, -3_534_000), True),  # Sydney
+        ((1_500_000, 6_193_000, 150_000), True),  # 1.4 degrees north
+        ((500_000, 5_400_000, 120), False),
+        ((500_000, 6_350_000, 120), False),  # UTM in Scotland: as far from its origin
+        ((500_000, 6_350_000, 29_000), False),  # the same in feet, on Everest
+        ((0, 0, 0), False),
+        ((np.nan, 0, 0), False),
+        ((6.37e306, 1e308, 1e308), False),
+    ],
+)
+def test_geocentric_coordinates_are_told_by_their_size(middle, geocentric):
+    middle = np.array(middle, float)
+    with np.errstate(over="ignore"):
+        assert bool(looks_geocentric(middle - 2000, middle + 2000)) is geocentric
+
+
+@pytest.mark.parametrize("records", [[], [projection(34735, b"\xff" * 40)]], ids=["no CRS", "a broken one"])
+def test_geocentric_strips_without_a_crs_get_no_ranges(tmp_path, records):
+    raw = make_raw(60)
+    raw.vlrs = [descriptor(1), *records]
+    strip = raw.write(tmp_path / "s.las")
+    content = bytearray(strip.read_bytes())
+    struct.pack_into("<3d", content, 155, 4_194_000.0, 1_162_000.0, 4_647_000.0)
+    struct.pack_into("<6d", content, 179, 4_195e3, 4_193e3, 1_163e3, 1_161e3, 4_648e3, 4_646e3)
+    strip.write_bytes(content)
+    arguments = ["run", str(strip), "-o", str(tmp_path / "out"), "--profile", "fast"]
+    done = CliRunner().invoke(main, [*arguments, "--flight-height", "500"])
+    assert done.exit_code == 4 and "coordinates are geocentric" in done.stderr
+    assert CliRunner().invoke(main, arguments).exit_code == 0

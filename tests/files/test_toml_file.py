@@ -107,7 +107,24 @@ def test_reading_is_bounded(tmp_path):
         read_text(tmp_path / "none.toml", "chain file")
 
 
-@pytest.mark.parametrize("text", ["a", "a = 1\na = 2", "a = " + "[" * 10_000, "a = " + "9" * 5000, 'a = "\\ud835"'])
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("a = " + "[" * 10_000, "nested more than 64 deep"),
+        ("a = " + "[" * 100 + "]" * 100, "nested more than 64 deep"),
+        ("a = " + "{b = [" * 70 + "]}" * 70, "nested more than 64 deep"),
+        (".".join("a" * 65) + " = 1", "nested more than 64 deep"),
+        ("a = " + "9" * 5000, "a number has more than 4000 digits"),
+        ("a = [1, -1" + "_0" * 5000 + "]", "a number has more than 4000 digits"),
+    ],
+)
+def test_depth_and_digits_are_bounded(text, why):
+    with pytest.raises(ConfigError, match=f"x.toml: .*{why}"):
+        parse_toml(text, "x.toml")
+    assert parse_toml("a = " + "[" * 60 + "]" * 60 + f"\nb = {'9' * 900}\n" + ".".join("c" * 60) + " = 1", "x")
+
+
+@pytest.mark.parametrize("text", ["a", "a = 1\na = 2", 'a = "\\ud835"'])
 def test_text_that_is_not_toml(text):
     with pytest.raises(ConfigError, match="x.toml: not valid TOML: "):
         parse_toml(text, "x.toml")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.angle_errors import angles_above, angles_of_variance
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
-    angles_of_variance,
     build_table,
     direct_width,
     paper_table,
@@ -133,3 +133,21 @@ def test_errors_hold_whatever_the_true_angle_is(root):
     angle, angle_err = angles_of_variance(u * near**2, np.full(len(u), near**2), np.full(len(u), HEIGHT), BETA)
     inside = np.abs(angle - float(angle_of_spread(root * near, HEIGHT, BETA))) <= angle_err
     assert weight[inside].sum() / weight.sum() == pytest.approx(0.683, abs=0.012)
+
+
+@pytest.mark.parametrize("root", [1.5, 1.8, 2.0, 2.5, 4.0])
+def test_angles_above_a_threshold_hold_for_the_echoes_that_are_seen(root):
+    """True variances of root^2 errors, of which 2 % to all lie above 4: plain angles are off by up to 1.9 errors."""
+    u = np.linspace(4.0, root**2 + 8.0, 40_001)[1:]
+    weight = np.exp(-0.5 * (u - root**2) ** 2)
+    near = 1e-3 / float(spread_of_angle(1.0, HEIGHT, BETA))
+    one, height = np.full(len(u), near**2), np.full(len(u), HEIGHT)
+    angle, error = angles_above(u * near**2, one, height, BETA, 4.0)
+    true = float(angle_of_spread(root * near, HEIGHT, BETA))
+    share = weight[angle < true].sum() / weight.sum()
+    assert share == pytest.approx(0.5, abs=0.01)
+    assert 0.6 < weight[np.abs(angle - true) <= error].sum() / weight.sum() < 0.77
+    plain = angles_of_variance(u * near**2, one, height, BETA)[0]
+    if root < 1.9:
+        assert weight[plain < true].sum() / weight.sum() < 0.01
+    assert (error > 0).all()

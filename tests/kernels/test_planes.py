@@ -1,5 +1,6 @@
 """Robust planes, neighbourhoods and tiles: against slow twins, known surfaces, and whatever points there may be."""
 
+import naive
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -7,6 +8,7 @@ from scipy.spatial import cKDTree
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.kernels.geometry import normals
 from wavebatch.kernels.geometry.normals import MOST_PER_CELL, Gap, Surroundings, measure_normals, thin_out
+from wavebatch.kernels.geometry.plane_halves import DOUBTFUL, SURE, compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import (
     LEAST_SPREAD,
     OUTLYING,
@@ -126,6 +128,86 @@ def test_neighbours_are_those_of_a_loop(rng):
     for number, place in enumerate(points):
         expected += [(number, *step) for step in around - place if (step * step).sum() <= 1.0]
     np.testing.assert_array_equal(np.column_stack([point, offset]), np.array(expected))
+
+
+def gable(rng, degrees, noise, density, half=6.0, length=40.0):
+    """Points of two slopes that meet in a ridge along y, rays onto them, and the true angles [deg]."""
+    n = int(density * 2 * half * length)
+    xyz = rng.uniform([-half, 0, 0], [half, length, 0], (n, 3))
+    rise = np.tan(np.radians(degrees))
+    xyz[:, 2] = -rise * np.abs(xyz[:, 0]) + noise * rng.standard_normal(n)
+    ray = np.array([0.1, 0.05, -1.0]) / np.sqrt(1.0125)
+    cosine = np.abs(rise * np.sign(xyz[:, 0]) * ray[0] + ray[2]) / np.hypot(rise, 1)
+    return xyz, np.tile(ray, (n, 1)), np.degrees(np.arccos(cosine))
+
+
+@pytest.mark.parametrize("degrees", [5, 10, 15, 20])
+@pytest.mark.parametrize(("noise", "density"), [(0.01, 4), (0.02, 4), (0.02, 10), (0.05, 20)])
+def test_at_a_ridge_the_error_grows_or_there_is_no_angle(degrees, noise, density):
+    """One plane through both slopes is off by the slope: it was off by 3 to 8 errors."""
+    xyz, ray, true = gable(np.random.default_rng(degrees), degrees, noise, density, length=80.0)
+    (angle, error), gap = measure_normals(xyz, ray, Surroundings(xyz), **SETTINGS)
+    near, known = np.abs(xyz[:, 0]) < 1.5, np.isfinite(angle)
+    ratio = np.abs(angle - true) / error
+    assert (ratio[near & known] > 3).mean() < 0.05
+    assert (ratio[near & known] <= 1).mean() > 0.58
+    at_ridge = np.abs(xyz[:, 0]) < 0.3
+    assert (known & (ratio > 3))[at_ridge].mean() < 0.05
+    if degrees > 5:
+        assert (gap[at_ridge] == Gap.NO_PLANE).mean() > 0.75
+    plain = (np.abs(xyz[:, 0]) > 1.6) & (np.abs(xyz[:, 0]) < 4.4)
+    assert known[plain].mean() > 0.98
+    assert 0.62 < (ratio[plain & known] <= 1).mean() < 0.78
+
+
+def test_a_step_is_no_tilt(rng):
+    """A kerb of 15 cm: the plane through both levels rises by 5 degrees."""
+    xyz = np.column_stack([rng.uniform(-6, 6, (4000, 2)), 0.02 * rng.standard_normal(4000)])
+    xyz[:, 2] += 0.15 * (xyz[:, 0] > 0)
+    down = np.tile([0, 0, -1.0], (len(xyz), 1))
+    (angle, error), _ = measure_normals(xyz, down, Surroundings(xyz), **SETTINGS)
+    near = np.isfinite(angle) & (np.abs(xyz[:, 0]) < 1.5) & (np.abs(xyz[:, 1]) < 4.4)
+    assert np.sqrt(np.mean((angle[near] / error[near]) ** 2)) < 1.4
+
+
+def test_two_halves_are_those_of_a_loop(rng):
+    sets = [slope(rng, rng.integers(10, 60), rng.uniform(0, 40)) for _ in range(60)]
+    for xyz in sets[::2]:
+        xyz[:, 2] += rng.uniform(0, 0.2) * np.abs(xyz[:, 0] - rng.uniform(-0.5, 0.5))
+    group = np.repeat(np.arange(len(sets)), [len(xyz) for xyz in sets])
+    planes = fit_planes(np.concatenate(sets), group, len(sets))._replace(limit=np.full(len(sets), np.inf))
+    found = [naive.compare_halves(xyz) for xyz in sets]
+    flat = planes._replace(
+        axes=np.stack([np.linalg.svd(xyz - xyz.mean(axis=0))[2][::-1].T for xyz in sets]),
+        centre=np.stack([xyz.mean(axis=0) for xyz in sets]),
+    )
+    halves = compare_halves(np.concatenate(sets), group, flat)
+    np.testing.assert_allclose(halves.chance, [chance for chance, _ in found], rtol=1e-6, atol=1e-12)
+    assert (halves.chance < SURE).sum() > 10 and (halves.chance > DOUBTFUL).sum() > 10
+
+
+@pytest.mark.parametrize("count", [9, 15, 40, 120])
+def test_a_plane_is_seldom_taken_for_two(count):
+    rng = np.random.default_rng(count)
+    n = 2000
+    xyz = np.concatenate([slope(rng, count, 20) for _ in range(n)])
+    group = np.repeat(np.arange(n), count)
+    planes = fit_planes(xyz, group, n)
+    halves = compare_halves(xyz, group, planes)
+    assert (halves.chance < SURE).mean() < 0.06
+    assert (halves.chance < 0.001).mean() < 0.003
+    ray = np.tile([0, 0.6, -0.8], (n, 1))
+    off = misfit_of_angles(halves, planes, ray)
+    assert (off == 0).mean() > 0.8 and (off >= 0).all()
+
+
+def test_few_points_or_points_in_line_have_no_halves():
+    line = np.outer(np.linspace(-1, 1, 12), [1, 0.3, 0.1])
+    few = np.random.default_rng(1).uniform(-1, 1, (6, 3))
+    points, group = np.concatenate([line, few]), np.repeat([0, 1], [12, 6])
+    halves = compare_halves(points, group, fit_planes(points, group, 3))
+    np.testing.assert_array_equal(halves.chance, 1)
+    np.testing.assert_array_equal(halves.tilts, 0)
 
 
 def test_reasons():

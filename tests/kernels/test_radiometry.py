@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from wavebatch.kernels.physics.gap_probability import estimate_canopy_ratio
 from wavebatch.kernels.physics.radiometry import (
+    attenuation_of_visibility,
     backscatter,
     backscatter_error,
     calibrate_echoes,
@@ -86,3 +88,39 @@ def test_errors_are_those_of_repeated_measurements():
     assert backscatter_error(energy, distance, r_err, c_err, 0.5, power=4) == pytest.approx(
         np.std(section) / np.mean(section), rel=0.02
     )
+
+
+@pytest.mark.parametrize(
+    ("visibility", "wavelength", "expected"),
+    # Koschmieder: 3.912 / V at 550 nm, 4.343 dB per unit; Kruse's exponents for haze, clear and very clear air.
+    [(23.0, 550.0, 0.7387), (23.0, 1064.0, 0.3133), (100.0, 1064.0, 0.0591), (4.0, 1064.0, 2.3052)],
+)
+def test_attenuation_by_visibility(visibility, wavelength, expected):
+    assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0, 3.3])
+@pytest.mark.parametrize("cover", ["any", "dense", "open"])
+def test_the_ratio_of_canopy_and_ground_is_told_from_shared_light(ratio, cover):
+    """Pulse energy, leaves and soil vary from pulse to pulse; weak parts are not seen."""
+    off = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        gap = rng.beta(*{"any": (1, 1), "dense": (0.6, 4), "open": (4, 0.6)}[cover], 2000)
+        energy = 1000 * np.exp(0.05 * rng.standard_normal(2000))
+        canopy = 0.3 * energy * (1 - gap) * np.exp(0.2 * rng.standard_normal(2000))
+        ground = 0.3 / ratio * energy * gap * np.exp(0.15 * rng.standard_normal(2000))
+        found = estimate_canopy_ratio(np.where(canopy < 12, 0, canopy), np.where(ground < 12, 0, ground))
+        off.append((found.ratio - ratio) / found.error)
+        assert found.error < 0.2 * ratio
+    assert np.sqrt(np.mean(np.square(off))) < 2.5
+
+
+def test_light_that_is_shared_alike_tells_no_ratio(rng):
+    canopy, ground = np.full(500, 60.0), np.full(500, 40.0)
+    assert estimate_canopy_ratio(canopy, ground) is None
+    assert estimate_canopy_ratio(canopy + rng.standard_normal(500), ground + rng.standard_normal(500)) is None
+    assert estimate_canopy_ratio(np.arange(50.0), 50 - np.arange(50.0)) is None
+    assert estimate_canopy_ratio(np.zeros(0), np.zeros(0)) is None
+    assert estimate_canopy_ratio(np.full(500, np.nan), ground) is None
+    assert estimate_canopy_ratio(np.zeros(500), ground) is None

@@ -228,3 +228,20 @@ def test_widths_stay_in_their_box():
         assert (bound.flags & EchoFlag.AT_BOUND).astype(bool).mean() > 0.5, name
         narrow = decompose(name, *record(50, (300, 32), width=1.0)[:2], least_width=0.3)
         assert np.median(narrow.sigma[narrow.amplitude > 200]) == pytest.approx(1.0, abs=0.1), name
+
+
+@pytest.mark.parametrize("shape", [GAUSSIAN, GAUSSIAN._replace(components=((0.2, 9.0, 1.5), (-0.05, -4.0, -0.2)))])
+def test_long_waveforms_are_rendered_in_pieces_that_do_not_depend_on_other_waveforms(shape):
+    rng = np.random.default_rng(5)
+    s, m = 3 * render.COLUMNS + 1, 300
+    waveform = np.sort(rng.integers(0, 4, m)).astype(np.int32)
+    columns = (rng.uniform(0, s, m), rng.uniform(5, 200, m), rng.uniform(1, 4, m))
+    whole = render.render_echoes(shape, 4, s, waveform, *columns)
+    x = np.arange(s, dtype=np.float32)
+    for row in range(4):
+        own = np.flatnonzero(waveform == row)
+        time, height, width = (values[own].astype(np.float32)[:, None] for values in columns)
+        dense = (render.evaluate_pulse(shape, x, time, width)[0] * height).sum(axis=0)
+        np.testing.assert_allclose(whole[row], dense, rtol=1e-4, atol=1e-3)
+        alone = render.render_echoes(shape, 1, s, np.zeros(len(own), np.int32), *(values[own] for values in columns))
+        np.testing.assert_array_equal(alone[0], whole[row])

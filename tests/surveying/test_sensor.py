@@ -193,3 +193,69 @@ def test_a_few_rays_of_every_place(wide_strip):
     assert 500 < len(vectors.time) <= MOST_SLICES * RAYS_PER_SLICE
     assert (np.diff(vectors.time) >= 0).all()
     np.testing.assert_array_equal(vectors.direction, again.direction)
+
+
+def wobble(rng, level):
+    """Motion of an aircraft besides its course: sinusoids of 0.03 to 2 Hz; the slow ones are `level` m large."""
+    frequency = np.geomspace(0.03, 2, 24)
+    size = level * rng.rayleigh(1, (3, 24)) / np.sqrt(24) * (frequency / 0.1) ** -1.67
+    phase = rng.uniform(0, 2 * np.pi, (3, 24))
+    angle = 2 * np.pi * frequency[:, None]
+    return lambda time: (size[:, :, None] * np.sin(angle * time + phase[:, :, None])).sum(axis=1).T
+
+
+def drift(rng, time, memory):
+    """Values of spread 1 that are alike for `memory` seconds."""
+    steps = np.arange(time[0], time[-1] + memory, memory / 20)
+    values, keep = [rng.standard_normal()], np.exp(-1 / 20)
+    for shock in np.sqrt(1 - keep**2) * rng.standard_normal(len(steps) - 1):
+        values.append(keep * values[-1] + shock)
+    return np.interp(time, steps, values)
+
+
+def fly_roughly(rng, *, seconds=5.0, level=0.0, mounting=0.0, attitude=0.0, view=60.0, rounding=0.01):
+    """Rays of a flight 1000 m high as a file holds them, and how far their ranges by the vectors are off [m]."""
+    time = np.sort(rng.uniform(0, seconds, int(4000 * seconds)))
+    sensor = np.stack([60 * time, 0 * time, 1000 + 0 * time], axis=1) + wobble(rng, level)(time)
+    angle = np.radians(view / 2) * (4 * np.abs(time * 50 % 1 - 0.5) - 1)
+    x, y, z = np.zeros(len(time)), np.sin(angle), -np.cos(angle)
+    ground = sensor + np.stack([x, y, z], axis=1) * (sensor[:, 2] / -z)[:, None]
+    roll, pitch = np.full((2, len(time)), mounting)
+    if attitude:
+        roll, pitch = (1e-4 * drift(rng, time, attitude) for _ in range(2))
+    turned = np.stack([x + pitch * z, y - roll * z, z + roll * y - pitch * x], axis=1)
+    vectors = (turned * 1.4986e-4).astype(np.float32).astype(np.float64)
+    rays = Rays(time, np.round(ground / rounding) * rounding, vectors, np.ones(len(time)))
+    found = estimate_path(rays, "direction vectors")
+    far = np.linalg.norm(ground - found.trajectory.at(time), axis=1) - np.linalg.norm(ground - sensor, axis=1)
+    return found.error, float(np.sqrt(np.nanmean(far**2)))
+
+
+@pytest.mark.parametrize(
+    "flight",
+    [
+        {},
+        {"rounding": 0.001},
+        {"seconds": 0.3},
+        {"level": 0.3},
+        {"level": 1.0, "rounding": 0.001},
+        {"level": 1.0, "view": 20.0},
+        {"mounting": 1e-4},
+        {"mounting": 1e-4, "seconds": 0.3},
+        {"attitude": 0.05},
+        {"attitude": 0.5},
+        {"attitude": 5.0},
+    ],
+    ids=str,
+)
+def test_the_error_of_the_position_covers_what_it_is(flight):
+    """It was 3 to 22 times too small where the aircraft moves, its mounting is turned or its attitude drifts."""
+    claimed, true = np.array([fly_roughly(np.random.default_rng(seed), **flight) for seed in range(4)]).T
+    assert np.sqrt(np.mean(true**2) / np.mean(claimed**2)) < 1.3
+    assert np.median(true / claimed) > 0.2
+
+
+def test_few_windows_assume_what_an_aircraft_does_in_turbulent_air():
+    claimed, true = fly_roughly(np.random.default_rng(1), seconds=1.4, level=0.3, rounding=0.001)
+    still, _ = fly_roughly(np.random.default_rng(1), seconds=1.4, rounding=0.001)
+    assert still > 0.003 and claimed > 0.6 * true

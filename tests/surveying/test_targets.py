@@ -13,8 +13,9 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import MAD_TO_STD
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.writer import FullwaveWriter
-from wavebatch.surveying.calibration import format_calibration, load_calibration, parse_calibration
-from wavebatch.surveying.targets import Target, fit_normal, load_targets
+from wavebatch.kernels.geometry.planes import fit_normal
+from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+from wavebatch.surveying.calibrating.target_file import Target, load_targets
 from wavebatch.tools.simulate import find_scene, simulate_strip, strip
 from wavebatch.tools.simulate.geometry import AIR_SPEED, EAST, GROUND, NORTH, START_TIME, Flight, trace_rays
 from wavebatch.tools.simulate.scenes import GROUND_REFLECTS
@@ -94,7 +95,7 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     targets.write_text(f"name,reflectance,x,y,radius\nnear,0.2,{x},{y},40\nnowhere,0.5,{x + 1e5},{y},40\n")
     done = call("calibrate", ground, "--targets", targets, "-o", cal, "--divergence", 0.5)
     assert done.exit_code == 0, done.output
-    assert "nowhere: reflectance 0.5, 0 echoes, too few, left out" in done.stderr and "note: " not in done.stderr
+    assert "nowhere: reflectance 0.5, refused: 0 clean single echoes" in done.stderr and "warning" not in done.stderr
     found = load_calibration(cal)
     assert found.divergence == 0.5 and 0.03 <= found.relative_error < 0.1
     assert found.strip == "flat.las" and "direction vectors" in found.conditions
@@ -108,7 +109,7 @@ def test_targets_get_their_reflectance_back(tmp_path, ground):
     assert done.exit_code == 1 and "exists" in done.stderr
     targets.write_text(f"reflectance,x,y,radius\n0.2,{x},{y + 30},20\n0.5,{x},{y - 30},20\n")
     done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "two.toml")
-    assert done.exit_code == 0 and "note: constants of the targets differ by a factor of 2." in done.stderr
+    assert done.exit_code == 0 and "warning: constants of the targets differ by a factor of 2." in done.stderr
 
 
 def test_targets_off_the_strip(tmp_path, ground):
@@ -116,7 +117,7 @@ def test_targets_off_the_strip(tmp_path, ground):
     targets.write_text(f"reflectance,x,y,radius\n0.2,{EAST + 9e5},{NORTH},40\n")
     done = call("calibrate", ground, "--targets", targets, "-o", tmp_path / "cal.toml")
     assert done.exit_code == 1
-    assert "no target has 10 clean single echoes (target 1: 0 echoes)" in done.stderr
+    assert "no target gives a constant (target 1: 0 clean single echoes, 10 are needed)" in done.stderr
     assert not (tmp_path / "cal.toml").exists()
 
 

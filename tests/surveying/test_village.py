@@ -12,7 +12,7 @@ from helpers_scenes import make_scene
 from wavebatch.cli import main
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.surveying import survey_block
-from wavebatch.surveying.flat_ground import measure_level
+from wavebatch.surveying.flat_ground import Slopes, measure_reference
 from wavebatch.tools.simulate import find_scene, simulate_strip
 from wavebatch.tools.simulate.blocks import simulate_seed_block
 from wavebatch.tools.simulate.geometry import AIR_SPEED, GROUND, NORTH, START_TIME, Flight, trace_rays
@@ -133,18 +133,21 @@ def test_level_ground_is_told_from_the_swath(half_angle):
     surveyed = replace(survey_block(block).system, divergence=SCENE.divergence)
     true = SCENE.recording.pulse.sigma
     assert surveyed.sigma_ref / true > 1.005
-    seen = measure_level([block], surveyed, block.spacing)
+    known = Slopes(block, made.rays.incidence, np.full(len(block), np.radians(0.3)))
+    seen = measure_reference([known], surveyed, block.spacing).system
     assert np.sqrt(seen.sigma_ref**2 + seen.level_variance) == pytest.approx(true, rel=0.002)
     assert seen.width_scatter < 0.01 * true
 
 
-def test_level_ground_that_nobody_sees_changes_nothing():
+def test_a_reference_that_no_surface_shows_is_no_reference():
     block = simulate_seed_block(make_scene("empty"), 1, 0).block
     system = SystemPulse(2.0, divergence=0.5)
-    assert measure_level([block], system, 1.0) is system
+    unknown = Slopes(replace(block, sensor=block.origin), *np.full((2, len(block)), np.nan))
+    for samples in ([], [unknown], [unknown._replace(block=block)]):
+        seen = measure_reference(samples, system, 1.0)
+        assert np.isinf(seen.system.level_error) and seen.divergence is None and seen.echoes == 0
     blind = replace(system, divergence=None)
-    assert measure_level([replace(block, sensor=block.origin)], blind, 1.0) is blind
-    assert measure_level([], system, 1.0) is system
+    assert measure_reference([unknown], blind, 1.0).system == blind
 
 
 def test_survey_says_what_angles_the_beam_tells(village):

@@ -12,6 +12,8 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.surveying import survey_blocks
+from wavebatch.surveying.choose_chain import read_sample
 from wavebatch.tools.compare import chains
 from wavebatch.tools.compare.chains import ChainRun, Contender, find_contender, match_chains, match_sides
 from wavebatch.tools.compare.clouds import compare_clouds
@@ -65,7 +67,7 @@ def test_two_chains_as_a_loop_over_waveforms_finds_it(mixed, monkeypatch):
     sides = find_contender("fast"), find_contender("accurate")
     result = match_sides(mixed / "s.las", *sides)
     with StripReader(mixed / "s.las") as reader, reader.scan() as scan:
-        system = chains.survey_blocks(chains.read_sample(reader, scan)).system
+        system = survey_blocks(read_sample(reader, scan)).system
         ((block, _),) = list(reader.read_blocks(reader.read_unit(0, scan), 5000, owned_only=True))
     a, b = (side.chain.run(block, system) for side in sides)
     differences, exact, counts = [], 0, ({}, {})

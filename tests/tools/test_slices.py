@@ -92,6 +92,43 @@ def test_facets_are_found_with_their_slope_and_place(strip):
         assert line.point[segment.first_pulse] == segment.first_point
 
 
+def fly_over(height, rng, step, half=40.0, altitude=600.0):
+    """A scan line over a surface of the given height(place) [m], pulses `step` m apart, scatter 2 cm."""
+    place = np.arange(-half, half, step)
+    n, count = len(place), 80
+    angle = np.arctan(place / altitude)
+    direction = 0.149896 * np.stack([np.sin(angle), np.zeros(n), -np.cos(angle)], axis=1)
+    ground = np.stack([place, np.zeros(n), height(place) + 0.02 * rng.standard_normal(n)], axis=1)
+    time = 30 + rng.uniform(-5, 5, n)
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = 60 * np.exp(-0.5 * ((sample - time[row]) / 2.0) ** 2) + rng.standard_normal(n * count)
+    origin = ground - direction * time[:, None]
+    figures = (1.0, row, sample.astype(float), np.round(value).astype(np.float32))
+    return ScanLine(0, np.arange(n), np.arange(n) * 1e-5, origin, direction, *figures)
+
+
+@pytest.mark.parametrize("degrees", [3, 8, 20])
+@pytest.mark.parametrize("step", [0.3, 1.0])
+def test_a_shallow_gable_is_two_slopes(degrees, step):
+    """Both slopes lie within the band of one line through them: it was level, or of a slope between."""
+    rise = np.tan(np.radians(degrees))
+    line = fly_over(lambda x: np.where(np.abs(x) < 6, 5 + rise * (6 - np.abs(x)), 0), np.random.default_rng(1), step)
+    options = SliceOptions()
+    roof = [s for s in find_segments(cut_slice(line, options), options) if min(s.start[2], s.end[2]) > 3]
+    assert sorted(s.slope for s in roof) == pytest.approx([-degrees, degrees], abs=0.5)
+    for segment in roof:
+        assert segment.residual < 0.04 and segment.length > 3.9
+        assert max(segment.start[0], segment.end[0]) < 0.6 or min(segment.start[0], segment.end[0]) > -0.6
+
+
+@pytest.mark.parametrize("bend", [lambda x: -(x**2) / 2000, lambda x: 0.1 * np.sin(x / 3), lambda x: 0.15 * (x > 0)])
+def test_a_hill_a_wave_and_a_step_stay_one_line(bend):
+    options = SliceOptions()
+    line = fly_over(bend, np.random.default_rng(2), 0.5)
+    (segment,) = find_segments(cut_slice(line, options), options)
+    assert segment.length > 78
+
+
 def test_time_geometry_finds_a_line_over_pulses_and_places_it_in_space():
     n, count, spacing = 200, 80, 0.5
     row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)

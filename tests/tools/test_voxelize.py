@@ -29,6 +29,7 @@ from wavebatch.tools.simulate.pulses import find_pulse
 from wavebatch.tools.simulate.render import Recording
 from wavebatch.tools.simulate.strip import WKT, StripOptions
 from wavebatch.tools.voxels.ceiling import Ceiling
+from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.profile import Deconvolution, _pulse_taps, deconvolve_block
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
@@ -87,8 +88,8 @@ def load(path):
         return {name: file[name] for name in file}
 
 
-def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, **options):
-    settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed)
+def voxelize(strip, target, size, *, headroom=None, all_crossed=False, deconvolution=None, ratio=None, **options):
+    settings = VoxelOptions(size, deconvolution or Deconvolution(), headroom, all_crossed, reflectance_ratio=ratio)
     summary = voxelize_strip(strip, target, settings, system=options.pop("system", SAVED), force=True, **options)
     return summary, load(target) if target.suffix == ".npz" else laspy.read(target)
 
@@ -500,7 +501,8 @@ def test_voxels_too_small_for_the_strip_are_one_line(forest, tmp_path):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"size": 0.0}, {"size": -1.0}, {"size": float("nan")}, {"size": 1e9}, {"headroom": -1.0}, {"headroom": np.inf}],
+    [{"size": 0.0}, {"size": -1.0}, {"size": float("nan")}, {"size": 1e9}, {"headroom": -1.0}, {"headroom": np.inf},
+     {"ground_height": -1.0}, {"reflectance_ratio": 0.0}, {"reflectance_ratio": float("nan")}],
 )
 def test_wrong_sizes_are_refused(wrong):
     with pytest.raises(ConfigError):
@@ -539,6 +541,85 @@ def test_a_strip_without_any_signal_gives_no_voxel(tmp_path):
         summary, found = voxelize(strip, tmp_path / target, 1.0)
         assert summary.voxels == summary.with_signal == 0 and summary.waveforms == 20 and summary.shape == (0, 0, 0)
         assert len(found["energy"]) == 0
+
+
+def write_canopy(path, rng, *, leaf, soil, slope=0.0, n=900, full=180.0, layers=(109.3,)):
+    """Leaves in layers above a plane; each pulse leaves a part of its light to the ground. Returns that part's mean."""
+    xy = rng.uniform(0, 30, (n, 2))
+    ground = 100.0 + np.tan(np.radians(slope)) * xy[:, 0]
+    left, echoes = np.ones(n), [[] for _ in range(n)]
+    energy = full * np.exp(0.05 * rng.standard_normal(n))
+    for layer in layers:
+        taken = left * (1 - rng.beta(1.5, 1.0, n))
+        for row in range(n):
+            echoes[row].append((layer + ground[row] - 100.0, energy[row] * leaf * taken[row] / 0.5))
+        left = left - taken
+    for row in range(n):
+        echoes[row].append((ground[row], energy[row] * soil * left[row] / 0.5))
+    write_strip(path, [[one for one in some if one[1] > 4] for some in echoes], height=ground + 14.0, xy=xy, seed=3)
+    return left.mean()
+
+
+@pytest.mark.parametrize(("leaf", "soil"), [(0.5, 0.15), (0.3, 0.3), (0.15, 0.5)])
+@pytest.mark.parametrize("slope", [0.0, 20.0])
+def test_gap_probability_does_not_depend_on_what_leaf_and_ground_reflect(tmp_path, leaf, soil, slope):
+    """Signal from leaf and ground counted alike: .41 for .61 at .5 over .15."""
+    true = write_canopy(tmp_path / "s.las", np.random.default_rng(4), leaf=leaf, soil=soil, slope=slope)
+    summary, found = voxelize(tmp_path / "s.las", tmp_path / "v.npz", 2.0)
+    assert summary.reflectance_ratio_source == "strip"
+    assert abs(summary.reflectance_ratio - leaf / soil) < 2 * summary.reflectance_ratio_err < 0.3 * leaf / soil
+    assert json.loads(str(found["meta"]))["reflectance_ratio"]["source"] == "strip"
+    caught = found["share"] * found["light"].astype(float)
+    x, z = ((found["origin"][axis] + 2.0 * (found["index"][:, axis] + 0.5)) for axis in (0, 2))
+    high = z - np.tan(np.radians(slope)) * x - 100.0 > 5.0
+    assert 1 - caught[high].sum() / summary.with_signal == pytest.approx(true, abs=0.03)
+    plain, alike = voxelize(tmp_path / "s.las", tmp_path / "w.npz", 2.0, ratio=1.0)
+    assert plain.reflectance_ratio_source == "given" and plain.energy == summary.energy
+    np.testing.assert_array_equal(alike["energy"], found["energy"])
+    wrong = 1 - (alike["share"] * alike["light"].astype(float))[high].sum() / plain.with_signal
+    assert abs(wrong - true) > 0.1 or leaf == soil
+
+
+def test_where_nothing_shows_the_ratio_it_is_one_and_said(tmp_path):
+    strip = write_strip(tmp_path / "same.las", [[(109.0, 60.0), (100.0, 40.0)]] * 300)
+    assert voxelize(strip, tmp_path / "a.npz", 1.0)[0].reflectance_ratio_source == "assumed"
+    few = write_strip(tmp_path / "few.las", [[(109.0, 20.0 + i), (100.0, 90.0 - i)] for i in range(60)])
+    assert voxelize(few, tmp_path / "b.npz", 1.0)[0].reflectance_ratio_source == "assumed"
+    bare = write_strip(tmp_path / "bare.las", [[(100.0, 40.0)]] * 300)
+    summary, _ = voxelize(bare, tmp_path / "c.npz", 1.0)
+    assert (summary.reflectance_ratio_source, summary.reflectance_ratio) == ("no canopy", 1.0)
+
+
+def test_light_is_normalised_by_range(tmp_path):
+    """Leaves 60 m and ground 80 m below the sensor: without it, the share of the leaves is .64 for .5."""
+    canopy, ground, n = 120.0, 100.0, 60
+    near, far = 180.0 - canopy, 180.0 - ground
+    pairs = [(canopy, 50.0 / near**2 * far**2), (ground, 50.0)]
+    strip = write_strip(tmp_path / "s.las", [pairs] * n, height=122.0, xy=np.full((n, 2), 0.5))
+    request = SensorRequest(height=80.0)
+    _, found = voxelize(strip, tmp_path / "v.npz", 1.0, calibration=CALIBRATION, sensor=request, ratio=1.0)
+    z = found["origin"][2] + found["index"][:, 2]
+    share = (found["share"] * found["light"])[np.abs(z - canopy) < 3].sum() / n
+    assert share == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("most", [20, 1 << 18])
+def test_the_floor_is_the_ground_below_plants(monkeypatch, most):
+    monkeypatch.setattr("wavebatch.tools.voxels.floor.MOST_CELLS", most)
+    rng = np.random.default_rng(5)
+    xyz = rng.uniform(0, 60, (6000, 3)) * [1, 1, 0]
+    ground = 0.3 * xyz[:, 0] - 0.1 * xyz[:, 1] + 0.05 * rng.standard_normal(6000)
+    xyz[:, 2] = ground + np.where(rng.random(6000) < 0.7, rng.uniform(1, 20, 6000), 0)
+    floor = Floor(np.array([30.0, 30.0, 0.0]))
+    for part in (xyz[:2000], xyz[2000:2001], xyz[2001:], np.array([[np.nan, 0, 1], [1e300, 0, 1], [0, 0, np.inf]])):
+        floor.add(part)
+    floor.finish()
+    place = rng.uniform(5, 55, (500, 3))
+    height = floor.measure_height(place)
+    off = height - (place[:, 2] - 0.3 * place[:, 0] + 0.1 * place[:, 1])
+    assert np.abs(np.median(off)) < 0.15 and np.quantile(np.abs(off), 0.95) < 0.4
+    assert np.isinf(floor.measure_height(np.array([[1e6, 0, 0], [np.nan, 0, 0]]))).all()
+    assert np.isinf(Floor(np.zeros(3)).finish().measure_height(place)).all()
 
 
 def test_32_bit_samples_do_not_overflow(tmp_path):

@@ -166,7 +166,10 @@ class RunReport:
                 **{name: self.count(name) for name in COUNTS},
                 "passed_through": {name: self.passed_through.get(name, 0) for name in _PASSED},
                 "flags": {flag.name: self.flags.get(flag.name, 0) for flag in EchoFlag},
-                "no_data": {column: dict(reasons) for column, reasons in self.no_data.items()},
+                "no_data": {
+                    column: {name: number for name, number in reasons.items() if number}
+                    for column, reasons in self.no_data.items()
+                },
             },
             "remarks": list(self.remarks),
             "quality": {

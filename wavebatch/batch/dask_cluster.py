@@ -8,33 +8,46 @@ is lost must end the run with a message, never hang it.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import logging
-import os
 import pickle
 import platform
 import socket
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, InvalidStateError, wait
 from pathlib import Path
 from typing import Any
 
 from wavebatch.batch.processes import settle
+from wavebatch.batch.worker_check import (
+    compare_workers,
+    describe_worker,
+    list_sizes,
+    travelling_call,
+    travelling_versions,
+)
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.disk.publish import reporting
+from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 PATIENCE = 60.0
 """Seconds without a worker, or without an answer of the scheduler, after which a cluster counts as lost."""
-_CONNECT = 10.0
-"""Seconds to wait for a connection."""
+_CONNECT = 4.0
+"""Seconds to wait for a connection, and for the scheduler's first answer."""
+_WORKERS = 10.0
+"""Seconds to wait for the first worker."""
 _POLL = 5.0
 """Seconds between two questions to the scheduler."""
 _SAME = ("wavebatch", "numpy", "scipy")
 """Packages that must have one version everywhere, because results depend on them."""
+_SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
+"""Kinds of addresses that dask knows and that other machines can have."""
+_MISFIT = "misfit"
+"""Answer of a worker that joined later and does not fit."""
 _LOUD = ("distributed", "distributed.client", "distributed.core", "distributed.utils_perf", "tornado", "asyncio")
 _ADVICE = "check that it runs, and run again with --resume: finished clouds are complete"
 
@@ -48,6 +61,10 @@ class Cluster:
         Of the scheduler.
     folder : Path
         Of the outputs; temporary files that workers share lie in it.
+    files : sequence of Path
+        That all workers must see: strips and trajectories.
+    tell : callable, optional
+        Called with the events of `run_batch`: here, of a worker that joins and does not fit.
 
     Raises
     ------
@@ -57,8 +74,18 @@ class Cluster:
 
     is_remote = True
 
-    def __init__(self, address: str, folder: Path) -> None:
-        self.address, self._folder = address, folder.absolute()
+    def __init__(
+        self,
+        address: str,
+        folder: Path,
+        files: Sequence[Path] = (),
+        tell: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.address, self._folder, self._files = address, folder.absolute(), files
+        self._tell = tell or (lambda event: None)
+        self._kind: dict[str, str] = {}
+        self._misfits: set[str] = set()
+        """Workers that get no call."""
         self.limit = 2
         self._client: Any = None
         self._scratch: Path | None = None
@@ -75,7 +102,7 @@ class Cluster:
             self._check_versions()
             with reporting(self._folder):
                 self._folder.mkdir(parents=True, exist_ok=True)
-            self._check_folder()
+            self._check_files()
             self._scratch = stack.enter_context(owning_scratch(self._folder))
             self._stack = stack.pop_all()
         return self
@@ -85,12 +112,28 @@ class Cluster:
 
     def submit(self, function: Callable, *arguments: Any) -> Future:
         """Return the future result of `function(*arguments)`; both must be picklable."""
+        call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
+        return _Promise(functools.partial(self._send, call), self._translate, self._put_aside)
+
+    def _send(self, call: bytes) -> Any:
+        """Give the pickled call to a worker; the remote future."""
         try:
-            call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
-            remote = self._client.submit(_travelling_call(), call, pure=False)
+            chosen = {}
+            if self._misfits:
+                chosen = {"workers": [worker for worker in self._client.nthreads() if worker not in self._misfits]}
+                if not chosen["workers"]:
+                    raise ValueError("no worker fits")
+            return self._client.submit(travelling_call(), call, self._kind, pure=False, **chosen)
         except Exception as error:
             raise self._lost(error) from error
-        return _Promise(remote, self._translate)
+
+    def _put_aside(self, worker: str, kind: dict[str, str]) -> None:
+        """Take note of a worker that does not fit; it gets no further call."""
+        if worker not in self._misfits:
+            self._misfits.add(worker)
+            why = compare_workers(self._kind, kind)
+            line = f"worker {worker} {why}; it gets no work"
+            self._tell({"event": "worker", "strip": self.address, "warning": line})
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those done; BrokenExecutor where the cluster is lost."""
@@ -109,7 +152,7 @@ class Cluster:
 
     def _count_threads(self) -> int:
         try:
-            self._client.wait_for_workers(1, timeout=_CONNECT)
+            self._client.wait_for_workers(1, timeout=_WORKERS)
         except Exception as error:
             raise ConfigError(f"--scheduler {self.address}: has no workers; start some: dask worker ADDRESS") from error
         return sum(self._client.nthreads().values())
@@ -118,10 +161,14 @@ class Cluster:
         """Raise ConfigError where a worker has another version of Python or of a package that results depend on."""
         version = platform.python_version
         self._compare("python", version(), self._ask(version), lambda text: text.split(".")[:2])
-        find_versions = _travelling_versions()
+        find_versions = travelling_versions()
         here, there = find_versions(_SAME), self._ask(find_versions, _SAME)
         for name in _SAME:
             self._compare(name, here[name], {worker: found.get(name) for worker, found in there.items()})
+        self._kind = describe_worker()
+        for worker, kind in sorted(self._ask(describe_worker).items()):
+            if why := compare_workers(self._kind, kind):
+                raise ConfigError(f"--scheduler {self.address}: worker {worker} {why}")
 
     def _compare(self, name: str, mine: str, theirs: dict[str, Any], part: Callable = str) -> None:
         for worker, found in sorted(theirs.items()):
@@ -132,13 +179,23 @@ class Cluster:
                     "so that the result is the same"
                 )
 
-    def _check_folder(self) -> None:
-        for worker, seen in sorted(self._ask(os.path.isdir, str(self._folder)).items()):
-            if not seen:
-                raise ConfigError(
-                    f"--scheduler {self.address}: worker {worker} does not see {self._folder}; strips and outputs must "
-                    "lie on a file system that all workers share, under the same names"
-                )
+    def _check_files(self) -> None:
+        """Raise ConfigError where a worker does not see a strip, or sees another folder of the same name."""
+        shared = (
+            "strips and outputs must lie on a file system that all workers share, under the same names, and they must "
+            "be the same files"
+        )
+        with Draft(self._folder / "workers", overwrite=False) as token:  # never published
+            token.file.write(b"seen")
+            token.file.flush()
+            files = [str(file) for path in self._files for file in _with_packets(path.absolute())]
+            files.append(str(token.path))
+            here = list_sizes(files)
+            for worker, there in sorted(self._ask(list_sizes, files).items()):
+                lost = [file for file, mine, theirs in zip(files, here, there, strict=True) if mine != theirs]
+                if lost:
+                    what = f"{self._folder}" if lost == files[-1:] else lost[0]
+                    raise ConfigError(f"--scheduler {self.address}: worker {worker} does not see {what}; {shared}")
 
     def _ask(self, function: Callable, *arguments: Any) -> dict[str, Any]:
         """The answer of each worker."""
@@ -166,17 +223,28 @@ class Cluster:
 
 
 class _Promise(Future):
-    """A remote future with the interface of concurrent.futures."""
+    """A remote future with the interface of concurrent.futures; its call goes on to another worker from a misfit."""
 
-    def __init__(self, remote: Any, translate: Callable[[BaseException], BaseException]) -> None:
+    def __init__(
+        self,
+        send: Callable[[], Any],
+        translate: Callable[[BaseException], BaseException],
+        put_aside: Callable[[str, dict[str, str]], None],
+    ) -> None:
         super().__init__()
-        self._remote, self._translate = remote, translate
-        remote.add_done_callback(self._take)
+        self._send, self._translate, self._put_aside = send, translate, put_aside
+        self._remote = send()
+        self._remote.add_done_callback(self._take)
 
     def _take(self, remote: Any) -> None:
         with contextlib.suppress(InvalidStateError):
             try:
                 result, error = pickle.loads(remote.result())
+                if error == _MISFIT:
+                    self._put_aside(*result)
+                    self._remote = self._send()
+                    self._remote.add_done_callback(self._take)
+                    return
             except BaseException as failure:
                 result, error = None, self._translate(failure)
             if error is None:
@@ -201,52 +269,6 @@ def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
         use_scratch(None)
 
 
-def _travelling_call() -> Callable[[bytes], bytes]:
-    """A function that makes a pickled call and pickles (result, error).
-
-    It is sent as code, calls and results as bytes: the scheduler unpickles all else, and may lack wavebatch.
-    """
-
-    def call(pickled: bytes) -> bytes:
-        import pickle
-        import traceback
-
-        try:
-            function, arguments = pickle.loads(pickled)
-            return pickle.dumps((function(*arguments), None), pickle.HIGHEST_PROTOCOL)
-        except Exception as error:
-            error.add_note(traceback.format_exc())
-            return pickle.dumps((None, error))
-
-    return call
-
-
-def _travelling_versions() -> Callable[[tuple[str, ...]], dict[str, str]]:
-    """A function that finds the versions of installed packages, and for wavebatch a checksum of its files.
-
-    It is sent as code: a worker may lack wavebatch.
-    """
-
-    def find_versions(names: tuple[str, ...]) -> dict[str, str]:
-        import importlib
-        import pathlib
-        import zlib
-
-        found = {}
-        for name in names:
-            try:
-                package = importlib.import_module(name)
-            except ImportError:
-                continue
-            found[name] = package.__version__
-            if name == "wavebatch":
-                files = sorted(pathlib.Path(package.__file__).parent.rglob("*.py"))
-                found[name] += f" (files {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x})"
-        return found
-
-    return find_versions
-
-
 @contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
     """A client of the cluster; ConfigError where it cannot be reached."""
@@ -255,7 +277,7 @@ def _connected(address: str) -> Iterator[Any]:
     try:
         _knock(address)
         options = {"timeout": _CONNECT, "set_as_default": False, "name": "wavebatch"}
-        client = _call_in_time(2 * _CONNECT, lambda: Client(address, **options))
+        client = _call_in_time(_CONNECT + 0.5, lambda: Client(address, **options))
     except Exception as error:
         raise ConfigError(
             f"--scheduler {address}: cannot be reached: {_one_line(error)}; give the address that dask scheduler prints"
@@ -270,8 +292,8 @@ def _connected(address: str) -> Iterator[Any]:
 def _knock(address: str) -> None:
     """Raise OSError or ValueError where no scheduler listens; a client that fails can hang and leave threads."""
     scheme, separator, place = address.rpartition("://")
-    if separator and scheme not in ("tcp", "tls"):
-        return
+    if separator and scheme not in _SCHEMES:
+        raise ValueError(f"no scheduler has an address of the kind {scheme}://; known are {', '.join(_SCHEMES)}")
     host, _, port = place.rpartition(":")
     if not host or not port.isdigit():
         raise ValueError("it has no host and port")
@@ -302,6 +324,11 @@ def _silent() -> Iterator[None]:
         finally:
             for name, level in levels.items():
                 logging.getLogger(name).setLevel(level)
+
+
+def _with_packets(path: Path) -> list[Path]:
+    """The strip, and the packet file beside it."""
+    return [path, *(file for file in (path.with_suffix(".wdp"), path.with_suffix(".WDP")) if file.exists())]
 
 
 def _one_line(reason: object) -> str:

@@ -31,12 +31,16 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
     "backscatter_coefficient": (NoData.NOT_CALIBRATED,),
     "cross_section": (NoData.NOT_CALIBRATED, NoData.NO_DIVERGENCE),
     "reflectance": (NoData.NOT_CALIBRATED,),
+    "level_reflectance": (NoData.NOT_CALIBRATED,),
     _ANGLE: (NoData.NO_DIVERGENCE,),
 }
 """Physical columns, and what each needs besides the sensor's position."""
 
-LEAST_DOUBT = 2.0
-"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
+FASTEST = 120.0
+"""Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
+
+MOST_GAPS = 3
+"""Most gaps of a trajectory that a remark lists."""
 
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
@@ -52,9 +56,13 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     -------
     tuple of str
         One line each: a column that no echo has, with the commonest reason and its remedy; angles that the beam can
-        hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors.
+        hardly measure; waveforms and returns that do not fit together; a trajectory that contradicts the vectors, or
+        that does not cover the strip.
     """
-    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report), *_doubt_trajectory(prepared.sensor)]
+    lines = [*prepared.scan.notes, *_doubt_waveforms(prepared, report)]
+    lines += filter(None, [prepared.sensor.doubt()])
+    lines += _find_gaps(prepared.sensor, report.no_data)
+    lines += _doubt_units(prepared)
     lines += _name_height(prepared)
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
@@ -136,15 +144,36 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
         )
 
 
-def _doubt_trajectory(sensor: SensorSource) -> Iterator[str]:
-    """A trajectory that contradicts the packet vectors."""
-    if sensor.farther is not None and abs(sensor.farther) > max(LEAST_DOUBT, 5.0 * sensor.vectors_error):
-        which = "farther" if sensor.farther > 0 else "nearer"
+def _doubt_units(prepared: Prepared) -> Iterator[str]:
+    """An aircraft that is too fast: its strip may be in feet without saying so."""
+    facts = dict(prepared.sensor.facts)
+    named = any(unit.horizontal is not None or unit.kind is not None for unit in prepared.facts.units)
+    if prepared.sensor.kind != "trajectory" and not named and facts.get("speed_m_s", 0.0) > FASTEST:
         yield (
-            f"range: by the trajectory echoes are {abs(sensor.farther):.1f} m {which} than by the packets' vectors, "
-            f"whose error is {sensor.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
-            "the ellipsoid?"
+            f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
+            f"{facts['height_m']:.0f} m above the points; no CRS says so: are they in feet? Then ranges are 3.28 times "
+            "too long: project the strip to metres"
         )
+
+
+def _find_gaps(sensor: SensorSource, no_data: Mapping[str, Mapping[str, int]]) -> Iterator[str]:
+    """Echoes at times for which there is no position of the sensor, while others have one."""
+    missing = {column: counts.get(NoData.NO_SENSOR.name, 0) for column, counts in no_data.items()}
+    columns = [name for name, number in sorted(missing.items()) if 0 < number < sum(no_data[name].values())]
+    if not columns:
+        return
+    worst = max(columns, key=lambda name: missing[name])
+    number, total = missing[worst], sum(no_data[worst].values())
+    facts = dict(sensor.facts)
+    reason, remedy = "rays from which the sensor's position follows are missing there", "give --trajectory"
+    if sensor.kind == "trajectory":
+        gaps = facts.get("gaps_s", [])
+        times = [f"{begin:.2f} to {end:.2f} s" for begin, end in gaps[:MOST_GAPS]]
+        times += [f"{len(gaps) - MOST_GAPS} more"] * (len(gaps) > MOST_GAPS)
+        reason, remedy = f"{facts['file']} has no position there", "give a trajectory that covers the strip"
+        if times:
+            reason += f" ({100 * (1 - facts['share_covered']):.2g} % of the strip's time: {', '.join(times)})"
+    yield f"{', '.join(columns)}: {number} of {total} echoes have none: {reason}; {remedy}"
 
 
 def explain_absence(prepared: Prepared) -> dict[str, str]:

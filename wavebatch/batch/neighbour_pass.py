@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.unit import unpack
+from wavebatch.batch.unit import list_carried, unpack
 from wavebatch.core.echoes import COLUMNS, RAY
 from wavebatch.core.no_data import NoData
 from wavebatch.files.cloud.layout import OutputLayout
@@ -73,14 +73,26 @@ class SecondPass:
         Of the cloud; rows that are added have `layout.extended(RAY)`.
     target : Path
         The cloud; temporary files lie next to it.
+    late : tuple of Step
+        Steps whose columns are completed from those of the second pass; rows that are added carry what they need.
     tile_points : int, optional
         TILE_POINTS by default; the result does not depend on it.
     """
 
-    def __init__(self, step: Step, layout: OutputLayout, target: Path, *, tile_points: int | None = None) -> None:
-        self._step, self._layout = step, layout
+    def __init__(
+        self,
+        step: Step,
+        layout: OutputLayout,
+        target: Path,
+        *,
+        late: tuple[Step, ...] = (),
+        tile_points: int | None = None,
+    ) -> None:
+        self._step, self._layout, self._late = step, layout, late
         self._tile_points = tile_points or TILE_POINTS
-        self._rows = RowStore(target, layout.extended(RAY).dtype)
+        self._carrying = layout.extended(list_carried(late))
+        self._completed = dict.fromkeys((step.stage.makes[0] for step in late), 0)
+        self._rows = RowStore(target, self._carrying.dtype)
         self._found = RowStore(target, _found_dtype(step))
         self._entries: Spool | None = None
         self._blob = b""
@@ -153,8 +165,10 @@ class SecondPass:
         for rows, found in zip(self._rows.pieces(), self._found.pieces(), strict=True):
             self._gaps += np.bincount(found["gap"], minlength=len(Gap))
             known = found["gap"] == Gap.KNOWN
+            values = {name: np.where(known, found[name], np.float32(np.nan)) for name in found.dtype.names[:-1]}
             for field, column in filled:
-                rows[field] = column.encode(np.where(known, found[column.column], np.float32(np.nan)))
+                rows[field] = column.encode(values[column.column])
+            self._complete(rows, values)
             plain = rows.view(np.uint8).reshape(len(rows), -1)[:, : final.itemsize]
             yield np.ascontiguousarray(plain).view(final)[:, 0]
 
@@ -162,7 +176,10 @@ class SecondPass:
         """Count the echoes by reason for RunReport.no_data, once all rows were read."""
         counts = {NoData[gap.name].name: int(self._gaps[gap]) for gap in Gap if gap != Gap.NO_RAY}
         counts[NoData.NO_RAY.name] = echoes - sum(counts.values())
-        return {self._found.dtype.names[0]: {name: number for name, number in counts.items() if number}}
+        counts = {name: number for name, number in counts.items() if number}
+        # The units counted these as echoes without an angle; counts of a strip are sums.
+        late = {name: {NoData.KNOWN.name: k, NoData.NO_ANGLE.name: -k} for name, k in self._completed.items() if k}
+        return {self._found.dtype.names[0]: counts, **late}
 
     def close(self) -> None:
         """Remove all temporary files; harmless twice."""
@@ -170,6 +187,21 @@ class SecondPass:
         self._found.close()
         if self._entries is not None:
             self._entries.close()
+
+    def _complete(self, rows: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        """Fill the columns of late steps into the rows; values: the columns of the second pass."""
+        layout, fields = self._carrying, {}
+        for field, column in zip(layout.extra_fields[len(layout.carried) :], layout.written, strict=True):
+            fields[column.column] = (field, column)
+        for step in self._late:
+            needed = {name: fields[name][0] for name in step.stage.makes if not COLUMNS[name].extra_bytes}
+            carried = {name: _decode(name, rows[field]) for name, field in needed.items()}
+            for name, found in step.stage.complete({**values, **carried}).items():
+                if name in self._completed:
+                    self._completed[name] += int(np.count_nonzero(np.isfinite(found)))
+                if name in fields:
+                    field, column = fields[name]
+                    rows[field] = column.encode(found)
 
     def _place(self, rows: np.ndarray) -> np.ndarray:
         return np.stack([rows[name] for name in "XYZ"], axis=1) * np.array(self._layout.source.header.scales)
@@ -249,6 +281,11 @@ def _list_entries(rows: np.ndarray, first: int) -> np.ndarray:
 def _reach(step: Step) -> float:
     """Width of a tile's buffer [m]: cells that the radius touches must be complete."""
     return step.effective()["radius"] * (1.0 + 2.0 / FINENESS)
+
+
+def _decode(name: str, values: np.ndarray) -> np.ndarray:
+    """Values of a temporary column, NaN where they are no-data."""
+    return np.where(values == np.float32(COLUMNS[name].no_data), np.float32(np.nan), values)
 
 
 def _found_dtype(step: Step) -> np.dtype:

@@ -20,8 +20,8 @@ from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight
 from wavebatch.surveying.system_file import SavedSurvey, load_survey
 
-LEAST_MEMORY = 300 << 20
-"""Bytes that one process needs with the smallest blocks."""
+LEAST_MEMORY = 350 << 20
+"""Bytes that one process needs with the smallest blocks: 320 MB for the survey of a strip of noise."""
 
 FULL_MEMORY = 500 << 20
 """Bytes that one process takes with full blocks."""

@@ -24,6 +24,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
@@ -76,7 +77,7 @@ class Workers:
         if self.jobs == 1:
             return settle(Future(), function, *arguments)
         self._workers = [worker for worker in self._workers if worker.serves]
-        with _single_threaded(), _ctrl_c_held():
+        with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
             while len(self._workers) < self.jobs:
                 self._workers.append(_Worker(self._calls, self._scratch))
         call = _Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))

@@ -26,6 +26,8 @@ from wavebatch.surveying.choose_chain import describe_choice, describe_survey
 from wavebatch.surveying.system_file import format_survey
 
 STRIP_SCHEMA = "wavebatch.strip-report/1"
+MOST_REPORT = 64 << 20
+"""Most bytes of a report that are read; 255 digitizers take less than one."""
 BATCH_SCHEMA = "wavebatch.batch-report/1"
 
 
@@ -55,6 +57,9 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
+    energy = job.pulse_energy
+    if energy is not None and Path(energy).is_file():
+        energy = take_fingerprint(Path(energy))
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {
@@ -66,6 +71,8 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
             "system": None if saved is None else hashlib.sha256(format_survey(saved).encode()).hexdigest(),
             "sensor": {**asdict(sensor), "trajectory": trajectory},
             "calibration": None if job.calibration is None else job.calibration.describe(),
+            "attenuation_db_km": None if job.attenuation is None else list(job.attenuation),
+            "pulse_energy": energy,
             **flight,
         },
     }
@@ -82,8 +89,19 @@ def describe_strip(prepared: Prepared, described: Mapping[str, Any]) -> dict[str
     return {
         "direction": {"sign": vectors.direction, "evidence": vectors.evidence, "vector_ratio": ratio},
         "sensor": prepared.sensor.describe(),
+        "air": _describe_air(prepared),
+        "pulse_energy": None if prepared.pulse_energy is None else prepared.pulse_energy.describe(),
+        "calibration": None if prepared.job.calibration is None else prepared.job.calibration.describe(),
         **seen,
     }
+
+
+def _describe_air(prepared: Prepared) -> dict[str, Any]:
+    """Attenuation that the columns of light use, its error, and where it comes from."""
+    job, system = prepared.job, prepared.system
+    given = "the default, for which there is no source" if job.calibration is None else "the calibration"
+    source = given if job.attenuation is None else "--attenuation or --visibility"
+    return {"attenuation_db_km": system.attenuation, "error_db_km": system.attenuation_error, "from": source}
 
 
 def describe_chain(prepared: Prepared) -> dict[str, Any]:
@@ -124,7 +142,7 @@ def build_document(
     """
     facts, layout = prepared.facts, prepared.layout
     packets, file, stored = facts.packets, facts.packets.file, facts.packets.end - facts.packets.start
-    return {
+    found = {
         "schema": STRIP_SCHEMA,
         **described,
         **describe_chain(prepared),
@@ -146,9 +164,21 @@ def build_document(
             "not_computed": explain_absence(prepared),
         },
         **report.to_json(),
-        "warnings": [*serious, *facts.warnings, *prepared.scan.warnings, *map(": ".join, dropped.items())],
-        "timing": build_timing(report),
+        "warnings": [
+            *serious,
+            *facts.warnings,
+            *prepared.scan.warnings,
+            *prepared.doubts,
+            *map(": ".join, dropped.items()),
+        ],
     }
+    return {**found, "checksum": _sum_up(found), "timing": build_timing(report)}
+
+
+def _sum_up(document: Mapping[str, Any]) -> str:
+    """The checksum of a report without its timing: --resume believes no figure that was altered."""
+    figures = {key: value for key, value in document.items() if key not in ("timing", "checksum")}
+    return hashlib.sha256(format_json(json.loads(json.dumps(figures))).encode()).hexdigest()
 
 
 def build_timing(report: RunReport) -> dict[str, Any]:
@@ -187,8 +217,13 @@ def read_current(job: StripJob, folder: Path, described: Mapping[str, Any]) -> R
     RunReport or None
         None where the cloud must be made.
     """
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        document = json.loads(report_path(job, folder).read_text("utf-8"))
+    # Whatever is wrong with a report, the cloud is made anew.
+    wrong = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RecursionError)
+    with contextlib.suppress(*wrong):
+        with open(report_path(job, folder), "rb") as file:
+            document = json.loads(file.read(MOST_REPORT))
+        if document["checksum"] != _sum_up(document):
+            return None
         cloud = cloud_path(job, folder)
         same = document["schema"] == STRIP_SCHEMA and all(
             document[key] == json.loads(json.dumps(value)) for key, value in described.items()

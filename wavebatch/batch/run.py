@@ -102,7 +102,8 @@ def run_batch(
     jobs : sequence of StripJob
     options : BatchOptions
     on_event : callable, optional
-        Called with a dictionary for each event; its key `event` is flight, start, unit, written, skipped or failed.
+        Called with a dictionary for each event; its key `event` is flight, worker (one that does not fit),
+        start, unit, written, skipped or failed.
         `again` in a failure means that the same cause was reported for another strip before. `strip` of the event
         flight is the file of the flight's survey.
 
@@ -121,7 +122,9 @@ def run_batch(
     start = time.perf_counter()
     check_outputs(jobs, options)
     saved = load_flight(jobs, options)
-    workers = Cluster(options.scheduler, options.folder) if options.scheduler else Workers(options.jobs)
+    workers: Workers | Cluster = Workers(options.jobs)
+    if options.scheduler is not None:
+        workers = Cluster(options.scheduler, options.folder, find_inputs(jobs), on_event)
     with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
@@ -289,5 +292,5 @@ class _Batch:
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             more["serious"] = list(strip.serious)
             if strip.prepared is not None:
-                more["sensor"] = strip.prepared.sensor.describe()
+                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": list(strip.prepared.doubts)}
             self._tell({**event, **more})

@@ -173,7 +173,7 @@ class StripTask:
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
         if prepared.second_step is not None:
-            self._second = SecondPass(prepared.second_step, prepared.layout, cloud)
+            self._second = SecondPass(prepared.second_step, prepared.layout, cloud, late=prepared.late_steps)
 
     def _fill(self) -> None:
         """Write the rows that waited for the second pass."""

@@ -23,18 +23,24 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.angle_limits import angle_parameters, sample_level
+from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
-from wavebatch.surveying.calibration import Calibration, needs_sensor, with_physics, with_stages
+from wavebatch.surveying.calibrating.strip_match import match_strip
+from wavebatch.surveying.calibration import Calibration, needs_sensor, with_columns, with_physics
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
+from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
 from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
 """Samples of a block by default: a unit of 50,000 waveforms of 80. Smaller blocks are slower: NumPy's cost per call."""
+
+USUAL_SAMPLES = 256
+"""Waveforms of more samples than this count several times where --block-size is given."""
 
 LARGEST_HEIGHT_ERROR = 0.3
 """Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
@@ -74,28 +80,38 @@ class StripJob:
     sensor: SensorRequest = SensorRequest()
     """Where the sensor's positions come from; used only if the chain needs them."""
     calibration: Calibration | None = None
-    added: tuple[str, ...] = ()
-    """Stages that make columns of --columns which no shipped chain computes."""
+    attenuation: tuple[float, float] | None = None
+    """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
+
+    pulse_energy: str | None = None
+    """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
 
     def extend(self, chain: Chain) -> Chain:
-        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and `added`."""
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
+        columns that are asked for.
+        """
         sources = (self.calibration, self.request.system and self.request.system.survey.system)
         divergence = any(source is not None and source.divergence is not None for source in sources)
         given = self.sensor != SensorRequest()
-        calibrated = self.calibration is not None
-        return with_stages(
-            with_physics(chain, sensor=given, calibrated=calibrated, divergence=divergence), self.added
-        )
+        chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        return with_columns(chain, self.options.columns)
 
     def calibrate(self, system: SystemPulse) -> SystemPulse:
-        """Return the system pulse with the job's calibration, if it has one."""
-        return system if self.calibration is None else self.calibration.apply(system)
+        """Return the system pulse with the job's calibration and air, if it has them."""
+        system = system if self.calibration is None else self.calibration.apply(system)
+        if self.attenuation is None:
+            return system
+        value, error = self.attenuation
+        return replace(system, attenuation=value, attenuation_error=error)
 
     def absolute(self) -> StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
         file = self.sensor.trajectory
         sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        return replace(self, path=self.path.absolute(), sensor=sensor)
+        energy = self.pulse_energy
+        if energy is not None and Path(energy).is_file():
+            energy = str(Path(energy).absolute())
+        return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
 
     def open(self) -> StripReader:
         """Open the strip; raises InputError where it cannot be read."""
@@ -118,6 +134,9 @@ class Prepared:
     sensor: SensorSource = UNKNOWN
     stranger: str = ""
     """Why the strip does not belong to its flight and got a survey of its own; empty where it does."""
+    pulse_energy: PulseEnergy | None = None
+    doubts: tuple[str, ...] = ()
+    """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
     forced: str = ""
     """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
 
@@ -129,13 +148,30 @@ class Prepared:
     @property
     def second_step(self) -> Step | None:
         """The step whose columns need a second pass over the strip's points; None where none of them is written."""
-        step = self.job.chain.second_step
-        return step if step is not None and set(step.stage.makes) & set(self.job.options.columns) else None
+        step, wanted = self.job.chain.second_step, set(self.job.options.columns)
+        return step if step is not None and (self.late_steps or set(step.stage.makes) & wanted) else None
+
+    @property
+    def late_steps(self) -> tuple[Step, ...]:
+        """Steps that complete written columns from those of the second pass."""
+        wanted = set(self.job.options.columns)
+        return tuple(step for step in self.job.chain.late_steps if set(step.stage.makes) & wanted)
 
     @property
     def row_layout(self) -> OutputLayout:
         """The layout of a unit's rows: that of the cloud, then the columns that a second pass needs."""
-        return self.layout if self.second_step is None else self.layout.extended(RAY)
+        return self.layout if self.second_step is None else self.layout.extended(list_carried(self.late_steps))
+
+
+def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
+    """Columns that rows carry for a second pass, and the cloud does not get: those of late steps, then the rays."""
+    hidden = (name for step in late for name in step.stage.makes if not COLUMNS[name].extra_bytes)
+    return (*hidden, *RAY)
+
+
+def name_columns(wanted: str | None) -> tuple[str, ...]:
+    """List the columns that a value of --columns names, in order."""
+    return tuple(entry.strip().removeprefix("+") for entry in (wanted or "").split(",") if entry.strip(" +"))
 
 
 def split_columns(wanted: str | None) -> list[str]:
@@ -243,15 +279,33 @@ def prepare_strip(job: StripJob) -> Prepared:
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
+            job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
             _hold_height(reader, job.sensor, sensor)
-            choice = _see_level(reader, scan, job, choice, sensor)
+            choice, more = _see_level(reader, scan, job, choice, sensor)
+            doubts += more
+            job = replace(job, chain=_set_radius(reader, scan, job.chain))
+            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             layout = plan_layout(job, facts)
             units = reader.unit_count()
         except BaseException:
             scan.close()
             raise
     timing = {"scan": scanned - start, "survey": surveyed - scanned, "sensor": time.perf_counter() - surveyed}
-    return Prepared(job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, forced)
+    prepared = Prepared(
+        job, facts, scan, units, choice, layout, RunReport(timing=timing), sensor, stranger, energy, doubts
+    )
+    return replace(prepared, forced=forced)
+
+
+def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
+    """The chain with a radius in place of one of 0, which means that the distance between the points decides."""
+    steps = [
+        replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+        if step.stage.second_pass is not None and step.effective()["radius"] == 0
+        else step
+        for step in chain.steps
+    ]
+    return replace(chain, steps=tuple(steps))
 
 
 def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSource) -> None:
@@ -277,18 +331,40 @@ def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str
     return "", check_saved(reader, scan, request.system.survey, force=request.force)
 
 
-def _see_level(reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource) -> Choice:
-    """The choice with the widths of level ground, where angles are computed and no saved survey has them."""
+def _fit_calibration(
+    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
+) -> tuple[StripJob, tuple[str, ...]]:
+    """The job with the calibration as it holds for this strip, and warnings; InputError where it does not fit."""
+    if job.calibration is None:
+        return job, ()
+    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain)
+    return replace(job, calibration=fitted.calibration), fitted.warnings
+
+
+def _see_level(
+    reader: StripReader, scan: StripScan, job: StripJob, choice: Choice, sensor: SensorSource
+) -> tuple[Choice, tuple[str, ...]]:
+    """The choice with the widths of surfaces that face the sensor, where angles are computed and no saved survey has
+    them; and what is doubtful about the beam."""
     parameters = angle_parameters(job.chain)
-    saved = job.request.system is not None and not job.request.flight
-    if parameters is None or sensor is UNKNOWN or saved:
-        return choice
     survey = choice.survey
+    saved = job.request.system is not None and not job.request.flight and survey.system.level_error is not None
+    if parameters is None or sensor is UNKNOWN or saved:
+        return choice, ()
     used = job.calibrate(survey.system)
     used = replace(used, divergence=parameters["divergence"] or used.divergence)
-    seen = sample_level(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
-    system = replace(survey.system, level_variance=seen.level_variance, width_scatter=seen.width_scatter)
-    return replace(choice, survey=replace(survey, system=system))
+    seen = sample_reference(reader, scan, sensor, used, survey.figures.get("spacing_ns", 0.0))
+    doubt = seen.doubt()
+    error = abs(seen.divergence / used.divergence - 1.0) if doubt else survey.system.divergence_error
+    system = replace(_take_reference(survey.system, seen.system), divergence_error=error)
+    return replace(choice, survey=replace(survey, system=system)), (doubt,) if doubt else ()
+
+
+def _take_reference(system: SystemPulse, seen: SystemPulse) -> SystemPulse:
+    """The system with the reference of angles, each digitizer with its own."""
+    others = {index: _take_reference(other, seen.digitizers[index]) for index, other in system.digitizers.items()}
+    names = ("level_variance", "level_error", "width_scatter")
+    return replace(system, digitizers=others, **{name: getattr(seen, name) for name in names})
 
 
 def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tuple[np.ndarray, RunReport]:
@@ -316,8 +392,8 @@ def process_unit(blob: bytes, number: int, block_size: int | None = None) -> tup
     with StripReader(prepared.facts) as reader:
         unit = reader.read_unit(number, prepared.scan)
         timing["read points"] = time.perf_counter() - start
-        blocks = reader.read_blocks(unit, block_size or _block_size(unit), owned_only=echoes_mode)
-        echoes = gather_echoes(unit, _run_blocks(prepared, _timed(blocks, timing, "read packets"), timing))
+        blocks = reader.read_blocks(unit, _block_size(unit, block_size), owned_only=echoes_mode)
+        echoes = gather_echoes(unit, _run_blocks(prepared, unit, _timed(blocks, timing, "read packets"), timing))
     start = time.perf_counter()
     assemble = assemble_echoes if echoes_mode else assemble_returns
     rows, report = assemble(unit, echoes, prepared.row_layout)
@@ -331,17 +407,22 @@ def unpack(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
-def _block_size(unit: Unit) -> int:
+def _block_size(unit: Unit, wanted: int | None) -> int:
+    """Waveforms of a block: as many as wanted, but fewer long ones, so that memory stays bounded."""
     longest = int(unit.packets.n_samples.max(initial=1))
-    return int(np.clip(BLOCK_SAMPLES // longest, 64, 65536))
+    most = max(min(BLOCK_SAMPLES // longest, 65536), 1)
+    return most if wanted is None else min(most, max(wanted * USUAL_SAMPLES // longest, 1), wanted)
 
 
 def _run_blocks(
-    prepared: Prepared, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
+    prepared: Prepared, unit: Unit, blocks: Iterable[tuple[WaveformBlock, np.ndarray]], timing: dict[str, float]
 ) -> Iterator[tuple[WaveformBlock, np.ndarray, EchoTable]]:
     system = prepared.system
     for block, index in blocks:
-        yield block, index, prepared.job.chain.run(prepared.sensor.fill(block), system, timing)
+        placed = prepared.sensor.fill(block)
+        if prepared.pulse_energy is not None:
+            placed = prepared.pulse_energy.fill(placed, unit)
+        yield block, index, prepared.job.chain.run(placed, system, timing)
 
 
 def _timed(items: Iterator, timing: dict[str, float], name: str) -> Iterator:

@@ -5,21 +5,28 @@ Only reads options and prints; the work is in `wavebatch.surveying.targets`.
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, talk
+from wavebatch.cli.messages import count, format_json, talk
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.protect import protecting, refuse_input
+from wavebatch.files.figure_file import check_picture
+from wavebatch.files.inputs import find_files
 
-LEAST_DOUBT = 0.03
-"""Smallest relative error that a target is credited with: constants of targets that differ by more than six times
-this, or six times the stated error, give a note."""
+if TYPE_CHECKING:
+    from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+    from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
+    from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
+    from wavebatch.surveying.targets import CalibrationOptions
 
 
 @click.command()
-@shared.strip_argument
+@click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
 @shared.file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV "
                     "with reflectance and x, y, radius or vertices.")
 @shared.output_option("Calibration file to write.", "CAL.toml")
@@ -29,46 +36,124 @@ this, or six times the stated error, give a note."""
               help="Attenuation of the air, one way [dB/km].")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
+@shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
+                      required=False)
+@shared.output_option("Also draw drifts and overlaps of the strips (PNG, SVG or PDF).", "FILE", "--plot",
+                      required=False)
+@shared.chain_options
 @shared.system_option
 @shared.sensor_options
 @shared.direction_option
 @shared.common_options("overwrite")
-def calibrate(strip: Path, targets: Path, output: Path, overwrite: bool, **options: Any) -> None:
-    """Find the calibration constant of a strip over targets of known reflectance, for `wavebatch run --calibration`.
+def calibrate(strips: tuple[Path, ...], targets: Path, output: Path, overwrite: bool, **options: Any) -> None:
+    """Find the calibration constants of STRIPs over targets of known reflectance, for `wavebatch run --calibration`.
 
-    Used are echoes that are alone in their waveform and lie on a target. The incidence angle comes from the plane of
-    each target, unless the target file gives it. If several channels (digitizers, or scanner channels of the points)
-    saw targets, each gets its own constant; other channels get the constant of all together.
+    STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each channel
+    (digitizer, or scanner channel of the points) gets its own constant.
 
-    Exit code: 0 done, 1 the strip or its targets give no constant, 2 wrong usage.
+    Used are echoes that are alone in their waveform, lie on the plane of a target, and have their whole footprint
+    inside its outline. The incidence angle comes from that plane, unless the target file gives it; targets that do not
+    say are refused by name. Pulse and chain are chosen as `wavebatch run` chooses them.
+
+    Several strips of a flight are calibrated together: flat places where strips or channels overlap tie those without
+    a target to those with one. Each strip gets its constant, its drift, and their errors.
+
+    Exit code: 0 done, 1 the strips or their targets give no constant, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.files.disk.publish import refuse_existing
     from wavebatch.files.text_file import write_text
-    from wavebatch.surveying.calibration import format_calibration
-    from wavebatch.surveying.targets import calibrate_strip, load_targets
+    from wavebatch.surveying.calibrating.calibrate_flight import calibrate_flight
+    from wavebatch.surveying.calibrating.calibration_file import format_calibration
+    from wavebatch.surveying.calibrating.target_file import load_targets
 
-    sensor = shared.read_sensor(options)
-    refuse_existing(output, overwrite)
-    loaded, saved = load_targets(targets), shared.read_system(options)
+    paths = find_files(map(str, strips))
+    if not paths:
+        raise ConfigError("no strip given")
+    with protecting(paths):  # a folder or a list among STRIPs holds inputs too
+        for target in filter(None, (output, options["report"], options["plot"])):
+            refuse_input(target)
+    for target in filter(None, (output, options["report"])):
+        refuse_existing(target, overwrite)
+    if options["plot"] is not None:
+        check_picture(options["plot"], overwrite=overwrite)
+    flight = calibrate_flight(paths, load_targets(targets), _read_options(options))
+    found = flight.calibration
+    write_text(output, format_calibration(found), overwrite=overwrite)
+    if options["report"] is not None:
+        write_text(options["report"], format_json(_list_report(flight)) + "\n", overwrite=overwrite)
+    if options["plot"] is not None:
+        from wavebatch.tools.plots.draw_flight import draw_flight
+
+        draw_flight(flight, options["plot"], overwrite=overwrite)
+    for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
+        talk(line)
+    for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
+        talk(line)
+    for note in found.notes:
+        talk(f"warning: {note}")
+    numbers = f"constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %"
+    if len(found.channels) > 1:
+        numbers = f"constants of {len(found.channels)} channels"
+    talk(f"{output}: {numbers}; {found.conditions}")
+
+
+def _read_options(options: dict[str, Any]) -> CalibrationOptions:
+    """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
+    from wavebatch.surveying.targets import CalibrationOptions
+    from wavebatch.tools.api.run import find_request
+
+    if options["chain_file"] is not None and options["profile"] is not None:
+        raise ConfigError("--chain and --profile exclude each other; give one of them")
+    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
+    request = replace(request, force=options["force"])
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
-    known = saved and saved.survey
-    found = calibrate_strip(strip, loaded, sensor=sensor, survey=known, force=options["force"], **figures)
-    write_text(output, format_calibration(found), overwrite=overwrite)
-    for target in found.targets:
-        result = "too few, left out"
-        if target.constant is not None:
-            numbers = f"constant {target.constant:.4g}, spread {100 * target.spread:.1f} %"
-            result = f"{numbers}, incidence {target.incidence_deg:.1f} deg"
-        talk(f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, {result}")
-    constants = [target.constant for target in found.targets if target.constant is not None]
-    ratio = max(constants) / min(constants)
-    # Channels may have different constants, so that their targets may differ too.
-    if ratio > 1 + 6 * max(options["reflectance_error"], LEAST_DOUBT) and not found.channels:
-        talk(f"note: constants of the targets differ by a factor of {ratio:.2f}: check reflectances and coordinates")
-    for channel in found.channels:
-        error, spread = 100 * channel.relative_error, 100 * channel.spread
-        numbers = f"constant {channel.constant:.4g} +- {error:.1f} %, spread {spread:.1f} %"
-        where = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
-        talk(f"{where}: {count(channel.echoes, 'echo')}, {numbers}")
-    talk(f"{output}: constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %; {found.conditions}")
+    return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
+
+
+def _list_report(flight: FlightCalibration) -> dict[str, Any]:
+    """All figures as plain values."""
+    found = flight.calibration
+    return {
+        "schema": "wavebatch.calibration-report/1",
+        **found.describe(),
+        "strips": [asdict(row) for row in found.strips],
+        "targets": [asdict(row) for row in found.targets],
+        "pairs": [asdict(row) for row in flight.pairs],
+        "cell_m": flight.cell,
+        "warnings": list(found.notes),
+    }
+
+
+def _describe_strip(row: StripConstant) -> str:
+    return (
+        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {row.constant:.4g} +- "
+        f"{100 * row.relative_error:.1f} %, drift {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} %, "
+        f"{count(row.ties, 'tie cell')}"
+    )
+
+
+def _describe_pair(pair: PairOverlap) -> str:
+    return (
+        f"{pair.a} over {pair.b}: {count(pair.cells, 'cell')}, light {100 * (pair.ratio - 1):+.2f} %, calibrated "
+        f"{100 * (pair.after - 1):+.2f} %, spread {100 * pair.spread:.2f} %, height {pair.height:+.3f} m"
+    )
+
+
+def _describe_target(target: TargetResult) -> str:
+    if target.constant is None:
+        return f"{target.name}: reflectance {target.reflectance:g}, refused: {target.refused}"
+    return (
+        f"{target.name}: reflectance {target.reflectance:g}, {count(target.echoes, 'echo')}, constant "
+        f"{target.constant:.4g}, spread {100 * target.spread:.1f} %, incidence {target.incidence_deg:.1f} +- "
+        f"{target.incidence_error_deg:.1f} deg"
+    )
+
+
+def _describe_channel(channel: ChannelConstant) -> str:
+    name = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
+    constant = f"constant {channel.constant:.4g} +- {100 * channel.relative_error:.1f} %"
+    if not channel.echoes:
+        return f"{name}: no target, by overlap, {constant}"
+    scatter = f"spread {100 * channel.spread:.1f} %, from shot to shot {100 * channel.shot_energy:.1f} %"
+    return f"{name}: {count(channel.echoes, 'echo')}, {constant}, {scatter}"

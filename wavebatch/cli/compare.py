@@ -22,6 +22,7 @@ from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_t
 if TYPE_CHECKING:
     from wavebatch.tools.compare.angles import AngleAgreement
     from wavebatch.tools.compare.chains import Matchup
+    from wavebatch.tools.compare.overlap import OverlapComparison
 
 EXIT_VIOLATED = 1
 """A threshold was not met."""
@@ -44,6 +45,8 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
               help="With --strip: use about N waveforms, spread over the strip, instead of all.")
 @click.option("--angles", is_flag=True,
               help="Compare incidence angles from echo widths with those from normals: both of A, or of A and B.")
+@click.option("--overlap", is_flag=True,
+              help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
 @click.option("--tolerance", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
 @click.option("--min-completeness", **_SHARE, help="Least share of B's echoes that A has.")
@@ -60,6 +63,7 @@ def compare(
     strip: Path | None,
     truth: Path | None,
     angles: bool,
+    overlap: bool,
     as_json: bool,
     output: Path | None,
     overwrite: bool,
@@ -77,12 +81,19 @@ def compare(
     With --angles, column incidence_angle is compared with incidence_angle_normals: both of A, or one of A and the other
     of B.
 
+    With --overlap, A and B are clouds of two strips that overlap. On flat places with single echoes of both, columns
+    backscatter_coefficient and reflectance (or their relative ones) and heights are compared.
+
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
     """  # fmt: skip
     if output is not None:
-        if angles:
-            raise click.UsageError("-o has no meaning with --angles; --json writes its histograms")
+        if angles or overlap:
+            raise click.UsageError("-o has no meaning with --angles and --overlap; --json writes their figures")
         check_target(output, overwrite=overwrite)
+    if overlap:
+        found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
+        print_result(as_json, found, _list_overlap(found))
+        return
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
         print_result(as_json, agreement, _list_angles(agreement))
@@ -106,8 +117,8 @@ def _tolerance(options: dict) -> dict[str, float]:
 
 
 def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comparison:
-    for name in ("system_file", "limit"):
-        if options[name] is not None:
+    for name in ("system_file", "force", "limit"):
+        if options[name] not in (None, False):
             raise click.UsageError(f"--{name.removesuffix('_file')} is for chains; give --strip STRIP too")
     if (b is None) == (truth is None):
         raise click.UsageError("give either B or --truth FILE.npz")
@@ -230,10 +241,41 @@ def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
     """The agreement of the angles of one or two clouds; UsageError for options that have no meaning here."""
     from wavebatch.tools.compare.angles import compare_angles
 
-    for name, value in options.items():
-        if value is not None and name not in ("tolerance", "debug"):
-            raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with --angles")
+    _refuse_others(options, "--angles", "tolerance")
     return compare_angles(a, b, **_tolerance(options))
+
+
+def _refuse_others(options: dict, mode: str, *allowed: str) -> None:
+    """UsageError for options that have no meaning in this mode."""
+    for name, value in options.items():
+        if value not in (None, False) and name not in (*allowed, "debug"):
+            raise click.UsageError(f"--{name.removesuffix('_file').replace('_', '-')} has no meaning with {mode}")
+
+
+def _measure_overlap(a: Path, b: Path | None, options: dict) -> OverlapComparison:
+    from wavebatch.tools.compare.overlap import compare_overlap
+
+    _refuse_others(options, "--overlap")
+    if b is None:
+        raise click.UsageError("--overlap needs two clouds, A and B")
+    return compare_overlap(a, b)
+
+
+def _list_overlap(result: OverlapComparison) -> Iterator[str]:
+    """A line for the height and for each column that both clouds have."""
+    yield from (f"A {result.a}", f"B {result.b}", f"flat cells of {result.cell:.1f} m with single echoes of both")
+    yield from ("", row(f"{'A against B':<26}", ("cells", "median", "error", "nmad", "stated")))
+    height = result.height
+    yield row(f"{'height, A - B, m':<26}", (height.cells, height.median, height.error, height.nmad, math.nan), ".4f")
+    for name, one in result.columns.items():
+        values = (100 * value for value in (one.median, one.error, one.nmad, one.stated))
+        yield row(f"{name + ', %':<26}", (one.cells, *values), ".3f")
+    if not result.columns:
+        yield "no calibrated or relative column is in both; run both strips with --calibration"
+    elif result.angles == "scan angle":
+        yield "backscatter is taken to a facing surface by the scan angle, on level cells; stated: error of one echo"
+    else:
+        yield "backscatter is taken to a facing surface by incidence_angle_normals; stated: error of one echo"
 
 
 def _list_angles(result: AngleAgreement) -> Iterator[str]:

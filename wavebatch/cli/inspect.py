@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json
+from wavebatch.cli.messages import count, print_json, printable
 from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
 from wavebatch.files.inputs import find_files
 from wavebatch.surveying.inspect_strip import check_file
@@ -98,11 +98,11 @@ def check(
         if as_json:
             continue
         for line in found.problems:
-            click.echo(f"{found.file}: {line}")
+            click.echo(printable(f"{found.file}: {line}"))
         for line in found.notes:
-            click.echo(f"{found.file}: note: {line}")
+            click.echo(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
-            click.echo(f"{found.file}: ok ({found.summary})")
+            click.echo(printable(f"{found.file}: ok ({found.summary})"))
     if as_json:
         print_json(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)

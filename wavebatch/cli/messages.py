@@ -151,7 +151,7 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str]) -> None:
     if as_json:
         print_json(document)
     else:
-        click.echo("\n".join(lines))
+        click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
 def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:
@@ -184,6 +184,9 @@ def one_line(error: BaseException) -> str:
         return f"{place}{error.strerror}; check disk and permissions"
     if isinstance(error, ConfigError | InputError | StageError | click.ClickException):
         return text
+    if isinstance(error, MemoryError):
+        needed = f" ({text[0].lower()}{text[1:]})" if text else ""
+        return f"not enough memory{needed}; close other programs, or use fewer --jobs or a smaller --block-size"
     return f"{type(error).__name__}: {text}; this is a bug, please report it with the output of --debug"
 
 
@@ -273,10 +276,13 @@ class Progress:
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "written":
-            for line in event["serious"]:
+            # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
+            for line in (*event["serious"], *event["doubts"]):
                 self._say(printable(f"{strip}: warning: {line}"))
         elif kind == "skipped" and self._level >= 0:
             self._say(printable(f"{strip}: is up to date, skipped"))
+        elif kind == "worker":
+            self._say(printable(f"{strip}: warning: {event['warning']}"))
         elif kind == "flight" and self._level > 0:
             self._say(printable(f"{strip}: survey of {count(event['strips'], 'strip')} together"))
 

@@ -105,10 +105,25 @@ calibration_option = file_option(
     "--calibration", "calibration_file",
     text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",
 )  # fmt: skip
+air_options = together(
+    click.option("--attenuation", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
+                 help="Attenuation of the air during the flight, one way [dB/km].  [default: that of --calibration, "
+                 "else 0.22]"),
+    click.option("--visibility", type=click.FloatRange(0.5, 400.0), metavar="KM",
+                 help="Meteorological visibility during the flight [km], in place of --attenuation."),
+    click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), metavar="NM",
+                 help="Wavelength of the laser [nm], for --visibility.  [default: 1064]"),
+    click.option("--pulse-energy", metavar="NAME|FILE",
+                 help="Energy of each emitted pulse: an extra byte of the strips, or a text file with columns time "
+                 "(GPS time of the points) and energy. Backscatter and normalized amplitudes are divided by it."),
+    click.option("--attenuation-error", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
+                 help="Standard deviation of the attenuation [dB/km]: goes into the errors.  [default: 0]"),
+)  # fmt: skip
 chain_options = together(
     file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
     click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=_complete_profiles,
-                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  [default: auto]"),
+                 help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  "
+                 "[default: auto]"),
 )  # fmt: skip
 sensor_options = together(
     file_option("--trajectory", text="Trajectory of the sensor: text with columns time, x, y, z, or SBET. Without it "
@@ -254,9 +269,25 @@ def read_system(options: Mapping[str, Any]) -> SavedSurvey | None:
 
 def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
     """The calibration of --calibration, None without it."""
-    from wavebatch.surveying.calibration import load_calibration
+    from wavebatch.surveying.calibrating.calibration_file import load_calibration
 
     return load_calibration(options["calibration_file"]) if options["calibration_file"] else None
+
+
+def read_air(options: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError where they do not fit."""
+    from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
+
+    given, visibility = options["attenuation"], options["visibility"]
+    if given is not None and visibility is not None:
+        raise ConfigError("--attenuation and --visibility exclude each other; give one of them")
+    if options["wavelength"] is not None and visibility is None:
+        raise ConfigError("--wavelength is of no use without --visibility; give that too")
+    if options["attenuation_error"] is not None and given is None and visibility is None:
+        raise ConfigError("--attenuation-error is of no use without --attenuation or --visibility; give one of them")
+    if visibility is not None:
+        given = attenuation_of_visibility(visibility, options["wavelength"] or 1064.0)
+    return None if given is None else (given, options["attenuation_error"] or 0.0)
 
 
 def read_sensor(options: Mapping[str, Any]) -> SensorRequest:

@@ -14,13 +14,25 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import EXIT_USAGE, Interrupted, Progress, count, format_json, one_line, print_safely, talk
+from wavebatch.cli.messages import (
+    EXIT_USAGE,
+    Interrupted,
+    Progress,
+    count,
+    format_json,
+    one_line,
+    print_safely,
+    printable,
+    talk,
+)
 from wavebatch.cli.options import (
     OutputPath,
+    air_options,
     calibration_option,
     chain_options,
     common_options,
     output_option,
+    read_air,
     read_sensor,
     sensor_options,
     strip_options,
@@ -60,6 +72,7 @@ def _read_size(context: click.Context, parameter: click.Parameter, text: str | N
               "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.")
 @sensor_options
 @calibration_option
+@air_options
 @strip_options
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
@@ -152,8 +165,8 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
 
 
 _PASSED_ON = (
-    "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets", "direction",
-    "headerless", "scheduler", "memory", "block_size", "overwrite", "resume",
+    "pulse_energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
+    "direction", "headerless", "scheduler", "memory", "block_size", "overwrite", "resume",
 )  # fmt: skip
 """Options that `plan_run` takes under the same names."""
 
@@ -173,6 +186,7 @@ def _plan(options: dict[str, Any]) -> tuple[list[Any], Any]:
         survey=options["survey"],
         sensor=read_sensor(options),
         calibration=options["calibration_file"],
+        attenuation=read_air(options),
         format=options["file_format"],
         jobs=1 if options["jobs"] is None else options["jobs"],
         **{name: options[name] for name in _PASSED_ON},
@@ -242,11 +256,12 @@ def _dry_run(jobs: list[Any], batch_options: Any) -> int:
             failed += 1
             talk(f"error: {one_line(error)}")
             continue
-        click.echo(
+        line = (
             f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
             f"{plan['point_format']} -> {plan['output_point_format']}, {plan['packet_bytes'] / 1e6:.1f} MB of packets, "
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
+        click.echo(printable(line))
     by = jobs[0].request.describe(jobs[0].chain)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)

@@ -91,7 +91,18 @@ def slice_(
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line.
 
     A slice shows the waveforms of one scan line side by side. A new line starts where the scan angle turns or jumps
-    back, or after a pause. Each segment has its end points in space, length, slope and residual.
+    back, or after a pause. With plane slices a line that bends, as at the ridge of a roof, is two segments.
+
+    \b
+    Each segment has:
+      line, segment      scan line and number in it, the strongest first
+      x1 y1 z1 x2 y2 z2  its ends [units of the strip]
+      length             distance of the ends [units of the strip]
+      slope              angle above the horizontal from the first to the second end [degrees]
+      residual           rms distance of the pulses' centroids from it [as length; ns with --geometry time]
+      pulses             how many; first_pulse, last_pulse: which of the line; first_point: index in the file
+      theta, rho         normal form of the line in the slice [degrees, pixels]
+      weight             sum of its samples [DN]
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip

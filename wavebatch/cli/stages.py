@@ -53,6 +53,7 @@ def _types(parameter: Parameter) -> str:
 
 def _describe(stage: Stage) -> dict[str, Any]:
     """The document of a stage for --json."""
+    from wavebatch.stages.chain import Step
     from wavebatch.stages.chain_file import format_step
 
     parameters = {
@@ -64,7 +65,7 @@ def _describe(stage: Stage) -> dict[str, Any]:
         "kind": stage.kind,
         "text": stage.text,
         "makes": list(stage.makes),
-        "needs": list(stage.needs),
+        "needs": list(Step(stage).needs),
         "parameters": parameters,
         "example": format_step(stage.name, {name: one["default"] for name, one in parameters.items()}),
     }
@@ -79,8 +80,8 @@ def _explain(stage: Stage) -> str:
     if stage.makes:
         known = [COLUMNS[name] for name in stage.makes if name in COLUMNS]
         parts.append("Makes:\n" + "\n".join(f"  {c.name} [{c.unit}]: {c.meaning}" for c in known))
-    if stage.needs:
-        parts.append(f"Needs: {', '.join(stage.needs)}")
+    if described["needs"]:
+        parts.append(f"Needs: {', '.join(described['needs'])}")
     lines = []
     for name, p in described["parameters"].items():
         limits = f", {p['range'][0]:g} to {p['range'][1]:g}" if p["range"] else ""

@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, row, talk
+from wavebatch.cli.messages import count, print_json, printable, row, talk
 from wavebatch.cli.options import clouds_argument, common_options, file_option, output_option, recursive_option
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.publish import check_target
@@ -68,13 +68,15 @@ def stats(
         talk(f"error: {error}")
 
     each, total = count_returns(files, skip, divisions=divisions)
-    if output is not None:
+    if output is not None and failed:
+        talk(f"error: {output}: not written, because {count(len(failed), 'cloud')} of {len(files)} cannot be read")
+    elif output is not None:
         write_text(output, _format_table(each, total), overwrite=overwrite)
     shown = [*each, total] if len(files) > 1 else each
     if as_json:
         print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
     elif shown:
-        click.echo("\n\n".join("\n".join(_list_lines(one)) for one in shown))
+        click.echo("\n\n".join("\n".join(map(printable, _list_lines(one))) for one in shown))
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 

@@ -84,7 +84,9 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
     from wavebatch.tools.api.strip import survey as survey_strip
 
     with open_strip(strip, direction=options["direction"], headerless=options["headerless"]) as opened:
-        found = survey_strip(opened, waveforms=options["waveforms"], divergence=options["divergence"])
+        found = survey_strip(
+            opened, waveforms=options["waveforms"], divergence=options["divergence"], find_divergence=True
+        )
         scan = opened.scan
         facts = {
             "strip": str(opened.facts.path),
@@ -179,6 +181,9 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
         yield _line("vectors", f"{facts['direction']['sign']} the sensor: {facts['direction']['evidence']}")
     yield from _noise_lines(saved)
     yield from _pulse_lines(saved)
+    if "divergence_seen_mrad" in figures:
+        seen = f"{figures['divergence_seen_mrad']:.3g} +- {figures['divergence_seen_error_mrad']:.2g} mrad"
+        yield _line("beam", f"{seen} by the widths of echoes over the slopes of their surfaces")
     yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"

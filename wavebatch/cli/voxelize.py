@@ -45,6 +45,10 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--headroom", type=click.FloatRange(0, 100_000), metavar="M",
               help="Count each ray from this distance before its first sample [m], whether recorded or not.  [default: "
               "from the highest return near it]")
+@click.option("--ground-height", type=click.FloatRange(0, 100), default=0.5, show_default=True, metavar="M",
+              help="Signal up to this height above the lowest returns is the ground's [m].")
+@click.option("--reflectance-ratio", type=float, metavar="RATIO",
+              help="Reflectance of the canopy over that of the ground.  [default: estimated from the strip]")
 @click.option("--profiles", type=shared.OutputPath(path_type=Path), metavar="FILE.npz",
               help="Also write the deconvolved signal of every pulse: energy and, with --calibration, cross section by "
               "time.")
@@ -66,7 +70,11 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
       rays           number of rays that crossed it and had light left
       path           length of these rays inside it [m]
       light          light that was left in them, in units of whole rays
-      share          share of that light that came back from it; 1 - share is its transmittance
+      share          share of that light that was caught in it; 1 - share is its gap probability
+
+    Light is shared along a ray as its signal times the square of the range, where signal from the ground counts
+    RATIO times as much as that from the canopy. The ratio is that at which the sum does not depend on how much light
+    reached the ground; where the strip does not show it, it is taken as 1, and a note says so.
 
     Each sample is spread over its length along the ray, so that voxels smaller than a sample (15 cm) have no holes. A
     ray ends at its last signal; voxels after it were not seen. A voxel that is not in the file was not seen, or
@@ -105,6 +113,8 @@ def voxelize(strips: tuple[str, ...], output: Path, **options: Any) -> None:
                 bar.update(done)
 
             summary = voxelize_strip(strip, targets[strip], settings, progress=show, **more)
+        for line in summary.warnings:  # with --quiet too: they say how far the values can be trusted
+            talk(f"warning: {line}")
         if not options["quiet"]:
             for line in _list_lines(summary):
                 talk(line)
@@ -140,3 +150,18 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
     for text, number in notes.items():
         if number:
             yield f"note: {count(number, 'waveform')} {text}"
+    yield from _tell_ratio(summary)
+
+
+def _tell_ratio(summary: VoxelSummary) -> Iterator[str]:
+    """The reflectance ratio by which light is shared."""
+    if summary.reflectance_ratio_source == "strip":
+        yield (
+            f"reflectance of canopy over ground: {summary.reflectance_ratio:.3g} +- {summary.reflectance_ratio_err:.2g}"
+        )
+    elif summary.reflectance_ratio_source == "assumed":
+        yield (
+            "note: the strip does not show the reflectance of canopy over ground (fewer than 100 pulses, all shared by "
+            "both alike, or too different in energy); it was taken as 1, so 1 - share is a gap probability only if "
+            "both reflect alike: give --reflectance-ratio"
+        )

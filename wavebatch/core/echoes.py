@@ -32,7 +32,7 @@ class EchoFlag(IntFlag):
     NEAR_EDGE = 4, "the echo is cut by the start or the end of the waveform"
     SATURATED = 8, "samples under the echo are at the digitizer's limit"
     OVERLAPPED = 16, "fitted together with at least one neighbouring echo"
-    WEAK = 32, "amplitude below 5 noise standard deviations"
+    WEAK = 32, "amplitude below 5 noise standard deviations: noise helps to find it, so the mean of such is too high"
     RINGING_SUSPECT = 64, "may be ringing or an after-pulse of a stronger echo before it"
     NARROW = 128, "narrower than the system pulse"
     NO_WAVEFORM = 256, "point has no waveform (descriptor index 0 or packet size 0); passed through"
@@ -78,13 +78,16 @@ class Column:
 
 _COLUMNS = (
     Column("amplitude", "f4", "DN", "peak of the echo above the baseline"),
+    Column("amplitude_normalized", "f4", "DN", "amplitude at the reference range"),
+    Column("amplitude_normalized_db", "f4", "dB", "amplitude at the reference range, over 1 DN"),
     Column("echo_time", "f4", "ns", "centre of the echo after the first sample of its packet"),
     Column("echo_width", "f4", "ns", "full width at half maximum"),
     Column("energy", "f4", "DN ns", "integral of the echo over time"),
     Column("range", "f4", "m", "sensor to echo"),
     Column("cross_section", "f4", "m2", "backscatter cross section"),
     Column("backscatter_coefficient", "f4", "-", "cross section per illuminated area (gamma)"),
-    Column("reflectance", "f4", "-", "diffuse reflectance"),
+    Column("reflectance", "f4", "-", "diffuse reflectance, with the surface's angle"),
+    Column("level_reflectance", "f4", "-", "diffuse reflectance if the surface is level"),
     Column("relative_backscatter", "f4", "DN ns m2", "not calibrated: backscatter in units of its own strip"),
     Column("relative_cross_section", "f4", "DN ns m4", "not calibrated: cross section in units of its own strip"),
     Column("relative_reflectance", "f4", "DN ns m2", "not calibrated: reflectance in units of its own strip"),
@@ -92,12 +95,16 @@ _COLUMNS = (
     Column("incidence_angle_normals", "f4", "deg", "angle between ray and normal of the plane of the points around"),
     Column("range_err", "f4", "m", "one standard deviation of the echo along the ray, from the fit"),
     Column("amplitude_err", "f4", "DN", "one standard deviation of amplitude, from the fit"),
+    Column("amplitude_normalized_err", "f4", "DN", "one standard deviation of amplitude_normalized"),
+    Column("amplitude_normalized_db_err", "f4", "dB", "one standard deviation of amplitude_normalized_db"),
+    Column("energy_err", "f4", "DN ns", "one standard deviation of energy, from the fit"),
     Column("echo_width_err", "f4", "ns", "one standard deviation of echo_width, from the fit"),
     Column("incidence_angle_err", "f4", "deg", "one standard deviation of incidence_angle"),
     Column("incidence_angle_normals_err", "f4", "deg", "one standard deviation of incidence_angle_normals"),
     Column("cross_section_err", "f4", "m2", "one standard deviation of cross_section"),
     Column("backscatter_coefficient_err", "f4", "-", "one standard deviation of gamma"),
     Column("reflectance_err", "f4", "-", "one standard deviation of reflectance"),
+    Column("level_reflectance_err", "f4", "-", "one standard deviation of level_reflectance, with unknown slopes"),
     Column("relative_backscatter_err", "f4", "DN ns m2", "one standard deviation of relative_backscatter"),
     Column("relative_cross_section_err", "f4", "DN ns m4", "one standard deviation of relative_cross_section"),
     Column("relative_reflectance_err", "f4", "DN ns m2", "one standard deviation of relative_reflectance"),
@@ -108,6 +115,10 @@ _COLUMNS = (
     Column("x", "f8", "m", "easting of the echo", extra_bytes=False),
     Column("y", "f8", "m", "northing of the echo", extra_bytes=False),
     Column("z", "f8", "m", "height of the echo", extra_bytes=False),
+    Column("facing_reflectance", "f4", "-", "reflectance if the surface faces the sensor", extra_bytes=False),
+    Column("facing_reflectance_err", "f4", "-", "its standard deviation", extra_bytes=False),
+    Column("facing_relative_reflectance", "f4", "DN ns m2", "the same in units of the strip", extra_bytes=False),
+    Column("facing_relative_reflectance_err", "f4", "DN ns m2", "its standard deviation", extra_bytes=False),
     Column("ray_x", "f4", "-", "east component of the unit vector away from the sensor", extra_bytes=False),
     Column("ray_y", "f4", "-", "north component of the unit vector away from the sensor", extra_bytes=False),
     Column("ray_z", "f4", "-", "upward component of the unit vector away from the sensor", extra_bytes=False),
@@ -128,6 +139,7 @@ _FIELDS: dict[str, type] = {
     "time_err": np.float32,
     "amplitude_err": np.float32,
     "sigma_err": np.float32,
+    "relative_energy_err": np.float32,
     "residual": np.float32,
     "flags": np.uint16,
 }
@@ -155,6 +167,10 @@ class EchoTable:
     """One standard deviation of amplitude, float32 (m,), count."""
     sigma_err: np.ndarray
     """One standard deviation of sigma, float32 (m,), ns."""
+    relative_energy_err: np.ndarray
+    """One standard deviation of the energy (amplitude times sigma), relative, float32 (m,); from the fit's covariance
+    of both, which depends on how much the echo overlaps others. NaN where the decomposer has none.
+    """
     residual: np.ndarray
     """Root mean square of the fit's residuals in the echo's cluster, float32 (m,), in noise standard deviations."""
     flags: np.ndarray
@@ -188,7 +204,8 @@ class EchoTable:
         attributes : mapping of arrays (m,), optional
             Further columns by name.
         **others : arrays (m,)
-            Other core columns: time_err, amplitude_err, sigma_err, residual (NaN if not given), flags (0 if not given).
+            Other core columns: time_err, amplitude_err, sigma_err, relative_energy_err, residual (NaN if not given),
+            flags (0 if not given).
 
         Returns
         -------
@@ -202,7 +219,7 @@ class EchoTable:
         """
         nan = np.full(len(waveform), np.nan, np.float32)
         given = {
-            **dict.fromkeys(("time_err", "amplitude_err", "sigma_err", "residual"), nan),
+            **dict.fromkeys(("time_err", "amplitude_err", "sigma_err", "relative_energy_err", "residual"), nan),
             "flags": np.zeros(len(waveform), np.uint16),
             **{"waveform": waveform, "time": time, "amplitude": amplitude, "sigma": sigma, **others},
         }

@@ -15,8 +15,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+
+TYPE_CHECKING = False  # not from typing, which takes as long to import as all the others
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Any
 
 EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C or SIGTERM, as shells give it."""

@@ -207,7 +207,7 @@ def apply_lever_arm(xyz: np.ndarray, attitude: np.ndarray, arm: tuple[float, flo
     float64 (n, 3), m
         Positions of the scanner.
     """
-    roll, pitch, heading = attitude.T
+    roll, pitch, heading = np.where(np.isfinite(attitude), attitude, np.nan).T
     forward, right, down = arm
     # Body to level: roll about the forward axis, then pitch about the right one.
     side = right * np.cos(roll) - down * np.sin(roll)

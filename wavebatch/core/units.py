@@ -37,5 +37,8 @@ AIR_ATTENUATION = 0.22
 The default that others use; no source for it was found (docs/algorithms.md 5, 9).
 """
 
+MEDIAN_ERROR = math.sqrt(math.pi / 2.0)
+"""Standard deviation of the median of many normal numbers, in that of their mean."""
+
 MAD_TO_STD = 1.4826
 """Median absolute deviation of a normal distribution times this is its standard deviation."""

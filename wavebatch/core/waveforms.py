@@ -95,6 +95,8 @@ class WaveformBlock:
     """Samples that were not recorded (fill between two recordings of a packet), bool (n, s); None where all were.
     `samples` then hold a low count of the waveform there, which is no signal.
     """
+    pulse_energy: np.ndarray | None = None
+    """Energy of each emitted pulse over the mean of the strip, float64 (n,), NaN where unknown; None without any."""
 
     def __len__(self) -> int:
         """Number of waveforms."""
@@ -171,7 +173,7 @@ class WaveformBlock:
             returns = ReturnTable(at[keep], returns.time[keep], returns.point[keep], returns.xyz[keep])
         samples = self.samples[index]
         samples.flags.writeable = False
-        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing")
+        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy")
         given = {name: getattr(self, name) for name in names}
         parts = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first
@@ -271,18 +273,28 @@ class SystemPulse:
     """Variance of echoes of level ground seen from above, minus that of the system pulse [ns2]: zero or negative,
     because the echoes that the pulse was learned from come from slopes too.
     """
+    level_error: float | None = None
+    """Standard deviation of `level_variance` [ns2]; None where it was not measured, infinite where surfaces of known
+    slope were sought and not found, so that widths mean no angle.
+    """
     width_scatter: float = 0.0
     """Scatter of the echo widths of one surface beyond their fit errors [ns]: no pulse model is exact."""
     divergence: float | None = None
     """Full angle of the beam between the 1/e^2 points [mrad]; None where it is not known."""
+    divergence_error: float = 0.0
+    """Relative standard deviation of the divergence."""
     calibration: float | None = None
     """Constant C' of kernels/physics/radiometry [1/(m2 count ns)]; None where the strip is not calibrated."""
     calibration_err: float = 0.0
     """Relative standard deviation of the calibration."""
+    shot_error: float = 0.0
+    """Relative standard deviation of the emitted energy from shot to shot, where the block does not hold it."""
     channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     """Calibration and its relative error of single channels, by (index of the digitizer, scanner channel)."""
     attenuation: float = AIR_ATTENUATION
     """Attenuation of the light in the air, one way [dB/km]."""
+    attenuation_error: float = 0.0
+    """Standard deviation of the attenuation [dB/km]."""
     sensor_error: float = 0.0
     """Standard deviation of the distance to the sensor's position [m]."""
     digitizers: Mapping[int, SystemPulse] = field(default_factory=dict)
@@ -303,7 +315,10 @@ class SystemPulse:
         other = self.digitizers.get(block.digitizer.index)
         if other is None:
             return self
-        whole = ("divergence", "calibration", "calibration_err", "channels", "attenuation", "sensor_error")
+        whole = (
+            "divergence", "divergence_error", "calibration", "calibration_err", "channels", "shot_error",
+            "attenuation", "attenuation_error", "sensor_error",
+        )  # fmt: skip
         return replace(other, **{name: getattr(self, name) for name in whole})
 
     def calibrate(self, block: WaveformBlock) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,8 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
 
+_WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polygon:
@@ -79,18 +81,28 @@ def read_features(text: str, path: Path | str) -> list[tuple[dict[str, Any], lis
     path: name for messages. Raises ConfigError for anything else than polygons.
     """
     try:
-        features = []
-        for feature in json.loads(text)["features"]:
-            shape = feature["geometry"]
-            if shape["type"] not in ("Polygon", "MultiPolygon"):
-                raise ConfigError(f"{path}: a feature is a {shape['type']}; give polygons only")
-            parts = [shape["coordinates"]] if shape["type"] == "Polygon" else shape["coordinates"]
-            rings = [np.array([[float(x), float(y)] for x, y, *_ in ring]) for part in parts for ring in part]
-            if not rings:
-                raise ConfigError(f"{path}: a {shape['type']} has no ring")
-            features.append((dict(feature.get("properties") or {}), rings))
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {type(error).__name__}: {error}") from error
-    return features
+        listed = json.loads(text)["features"]
+        listed = list(listed.values()) if isinstance(listed, dict) else list(listed)
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: no JSON at {where}") from error
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {_WANTED}") from error
+    return [_read_feature(feature, f"{path}: feature {number}") for number, feature in enumerate(listed, 1)]
+
+
+def _read_feature(feature: Any, where: str) -> tuple[dict[str, Any], list[np.ndarray]]:
+    try:
+        shape, properties = feature["geometry"], dict(feature.get("properties") or {})
+        kind, parts = shape["type"], shape["coordinates"]
+        if kind not in ("Polygon", "MultiPolygon"):
+            raise ConfigError(f"{where} is a {str(kind)[:40]}; give polygons only")
+        parts = [parts] if kind == "Polygon" else parts
+        rings = [np.array([[float(x), float(y)] for x, y, *_ in ring]) for part in parts for ring in part]
+    except ConfigError:
+        raise
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
+        raise ConfigError(f"{where}: not GeoJSON of a polygon: {_WANTED}") from error
+    if not rings or not all(len(ring) for ring in rings):
+        raise ConfigError(f"{where}: a {kind} has no ring, or a ring has no corner")
+    return properties, rings

@@ -47,6 +47,8 @@ def find_crs(text: str | None, vlrs: Iterable[Vlr]) -> str | None:
 
     text: as `read_crs` gives it.
     """
+    if text is not None and text.startswith("EPSG:"):
+        return text
     if text is not None and text.rstrip().endswith("]"):
         return _repair(text)
     code = find_code(vlrs)

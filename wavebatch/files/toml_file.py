@@ -24,6 +24,17 @@ LARGEST_INTEGER = 1 << 53
 REQUIRED: Any = object()
 """Default of a key that must be there."""
 
+MOST_NESTED = 64
+"""Tables and lists in each other; files of wavebatch have 4. tomllib takes 40 kB of memory per level of a key."""
+
+MOST_DIGITS = 4000
+"""Decimal digits of a number; Python refuses to read integers of more than 4300."""
+
+_PART = r"(?:[A-Za-z0-9_-]++|\"[^\"\n]*+\"|'[^'\n]*+')"
+_DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-])(?:{_PART}[ \t]*+\.[ \t]*+){{{MOST_NESTED}}}")
+_DEEP_VALUE = re.compile(rf"(?:[\[{{][^\[\]{{}}\"'#]*+){{{8 * MOST_NESTED}}}")
+_LONG_NUMBER = re.compile(rf"(?<![A-Za-z0-9_.\"'-])[+-]?[0-9][0-9_]{{{MOST_DIGITS},}}")
+
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _WORDS = {int: "an integer", float: "a number", bool: "true or false", str: "a string", dict: "a table"}
 
@@ -112,12 +123,29 @@ def _one_line(text: str) -> str:
 def parse_toml(text: str, name: str) -> TomlTable:
     """Return the document that TOML text describes, as a table with checks; `name` starts every message.
 
-    Raises ConfigError where the text is not TOML.
+    Raises ConfigError where the text is not TOML, is nested too deep, or has a number of too many digits.
     """
+    if _DEEP_KEY.search(text) or _DEEP_VALUE.search(text):
+        raise ConfigError(f"{name}: keys or values are nested more than {MOST_NESTED} deep")
+    if _LONG_NUMBER.search(text):
+        raise ConfigError(f"{name}: a number has more than {MOST_DIGITS} digits")
     try:
-        return TomlTable(tomllib.loads(text), name)
-    except (ValueError, RecursionError) as error:  # ValueError: also an integer with too many digits for Python
-        raise ConfigError(f"{name}: not valid TOML: {error}") from error
+        document = tomllib.loads(text)
+        if _is_deep(document):
+            raise RecursionError
+    except RecursionError as error:
+        raise ConfigError(f"{name}: keys or values are nested more than {MOST_NESTED} deep") from error
+    except ValueError as error:
+        raise ConfigError(f"{name}: not valid TOML: {_one_line(str(error))}") from error
+    return TomlTable(document, name)
+
+
+def _is_deep(document: dict[str, Any]) -> bool:
+    level: list[Any] = [document]
+    for _ in range(MOST_NESTED):
+        held = [value.values() if isinstance(value, dict) else value for value in level]
+        level = [item for items in held for item in items if isinstance(item, dict | list)]
+    return bool(level)
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,9 @@ MOST_RECORDS = 400_000
 MOST_TEXT = 1 << 30
 """Most bytes of a text file: it is held in memory."""
 
+MOST_NAME = 100
+"""Most characters of the name of a column."""
+
 COLUMN_NAMES: dict[str, tuple[str, ...]] = {
     "time": ("time", "gpstime", "gps", "t", "sow", "gpsseconds", "gpssow", "secondsofweek", "weekseconds", "timestamp"),
     "x": ("x", "easting", "east", "e", "utmeasting", "projx"),
@@ -137,6 +140,9 @@ def _find_header(path: Path, lines: list[str]) -> tuple[int, list[str]]:
 
 
 def _meaning(field: str) -> str:
+    """The column that a name means; empty for other names, and for long ones, for which the patterns take hours."""
+    if len(field) > MOST_NAME:
+        return ""
     bare = re.sub(r"[\[(].*?[\])]", "", field.strip().strip('"').lower())
     bare = re.sub(r"[^a-z]", "", re.sub(r"_(m|s|deg)$", "", bare))
     return next((name for name, known in COLUMN_NAMES.items() if bare in known), "")

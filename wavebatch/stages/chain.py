@@ -79,6 +79,12 @@ class Stage:
     it, so that widths and areas are read as what they are. None: the survey's pulse."""
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None
     """What is wrong with this stage in a chain and for a strip (None before the strip is known); empty if nothing."""
+    needs_if: Mapping[str, Mapping[Any, tuple[str, ...]]] = field(default_factory=dict)
+    """More columns that earlier stages must have added, by parameter and its value."""
+    complete: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]] | None = None
+    """Computes columns that need those of the second pass. In the block, the stage fills them with no-data for the
+    reason NO_ANGLE, and its other columns hold what is needed. The function gets these and those of the second pass
+    (float (n,), NaN where unknown), and returns the completed ones."""
 
     @property
     def summary(self) -> str:
@@ -105,6 +111,8 @@ def stage(
     second_pass: Callable[..., Any] | None = None,
     fits: Callable[[SystemPulse, Mapping[str, Any]], SystemPulse] | None = None,
     check: Callable[[Step, Chain, SystemPulse | None], str] | None = None,
+    needs_if: Mapping[str, Mapping[Any, tuple[str, ...]]] | None = None,
+    complete: Callable[[Mapping[str, np.ndarray]], dict[str, np.ndarray]] | None = None,
 ) -> Callable[[Callable], Callable]:
     """Register the decorated function as stage `kind.<function name>`.
 
@@ -116,7 +124,7 @@ def stage(
         Attribute columns that the stage adds. A Column declares a new one, so that `run` can write it.
     needs : tuple of str
         Attribute columns that earlier stages must have added.
-    second_pass, fits, check : callable, optional
+    second_pass, fits, check, needs_if, complete : optional
         See `Stage`.
 
     Returns
@@ -144,7 +152,9 @@ def stage(
             raise StageError(f"stage {name} declares column {min(taken)}, which there is already")
         COLUMNS.update(new)
         names = tuple(column.name if isinstance(column, Column) else column for column in makes)
-        STAGES[name] = Stage(name, kind, function, parameters, names, needs, second_pass, fits, check)
+        STAGES[name] = Stage(
+            name, kind, function, parameters, names, needs, second_pass, fits, check, needs_if or {}, complete
+        )  # fmt: skip
         return function
 
     return register
@@ -204,6 +214,12 @@ class Step:
         """Every parameter with the value that will be used."""
         return {**{name: p.default for name, p in self.stage.parameters.items()}, **self.parameters}
 
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Attribute columns that earlier stages must have added."""
+        more = [by_value.get(self.effective()[name], ()) for name, by_value in self.stage.needs_if.items()]
+        return (*self.stage.needs, *(column for columns in more for column in columns))
+
 
 @dataclass(frozen=True, slots=True)
 class Chain:
@@ -228,7 +244,7 @@ class Chain:
             )
         have: set[str] = set()
         for step in self.steps:
-            missing = [column for column in step.stage.needs if column not in have]
+            missing = [column for column in step.needs if column not in have]
             if missing:
                 raise ConfigError(
                     f"chain {self.name or '(unnamed)'}: {step.stage.name} needs {', '.join(missing)}; "
@@ -263,6 +279,13 @@ class Chain:
     def second_step(self) -> Step | None:
         """The step that needs a second pass over the strip's points; None where no step does."""
         return next((step for step in self.steps if step.stage.second_pass is not None), None)
+
+    @property
+    def late_steps(self) -> tuple[Step, ...]:
+        """The steps that complete their columns from those of the second pass."""
+        second = self.second_step
+        made = set() if second is None else set(second.stage.makes)
+        return tuple(step for step in self.steps if step.stage.complete is not None and made & set(step.needs))
 
     def run(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> EchoTable:
         """Find and describe the echoes of a block.

@@ -183,8 +183,9 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 
     Returns
     -------
-    float64 array, shape (m, 3)
-        Of amplitude, time and sigma as `describe_echoes` gives them; 1 for a Gaussian in white noise.
+    float64 array, shape (m, 4)
+        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 for a Gaussian in white
+        noise.
 
     Notes
     -----
@@ -194,7 +195,7 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
     """
     shape = pulse_shape(system, spacing)
     if not system.correlation and not shape.components:
-        return np.ones((len(width), 3))
+        return np.ones((len(width), 4))
     widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
     return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
 
@@ -203,16 +204,18 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
 def _factor_table(
     shape: PulseShape, limits: ShapeLimits, correlation: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Widths (k,) and the factors of errors there (k, 3)."""
+    """Widths (k,) and the factors of errors there (k, 4)."""
     alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
     widths = np.geomspace(limits.low, limits.high, FACTOR_WIDTHS)
     return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
 
 
 def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """Errors of amplitude, time and width (3,) in noise of this correlation, over those of the main component."""
+    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those of the main component."""
     joint = _pulse_rows(shape, width)
     main = np.linalg.solve(joint @ joint.T, joint)
+    # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
+    main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
     if shape.components:
         table = pulse_measures(shape, limits)

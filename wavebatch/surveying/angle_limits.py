@@ -11,15 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.physics.incidence import angle_of_spread, angles_of_variance, spread_of_angle
+from wavebatch.kernels.physics.angle_errors import angles_of_variance
+from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Decision, Part, Survey
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.flat_ground import measure_level
+from wavebatch.surveying.flat_ground import Reference, measure_reference, sample_slopes
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 
 SLOPE = 30.0
@@ -36,14 +38,16 @@ class AngleOutlook:
     error: float
     """Standard deviation of the angle of a plane at SLOPE [deg]; inf where widths say nothing about it."""
     max_error: float
-    """Largest error of an angle that is written [deg]."""
+    """Largest error, for a surface that faces the sensor, with which angles are written [deg]."""
     reason: str
     """The numbers as a sentence."""
+    facing: float = np.inf
+    """Standard deviation of the angle of a surface that faces the sensor [deg]: it decides what is written."""
 
     @property
     def possible(self) -> bool:
-        """Whether angles at SLOPE would be written."""
-        return self.error <= self.max_error
+        """Whether angles would be written."""
+        return self.facing <= self.max_error
 
 
 def angle_parameters(chain: Chain) -> dict[str, Any] | None:
@@ -81,6 +85,8 @@ def predict_angles(
     """
     width = system.sigma_ref / spacing
     own = float(np.sqrt(max(system.sigma_ref**2 + system.level_variance, 1e-12)))
+    if np.isinf(system.level_error or 0.0):
+        return AngleOutlook(np.inf, max_error, REASONS[NoData.NO_LEVEL][0])
     if width < LEAST_PULSE_WIDTH:
         needed = f"{LEAST_PULSE_WIDTH} are needed for widths to mean a slope"
         reason = f"the system pulse is {width:.2f} samples wide, {needed}"
@@ -89,10 +95,11 @@ def predict_angles(
     sigma = float(np.hypot(own, added))
     bound = float(bound_time(max(amplitude, 1e-3), sigma, system.noise_std, spacing))
     width_err = float(np.hypot(bound, system.width_scatter))
-    variance_err = 2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR)
+    variance_err = np.hypot(2.0 * np.hypot(sigma * width_err, own * own * REFERENCE_ERROR), system.level_error or 0.0)
     values = (np.array([value]) for value in (added * added, variance_err, distance))
     error = float(np.degrees(angles_of_variance(*values, 1e-3 * divergence)[1][0]))
-    least = np.sqrt(2.0 * np.hypot(own * width_err, own * own * REFERENCE_ERROR))
+    flat_err = float(np.hypot(bound_time(max(amplitude, 1e-3), own, system.noise_std, spacing), system.width_scatter))
+    least = np.sqrt(np.hypot(2.0 * np.hypot(own * flat_err, own * own * REFERENCE_ERROR), system.level_error or 0.0))
     facing = float(np.degrees(angle_of_spread(least, distance, 1e-3 * divergence)))
     reason = (
         f"at {distance:.0f} m, a beam of {divergence:g} mrad on a slope of {SLOPE:g} degrees widens the pulse from "
@@ -100,13 +107,13 @@ def predict_angles(
         f"give this width to {width_err:.2g} ns, so the angle to {error:.1f} degrees ({facing:.1f} where the surface "
         f"faces the sensor); max_error is {max_error:g}"
     )
-    return AngleOutlook(error, max_error, reason)
+    return AngleOutlook(error, max_error, reason, facing)
 
 
-def sample_level(
+def sample_reference(
     reader: StripReader, scan: StripScan, source: SensorSource, system: SystemPulse, spacing: float
-) -> SystemPulse:
-    """Measure the widths of level ground on a sample of a strip; see `flat_ground.measure_level`.
+) -> Reference:
+    """Measure the widths of surfaces of known slope on a sample of a strip; see `flat_ground.measure_reference`.
 
     Parameters
     ----------
@@ -115,29 +122,28 @@ def sample_level(
     source : SensorSource
         Positions of the sensor.
     system : SystemPulse
-        With the beam's divergence.
+        With the beam's divergence, where it is known.
     spacing : float
         Of the samples that are used [ns].
 
     Returns
     -------
-    SystemPulse
-        With the variance and the scatter of level ground.
+    Reference
     """
-    blocks = (source.fill(block) for block in reader.sample_blocks(scan, sample_size(reader, scan)))
-    return measure_level(blocks, system, spacing)
+    return measure_reference(sample_slopes(reader, scan, source, sample_size(reader, scan)), system, spacing)
 
 
-def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float) -> Survey:
-    """Add the beam's divergence, the variance of level ground, and a decision about angles to a survey.
+def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergence: float | None) -> Survey:
+    """Add the divergence, the variance of surfaces that face the sensor, and a decision about angles to a survey.
 
     Parameters
     ----------
     reader : StripReader
     scan : StripScan
     survey : Survey
-    divergence : float
-        Full angle of the beam between the 1/e^2 points [mrad].
+    divergence : float or None
+        Full angle of the beam between the 1/e^2 points [mrad]; None: only the figure `divergence_seen_mrad` is added,
+        where the widths of the strip show it.
 
     Returns
     -------
@@ -150,12 +156,20 @@ def survey_angles(reader: StripReader, scan: StripScan, survey: Survey, divergen
     """
     system = replace(survey.system, divergence=divergence)
     source = find_sensor(reader, scan, SensorRequest())
-    if source.distance is None:
+    spacing, figures = survey.figures["spacing_ns"], dict(survey.figures)
+    seen = None if source.distance is None else sample_reference(reader, scan, source, system, spacing)
+    if seen is not None and seen.divergence is not None:
+        figures["divergence_seen_mrad"] = seen.divergence
+        figures["divergence_seen_error_mrad"] = seen.divergence * seen.divergence_error
+    if divergence is None:
+        return replace(survey, figures=figures)
+    if seen is None:
         outlook = AngleOutlook(np.inf, 0.0, "the sensor's position is unknown: give --trajectory to `wavebatch run`")
     else:
-        spacing = survey.figures["spacing_ns"]
-        system = sample_level(reader, scan, source, system, spacing)
+        system = seen.system
         outlook = predict_angles(system, spacing, source.distance, divergence, survey.figures["amplitude_50"])
+        if seen.doubt():
+            outlook = replace(outlook, reason=f"{seen.doubt()}; {outlook.reason}")
     others = (decision for decision in survey.decisions if decision.part != Part.ANGLE)
     decisions = (*others, Decision(Part.ANGLE, outlook.possible, outlook.reason))
-    return replace(survey, system=system, decisions=decisions)
+    return replace(survey, system=system, figures=figures, decisions=decisions)

@@ -1,54 +1,35 @@
-"""The calibration of a sensor: its constant, the file CAL.toml, and the stages that it adds to a chain.
+"""The calibration of a sensor: its constants, what they were measured with, and the stages that it adds to a chain.
 
-`targets` measures a calibration, `wavebatch calibrate` writes it, `wavebatch run` reads it for each strip.
-Before you change it: files of earlier versions must stay readable.
+`targets` measures a calibration, `calibrating.calibration_file` keeps it as CAL.toml, and `wavebatch run` fits it to
+each strip with `calibrating.strip_match`. Before you change it: give new fields a default, since older files lack them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-from wavebatch import __version__
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
-from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml
 from wavebatch.stages.chain import STAGES, Chain, Step
 
-CALIBRATION_SCHEMA = "wavebatch.calibration/1"
-
 NEEDS_SENSOR = (
-    "range", "backscatter_coefficient", "cross_section", "reflectance", "incidence_angle", "relative_backscatter",
-    "relative_cross_section", "relative_reflectance",
+    "range", "backscatter_coefficient", "cross_section", "reflectance", "level_reflectance", "incidence_angle",
+    "amplitude_normalized", "amplitude_normalized_db", "relative_backscatter", "relative_cross_section",
+    "relative_reflectance",
 )  # fmt: skip
 """Columns that need the sensor's position."""
 
-_NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
-    "constant": (
-        "constant", 1e-30, 1e30, REQUIRED, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"
-    ),
-    "relative_error": ("relative_error", 0.0, 10.0, REQUIRED, "standard deviation of the constant, relative"),
-    "attenuation_db_km": ("attenuation", 0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
-    "divergence_mrad": (
-        "divergence", 1e-3, 100.0, None, "full angle of the beam between the 1/e^2 points; needed for m2"
-    ),
-    "section_constant": (
-        "section_constant", 0.0, 1e30, None, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
-    ),
-}  # fmt: skip
-"""Numbers of the file by key: field of Calibration, least and largest value, default, meaning."""
-
-_HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
-_TEXTS = ("strip", "date", "conditions")
+_REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
+_MOST_DESCRIBED = 8
+"""Strips that a description lists one by one."""
 
 
 @dataclass(frozen=True, slots=True)
 class TargetResult:
-    """What one reference target gave; the last three are None where it has too few echoes."""
+    """What one reference target gave; where it gave no constant, `refused` says why."""
 
     name: str
     reflectance: float
@@ -60,11 +41,26 @@ class TargetResult:
     """Robust standard deviation of the echoes' constants, relative."""
     incidence_deg: float | None = None
     """Median angle between ray and normal [deg]."""
+    incidence_error_deg: float | None = None
+    """Standard deviation of that angle [deg]."""
+    inset_m: float | None = None
+    """Echoes nearer to the outline than this do not count: their footprint is not all on the target [m]."""
+    edge: float | None = None
+    """Constant of the echoes near the outline over that of the others, less 1; None where they agree."""
+    strange: float = 0.0
+    """Share of its echoes that are far darker or brighter than the others."""
+    relative_error: float | None = None
+    """Standard deviation of the constant from this target alone, relative."""
+    refused: str = ""
+    """Why the target gave no constant."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelConstant:
-    """The calibration of one channel: a digitizer together with a scanner channel."""
+    """The calibration of one channel, a digitizer together with a scanner channel, and how that channel records.
+
+    What is None or empty is not known: the file is of an earlier version.
+    """
 
     digitizer: int
     """Index of the wave packet descriptor."""
@@ -76,6 +72,42 @@ class ChannelConstant:
     """Robust standard deviation of the echoes' constants, relative."""
     echoes: int = 0
     """Echoes that the constant was measured from."""
+    shot_energy: float = 0.0
+    """Scatter of the energy from shot to shot and of the targets' surfaces, relative: `spread` without fit errors."""
+    bits: int | None = None
+    """Bits per sample."""
+    samples: int | None = None
+    """Samples per waveform."""
+    spacing_ns: float | None = None
+    gain: float | None = None
+    """Volts per count, as the descriptor has it."""
+    pulse_ns: float | None = None
+    """Full width at half maximum of the system pulse [ns]."""
+
+    @property
+    def is_described(self) -> bool:
+        """Whether anything is known of how the channel records."""
+        return any(value is not None for value in (self.bits, self.spacing_ns, self.gain, self.pulse_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class StripConstant:
+    """The constant of one channel on one strip of the flight that was calibrated."""
+
+    strip: str
+    """Name of the strip's file."""
+    sha256: str
+    """Of the strip, from its fingerprint: a strip is known by it, not by its name."""
+    digitizer: int
+    scanner: int
+    constant: float
+    relative_error: float
+    drift: float = 0.0
+    """Constant over the mean constant of the channel, less 1."""
+    drift_error: float = 0.0
+    """Standard deviation of the drift."""
+    ties: int = 0
+    """Places that tie it to other strips or channels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,16 +125,34 @@ class Calibration:
     strip: str = ""
     date: str = ""
     conditions: str = ""
+    sensor: str = ""
+    """System identifier of the strip's header."""
+    flight: str = ""
+    """Day of the flight by GPS time, as 2026-11-22; empty where the time does not say."""
+    chain: str = ""
+    """Name of the chain that decomposed the echoes."""
+    decomposer: str = ""
+    """Its decompose stage."""
+    height: float | None = None
+    """Median height of the sensor above the targets [m]."""
+    distance: float | None = None
+    """Median distance from the sensor to the targets [m]."""
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     """Of the strip that was measured."""
     targets: tuple[TargetResult, ...] = ()
     channels: tuple[ChannelConstant, ...] = ()
     """Channels that have a constant of their own."""
+    strips: tuple[StripConstant, ...] = ()
+    """Constants of single strips, where several were calibrated together."""
+    notes: tuple[str, ...] = ()
+    """What is doubtful about it, one line each; not kept in the file."""
 
     @property
     def section_constant(self) -> float | None:
         """C_cal [1/(m2 count ns)]; None where the divergence is unknown."""
-        return None if self.divergence is None else 0.25 * math.pi * (1e-3 * self.divergence) ** 2 * self.constant
+        if self.divergence is None or math.isnan(self.constant):
+            return None
+        return 0.25 * math.pi * (1e-3 * self.divergence) ** 2 * self.constant
 
     def apply(self, system: SystemPulse) -> SystemPulse:
         """Return the system pulse with this calibration; a divergence that the system has already stays."""
@@ -111,6 +161,7 @@ class Calibration:
             calibration=self.constant,
             calibration_err=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
+            shot_error=max((row.shot_energy for row in self.channels), default=0.0),
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -118,11 +169,26 @@ class Calibration:
     def describe(self) -> dict[str, Any]:
         """Return the calibration as plain values for reports."""
         return {
-            **{key: getattr(self, name) for key, (name, *_) in _NUMBERS.items()},
-            "strip": self.strip,
-            "date": self.date,
+            "constant": None if math.isnan(self.constant) else self.constant,
+            "relative_error": self.relative_error,
+            "attenuation_db_km": self.attenuation,
+            "divergence_mrad": self.divergence,
+            "section_constant": self.section_constant,
+            **{name: getattr(self, name) for name in _REPORTED},
             "channels": [asdict(row) for row in self.channels],
+            "strips": self._describe_strips(),
         }
+
+    def _describe_strips(self) -> Any:
+        """The constants of single strips, or their number and hash: every cloud of a flight holds this description."""
+        if len(self.strips) <= _MOST_DESCRIBED:
+            return [asdict(row) for row in self.strips]
+        text = repr([tuple(asdict(row).values()) for row in self.strips])
+        return {"number": len(self.strips), "sha256": hashlib.sha256(text.encode(errors="replace")).hexdigest()}
+
+
+_CHOSEN: dict[str, dict[str, Any]] = {"attribute.incidence_angle_normals": {"radius": 0.0}}
+"""Parameters of stages that are added to a chain: the radius then follows the distance between the points."""
 
 
 def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bool) -> Chain:
@@ -147,121 +213,40 @@ def with_physics(chain: Chain, *, sensor: bool, calibrated: bool, divergence: bo
     names += ["attribute.incidence_angle"] if divergence else []
     names += ["attribute.backscatter_coefficient"] if calibrated else []
     names += ["attribute.cross_section"] if calibrated and divergence else []
-    names += ["attribute.reflectance"] if calibrated else []
-    return with_stages(chain, names)
+    have = {step.stage.name for step in chain.steps}
+    if calibrated and "attribute.reflectance" not in have:
+        names += ["attribute.level_reflectance", "attribute.incidence_angle_normals", "attribute.reflectance"]
+    added = tuple(Step(STAGES[name], _CHOSEN.get(name, {})) for name in names if name not in have)
+    return replace(chain, steps=(*chain.steps, *added)) if added else chain
 
 
-def find_makers(chain: Chain, columns: Iterable[str]) -> tuple[str, ...]:
-    """Find the attribute stages that a chain lacks for some columns.
+_USUAL = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+"""Stages that a shipped chain has or leaves out on purpose; asking for their columns does not add them."""
+
+
+def with_columns(chain: Chain, wanted: Iterable[str]) -> Chain:
+    """Add the attribute stages that make wanted columns, with those that they need, to the end of a chain.
 
     Parameters
     ----------
     chain : Chain
-    columns : iterable of str
-        Names in COLUMNS; those that no attribute stage makes are left out.
+    wanted : iterable of str
+        Names of columns; those that no stage makes are left to others.
 
     Returns
     -------
-    tuple of str
-        Names of stages, each after those whose columns it needs.
+    Chain
+        The same object where nothing is missing.
     """
-    have, found = set(chain.makes), []
-    for column in columns:
-        if column in have:
-            continue
-        maker = next((one for one in STAGES.values() if one.kind == "attribute" and column in one.makes), None)
-        if maker is not None:
-            before = find_makers(chain, [name for name in maker.needs if name not in have])
-            found += [name for name in (*before, maker.name) if name not in found]
-            have.update(*(STAGES[name].makes for name in (*before, maker.name)))
-    return tuple(found)
-
-
-def with_stages(chain: Chain, names: Iterable[str]) -> Chain:
-    """Return the chain with these stages at its end, with their default parameters; those that it has stay."""
-    have = {step.stage.name for step in chain.steps}
-    added = tuple(Step(STAGES[name]) for name in names if name not in have)
-    return replace(chain, steps=(*chain.steps, *added)) if added else chain
+    for name in wanted:
+        makers = [stage for stage in STAGES.values() if name in stage.makes and stage.name not in _USUAL]
+        if name not in chain.makes and makers:
+            step = Step(makers[0], _CHOSEN.get(makers[0].name, {}))
+            chain = with_columns(chain, step.needs)
+            chain = replace(chain, steps=(*chain.steps, step))
+    return chain
 
 
 def needs_sensor(chain: Chain) -> bool:
     """Return whether a chain computes a column that needs the sensor's position."""
     return any(name in NEEDS_SENSOR for name in chain.makes)
-
-
-def format_calibration(found: Calibration) -> str:
-    """Return the TOML text of a calibration; `parse_calibration` gives the same constants again."""
-    numbers = {key: getattr(found, name) for key, (name, *_) in _NUMBERS.items()}
-    document = {
-        "schema": CALIBRATION_SCHEMA,
-        "version": __version__,
-        **{key: getattr(found, key) for key in _TEXTS},
-        **{key: None if value is None else float(value) for key, value in numbers.items()},
-        "channel": [asdict(row) for row in found.channels] or None,
-        "target": [asdict(row) for row in found.targets] or None,
-        "fingerprint": {key: item for key, item in found.fingerprint.items() if not isinstance(item, Mapping)} or None,
-    }
-    return format_toml(document, heading=_HEADING, comments={key: row[-1] for key, row in _NUMBERS.items()})
-
-
-def load_calibration(path: Path | str) -> Calibration:
-    """Read a calibration file; raises ConfigError, in one line, where it cannot be read or is wrong."""
-    return parse_calibration(read_text(path, "calibration file"), str(path))
-
-
-def parse_calibration(text: str, name: str) -> Calibration:
-    """Read the TOML text of a calibration.
-
-    Parameters
-    ----------
-    text : str
-    name : str
-        Start of every message, usually the path.
-
-    Returns
-    -------
-    Calibration
-        Without `targets` and `fingerprint`, which nothing uses after the measurement.
-
-    Raises
-    ------
-    ConfigError
-        When a key is unknown, missing or out of its range, or where section_constant does not fit the others.
-    """
-    table = parse_toml(text, name)
-    table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, "channel", "target", "fingerprint"))
-    table.check_schema(CALIBRATION_SCHEMA)
-    values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
-    section = values.pop("section_constant")
-    texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
-    channels: dict[tuple[int, int], ChannelConstant] = {}
-    for row in table.tables("channel"):
-        channel = _read_channel(row)
-        key = (channel.digitizer, channel.scanner)
-        if key in channels:
-            raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} is there already")
-        channels[key] = channel
-    found = Calibration(**values, **texts, channels=tuple(channels.values()))
-    if section is not None:
-        _check_section(section, found, name)
-    return found
-
-
-def _check_section(section: float, found: Calibration, name: str) -> None:
-    """Raise ConfigError where C_cal does not follow from the other two: one was changed by hand."""
-    expected = found.section_constant
-    if expected is None or abs(section - expected) > 1e-3 * expected:
-        wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
-        problem = f"section_constant is {section!r}, but there is {wanted}"
-        raise ConfigError(f"{name}: {problem}; correct these, or leave section_constant out")
-
-
-def _read_channel(table: TomlTable) -> ChannelConstant:
-    table.check_keys(ChannelConstant.__dataclass_fields__)
-    return ChannelConstant(
-        table.integer("digitizer", 1, 255),
-        table.integer("scanner", 0, 3, 0),
-        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
-        spread=table.number("spread", 0.0, 1e6, 0.0),
-        echoes=table.integer("echoes", 0, 10**12, 0),
-    )

@@ -25,7 +25,7 @@ from wavebatch.surveying.system_file import SavedSurvey, describe_system
 SAMPLE_SAMPLES = 1 << 21
 """Most samples that a survey reads: 8192 waveforms of 256 samples."""
 
-LEAST_WAVEFORMS = 256
+LEAST_WAVEFORMS = 64
 """Waveforms that it reads even if they are long."""
 
 COSTS = ("fast", "balanced", "accurate")

@@ -1,93 +1,279 @@
-"""The width of echoes from level ground: the reference against which widths of slopes are compared.
+"""How wide the echo of a surface is that faces the sensor: the reference against which widths of slopes are compared.
 
 A survey takes the narrowest echoes for those of level ground seen from above. Few are: across a swath, rays hit level
-ground at up to half the field of view. A reference that is 1 % too wide turns 5 degrees into 2. Where the sensor's
-position and the divergence are known, the broadening by each ray's angle is removed first (docs/algorithms.md 1.4).
-`angle_limits` calls it.
+ground at up to half the field of view, and a hillside has none. A reference 1 % too wide turns 5 degrees into 2.
+So echoes are used whose surface is known from the points around them, whatever its slope: what the slope adds to the
+width is taken off. The same echoes show the beam's divergence, where their surfaces differ in angle (docs/algorithms.md
+1.4). `angle_limits` calls it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import UNCLEAN
-from wavebatch.core.units import SQUARED_NORMAL_MEDIAN
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.physics.incidence import spread_of_angle
-from wavebatch.stages.attribute.radiometry import is_alone, level_angle
+from wavebatch.files.las.point_formats import locate
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
+from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
 
+SAMPLED_UNITS = 8
+"""Units of a strip whose points are read to find planes."""
 
-def measure_level(blocks: Iterable[WaveformBlock], system: SystemPulse, spacing: float) -> SystemPulse:
-    """Measure variance and scatter of the widths of level ground seen from above.
+LEAST_NEIGHBOURS = 8
+"""Points of a plane, as by default in stage attribute.incidence_angle_normals."""
+
+RADII = (1.5, 12.0)
+"""Least and largest radius of a neighbourhood that is chosen by the distance between points [m]."""
+
+LARGEST_ANGLE, LARGEST_ERROR = np.radians(50.0), 3.0
+"""Surfaces struck at a larger angle [rad], or known less well [deg], say little about the reference."""
+
+GROUPS = 12
+"""Groups of echoes by angle, through whose median widths the first line for the divergence goes."""
+
+LEAST_DIVERGENCE_ERROR = 0.03
+"""Relative error of a divergence from widths at best: rough ground widens echoes too, by a little."""
+
+LARGEST_DIVERGENCE_ERROR = 0.25
+"""A divergence that is known less well than this is not given."""
+
+
+class Slopes(NamedTuple):
+    """Sampled waveforms, and the angles at which their rays strike the surface around the return."""
+
+    block: WaveformBlock
+    """With the sensor's positions."""
+    incidence: np.ndarray
+    """float64 (n,), rad; NaN where the points around form no plane."""
+    error: np.ndarray
+    """float64 (n,), rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """What echoes of surfaces of known slope show."""
+
+    system: SystemPulse
+    """With `level_variance`, `level_error` and `width_scatter`."""
+    echoes: int
+    """Clean single echoes whose surface is known."""
+    divergence: float | None = None
+    """Of the beam by the widths over the angles [mrad]; None where they do not tell."""
+    divergence_error: float = 0.0
+    """Its relative standard deviation."""
+
+    def doubt(self) -> str:
+        """Return a sentence where the system's divergence contradicts the widths; empty where it does not."""
+        given = self.system.divergence
+        if given is None or self.divergence is None:
+            return ""
+        if abs(given / self.divergence - 1.0) < 3.0 * self.divergence_error:
+            return ""
+        return (
+            f"a beam of {given:g} mrad contradicts the echo widths, which grow with the slopes of surfaces as those of "
+            f"a beam of {self.divergence:.3g} +- {self.divergence * self.divergence_error:.2g} mrad do: "
+            "cross sections and angles are wrong unless the surfaces are rough; check divergence_mrad"
+        )
+
+
+def choose_radius(reader: StripReader, scan: StripScan) -> float:
+    """Choose the radius of neighbourhoods by the distance between the points of a strip.
 
     Parameters
     ----------
-    blocks : iterable of WaveformBlock
-        Sampled over the strip, with the sensor's positions; blocks of another spacing are left out.
-    system : SystemPulse
-        With the beam's divergence.
-    spacing : float
-        Of the samples that are used [ns].
+    reader : StripReader
+    scan : StripScan
 
     Returns
     -------
-    SystemPulse
-        With `level_variance` and `width_scatter`; unchanged where the divergence is unknown or fewer than 50 clean
-        echoes are found.
+    float
+        Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS; at least 1.5, at most 12.
     """
-    parts = [
-        _measure(block, system)
-        for block in blocks
-        if block.sensor is not None and block.spacing == spacing and block.digitizer.index not in system.digitizers
-    ]
-    if system.divergence is None or not parts:
+    unit = reader.read_unit(reader.unit_count() // 2, scan)
+    return _choose_radius(locate(unit.points, reader.facts.header)) if len(unit.points) else RADII[0]
+
+
+def _choose_radius(xyz: np.ndarray) -> float:
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    number = LEAST_NEIGHBOURS * 3 // 2
+    if len(xyz) <= number:
+        return RADII[0]
+    some = xyz[:: max(len(xyz) // 500, 1)]
+    distance = scipy.spatial.cKDTree(xyz).query(some, k=number)[0][:, -1]
+    return float(np.clip(np.ceil(10.0 * np.quantile(distance, 0.9)) / 10.0, *RADII))
+
+
+def sample_slopes(reader: StripReader, scan: StripScan, fill: object, n_waveforms: int) -> Iterator[Slopes]:
+    """Yield waveforms spread over a strip with the slopes of the surfaces that they hit.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+    fill : SensorSource
+        Positions of the sensor.
+    n_waveforms : int
+        About so many.
+
+    Yields
+    ------
+    Slopes
+    """
+    units = reader.unit_count()
+    chosen = (
+        np.unique(np.linspace(0, units - 1, min(units, SAMPLED_UNITS)).round().astype(int)).tolist() if units else []
+    )
+    for number in chosen:
+        unit = reader.read_unit(number, scan)
+        rows = np.flatnonzero(unit.packets.owned)
+        rows = rows[:: max(len(rows) * len(chosen) // max(n_waveforms, 1), 1)]
+        xyz = locate(unit.points, reader.facts.header)
+        xyz = xyz[np.isfinite(xyz).all(axis=1)]
+        radius = _choose_radius(xyz)
+        around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
+        for block, _ in reader.read_rows(unit, rows, 4096):
+            yield _measure_slopes(fill.fill(block), around, radius)
+
+
+def _measure_slopes(block: WaveformBlock, around: Surroundings, radius: float) -> Slopes:
+    """The slopes at the last return of each waveform."""
+    place = np.full((len(block), 3), np.nan)
+    if block.returns is not None:
+        place[block.returns.waveform] = block.returns.xyz
+    (angle, error), _ = measure_normals(
+        place, block.direction, around, radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR
+    )
+    return Slopes(block, *(np.radians(values.astype(np.float64)) for values in (angle, error)))
+
+
+def measure_reference(samples: Iterable[Slopes], system: SystemPulse, spacing: float) -> Reference:
+    """Measure variance and scatter of the widths of surfaces that face the sensor, and the beam's divergence.
+
+    Parameters
+    ----------
+    samples : iterable of Slopes
+        Sampled over the strip.
+    system : SystemPulse
+        With the beam's divergence, where it is known.
+    spacing : float
+        Of the samples of the main digitizer [ns]; other digitizers have pulses of their own in `system.digitizers`.
+
+    Returns
+    -------
+    Reference
+        `level_error` is infinite where fewer than 50 clean echoes of surfaces of known slope are found: widths then
+        mean no angle. Without a divergence the system stays as it is.
+    """
+    parts: dict[int | None, list[np.ndarray]] = {}
+    for sample in samples:
+        block, index = sample.block, sample.block.digitizer.index
+        if block.sensor is None or (index not in system.digitizers and block.spacing != spacing):
+            continue
+        parts.setdefault(index if index in system.digitizers else None, []).append(_measure(sample, system))
+    found = {index: np.concatenate(rows, axis=1) for index, rows in parts.items()}
+    others = {
+        index: _refer(replace(other, divergence=system.divergence), found.get(index, np.empty((4, 0))))
+        for index, other in system.digitizers.items()
+    }
+    main = found.get(None, np.empty((4, 0)))
+    divergence, error = _fit_divergence(*main)
+    return Reference(replace(_refer(system, main), digitizers=others), main.shape[1], divergence, error)
+
+
+def _refer(system: SystemPulse, rows: np.ndarray) -> SystemPulse:
+    """The system of one digitizer with the reference from echoes (4, n): see `_measure`."""
+    if system.divergence is None:
         return system
-    variance, error = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    variance, error, lever, lever_err = rows
+    square = (1e-3 * system.divergence) ** 2
+    variance, error = variance - square * lever, np.hypot(error, square * lever_err)
     if len(variance) < ENOUGH_TO_LEARN:
-        return system
+        return replace(system, level_error=np.inf)
     # The survey's pulse may include slopes, so the true one can be narrower, but never wider.
-    level = min(_find_level(variance, error), 0.0)
+    level, level_err = _find_level(variance, error)
+    level = min(level, 0.0)
     below = variance < level
     ratio = np.median(((level - variance[below]) / error[below]) ** 2) / SQUARED_NORMAL_MEDIAN if below.any() else 1.0
     excess = np.median(error[below] ** 2) * max(float(ratio) - 1.0, 0.0) if below.any() else 0.0
     scatter = float(np.sqrt(excess) / (2.0 * system.sigma_ref))
-    return replace(system, level_variance=level, width_scatter=scatter)
+    level_err = float(np.hypot(level_err, 2.0 * square * np.median(lever) * system.divergence_error))
+    return replace(system, level_variance=level, level_error=level_err, width_scatter=scatter)
 
 
-def _find_level(variance: np.ndarray, error: np.ndarray) -> float:
-    """The mode of variances (n,), then the weighted mean of those within two errors of it, until it stays."""
-    level = _find_mode(variance)
+def _find_level(variance: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """The mode of variances (n,), then the mean of those within two errors of it, until it stays; its error."""
+    level, level_err = _find_mode(variance), float(np.median(error))
     for _ in range(ROUNDS):
         near = np.abs(variance - level) < 2.0 * error
         if np.count_nonzero(near) < ENOUGH_TO_LEARN:
             break
         weight = error[near] ** -2.0
         level = float((weight * variance[near]).sum() / weight.sum())
-    return level
+        level_err = float(weight.sum() ** -0.5)
+    return level, level_err
 
 
-def _measure(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.ndarray]:
-    """Variance beyond the system's and beyond what level ground adds [ns2], and its error, of clean echoes."""
-    system = replace(system, level_variance=0.0, width_scatter=0.0)
+def _measure(sample: Slopes, system: SystemPulse) -> np.ndarray:
+    """Clean echoes of surfaces of known slope, float64 (4, m).
+
+    Variance beyond the system's and its error [ns2]; what a beam of 1 rad would add, and its error [ns2].
+    """
+    block = sample.block
+    system = replace(system.of(block), level_variance=0.0, level_error=None, width_scatter=0.0)
     echoes = decompose_sample(block, system)
     clean = is_alone(block, echoes) & (echoes.amplitude > MIN_SNR * system.noise_std)
     echoes = echoes.take(np.flatnonzero(clean & ((echoes.flags & np.uint16(UNCLEAN)) == 0)))
     variance, error = added_variance(block, system, echoes, "system", 0.0)
     row = echoes.waveform
     off = block.origin[row] + block.direction[row] * echoes.time[:, None] - block.sensor[row]
-    distance = np.sqrt((off * off).sum(axis=1))
-    divergence = np.nan if system.divergence is None else 1e-3 * system.divergence
-    level = spread_of_angle(level_angle(block)[row], distance, divergence)
-    known = np.isfinite(variance) & np.isfinite(level) & (error > 0)
-    return (variance - level * level)[known], error[known]
+    angle, angle_err = sample.incidence[row], sample.error[row]
+    arm = 0.5 / C * np.sqrt((off * off).sum(axis=1))
+    lever = (arm * np.tan(angle)) ** 2
+    lever_err = 2.0 * arm * arm * np.tan(angle) / np.cos(angle) ** 2 * angle_err
+    rows = np.stack([variance, error, lever, lever_err])
+    return rows[:, np.isfinite(rows).all(axis=0) & (error > 0) & (angle < LARGEST_ANGLE)]
+
+
+def _fit_divergence(
+    variance: np.ndarray, error: np.ndarray, lever: np.ndarray, lever_err: np.ndarray
+) -> tuple[float | None, float]:
+    """Divergence [mrad] and its relative error from the growth of variances with the lever; None where unknown."""
+    if len(variance) < GROUPS * ENOUGH_TO_LEARN // 2:
+        return None, 0.0
+    groups = np.array_split(np.argsort(lever, kind="stable"), GROUPS)
+    middle = np.array([(np.median(lever[rows]), np.median(variance[rows])) for rows in groups])
+    square, level = np.polyfit(*middle.T, 1)
+    for _ in range(ROUNDS):
+        total = np.hypot(error, max(square, 0.0) * lever_err)
+        left = variance - level - square * lever
+        # Rough surfaces and plants only widen echoes, so that the scatter is that of the lower half.
+        scatter = np.sqrt(np.median((left[left < 0] / total[left < 0]) ** 2) / SQUARED_NORMAL_MEDIAN)
+        total = total * max(scatter, 1.0) if np.isfinite(scatter) else total
+        near = np.abs(left) < 2.5 * total
+        weight = np.where(near, total**-2.0, 0.0)
+        mean = (weight * lever).sum() / weight.sum()
+        spread = (weight * (lever - mean) ** 2).sum()
+        if np.count_nonzero(near) < ENOUGH_TO_LEARN or not spread > 0:
+            return None, 0.0
+        square = float((weight * (lever - mean) * variance).sum() / spread)
+        level = float((weight * variance).sum() / weight.sum() - square * mean)
+    if square <= 0:
+        return None, 0.0
+    relative = float(np.hypot(0.5 * spread**-0.5 / square, LEAST_DIVERGENCE_ERROR))
+    return (None, 0.0) if relative > LARGEST_DIVERGENCE_ERROR else (1e3 * float(np.sqrt(square)), relative)
 
 
 def _find_mode(values: np.ndarray) -> float:

@@ -108,7 +108,7 @@ def check_file(path: Path | str, *, direction: str = "auto", headerless: bool = 
             reader.scan(tolerant=True) as scan,
         ):
             return _check_strip(path, reader, scan)
-    except InputError as error:
+    except (OSError, ConfigError, MemoryError) as error:  # the other files are still checked
         return Findings(str(path), (_without_name(path, error),), ())
 
 

@@ -10,10 +10,11 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
+from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.stages.decompose.fit import adaptive, closed_form
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
+from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
 from wavebatch.surveying.measure import (
     ALONE,
     ENOUGH_TO_LEARN,
@@ -22,7 +23,6 @@ from wavebatch.surveying.measure import (
     find_edge,
     find_strongest,
     keep_lone,
-    render_own,
     subtract_echoes,
 )
 
@@ -114,10 +114,34 @@ def refine_pulse(
     chosen = _nearest_to_edge(echoes.take(clear))
     if len(chosen) < ENOUGH_TO_LEARN:
         return system, chosen
-    rows = np.arange(len(chosen))
-    signal = subtract_echoes(block, system, echoes)[chosen.waveform]
-    signal += render_own(block, system, chosen, rows, len(chosen))
-    return _learn(block, system, chosen, signal, figures), chosen
+    signal, first = _lift(block, system, echoes, chosen)
+    return _learn(block, system, chosen, signal, figures, first=first), chosen
+
+
+def _lift(
+    block: WaveformBlock, system: SystemPulse, echoes: EchoTable, chosen: EchoTable
+) -> tuple[np.ndarray, np.ndarray]:
+    """The signal of each chosen echo without all others, float32 (m, k), and the first of its samples, int64 (m,).
+
+    Only the samples that are stacked: a waveform of 65,536 samples may hold thousands of chosen echoes.
+    """
+    s = block.samples.shape[1]
+    before, after = _reach(block, system)
+    length = min(int(np.ceil(before + after)) + 2, s)
+    first = np.clip(np.floor(chosen.time / block.spacing - before), 0, s - length).astype(np.int64)
+    at = first[:, None] + np.arange(length)
+    signal = subtract_echoes(block, system, echoes)[chosen.waveform[:, None], at]
+    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing)
+    whole = np.stack([chosen.amplitude, chosen.time / block.spacing, chosen.sigma / block.spacing], axis=1)
+    main = model_parameters(shape, limits, whole.astype(np.float64)).astype(np.float32)
+    signal += evaluate_pulse(shape, at.astype(np.float32), main[:, 1:2], main[:, 2:3])[0] * main[:, :1]
+    return signal, first
+
+
+def _reach(block: WaveformBlock, system: SystemPulse) -> tuple[float, float]:
+    """How far the learned pulse reaches before and after its centre [samples]."""
+    half = max(system.sigma_ref / block.spacing / 2, 1)
+    return BEFORE * half, AFTER * half
 
 
 def _find_separate(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
@@ -172,12 +196,12 @@ def _learn(
     signal: np.ndarray,
     figures: dict[str, float],
     most: int = MOST_COMPONENTS,
+    first: np.ndarray | int = 0,
 ) -> SystemPulse:
-    """The pulse of echoes whose signal (m, s), without baseline and other echoes, is given."""
+    """The pulse of echoes whose signal (m, k), without baseline and other echoes, is given from the sample `first`."""
     width = system.sigma_ref / block.spacing
-    before, after = BEFORE * max(width / 2, 1), AFTER * max(width / 2, 1)
     amplitude, time = main.amplitude.astype(np.float64), main.time / block.spacing
-    stack = stack_pulse(signal, amplitude, time, before, after, QUANTISATION_STD)
+    stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
     sums = fit_gaussians(stack, width, most)

@@ -16,7 +16,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.trajectory import Trajectory, solve_offset
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.geojson_crs import find_crs
-from wavebatch.files.strip.ray_sample import Rays, sample_rays
+from wavebatch.files.strip.ray_sample import Rays, measure_scale, sample_rays
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.files.trajectory_file import read_trajectory
 from wavebatch.kernels.geometry.ray_convergence import SensorFit, fit_best, range_error, sensor_at
@@ -44,6 +44,16 @@ LARGEST_ANGLE = np.radians(2.0)
 
 FOOT = 0.3048
 """International foot [m]."""
+
+LEAST_OVERLAPS = 3
+"""Smallest number of overlapping windows whose positions show by how much the motion leaves the fits' polynomials."""
+
+JERK, JERK_LEFT = 1.0, 0.025
+"""Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
+parabola leaves of it: a root mean square of JERK half^3 times this."""
+
+LEAST_DOUBT = 2.0
+"""Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
 
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known."""
@@ -108,6 +118,17 @@ class SensorSource:
             back = block.direction * ((low[:, None] + self.height - block.origin[:, 2:]) / down)
         return replace(block, sensor=np.where(down > 0, block.origin - back, np.nan))
 
+    def doubt(self) -> str:
+        """Return the line about a trajectory that contradicts the packet vectors; empty where it does not."""
+        if self.farther is None or abs(self.farther) <= max(LEAST_DOUBT, 5.0 * (self.vectors_error or 0.0)):
+            return ""
+        which = "farther" if self.farther > 0 else "nearer"
+        return (
+            f"range: by the trajectory echoes are {abs(self.farther):.1f} m {which} than by the packets' vectors, "
+            f"whose error is {self.vectors_error:.2g} m; are the heights of one above the geoid, of the other above "
+            "the ellipsoid?"
+        )
+
     def describe(self) -> dict[str, Any]:
         """Return kind, errors and the other values for reports."""
         report = {"source": self.kind, "range_error_m": round(self.error, 6) or None, **dict(self.facts)}
@@ -156,7 +177,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
 
 
 def refuse_units(reader: StripReader, scan: StripScan) -> None:
-    """Raise InputError where the coordinates are not in metres, or where the packet vectors make that doubtful."""
+    """Raise InputError where the coordinates are not in metres, or where the packets make that doubtful."""
     path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
     remedy = "project the strip to metres, or leave out the stages that measure in metres"
     for unit in units:
@@ -167,6 +188,13 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
             f"that its coordinates are in feet: {remedy}"
         )
+    if all(unit.horizontal is None for unit in units):
+        scale = measure_scale(reader, scan)
+        if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
+            raise InputError(
+                f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
+                f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
+            )
 
 
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
@@ -303,15 +331,30 @@ def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle:
 
 
 def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: Rays) -> float:
-    """Root mean square of the range's error over all windows [m]."""
-    squares = []
-    for fit, _, within in found:
+    """Root mean square of the range's error over all windows [m]: what the fits say, and what they contradict."""
+    squares, apart = [], []
+    for number, (fit, _, within) in enumerate(found):
         near = np.abs(rays.time - fit.centre) <= fit.half
         direction = rays.direction[near][:64]
         direction = direction / np.sqrt((direction**2).sum(axis=1))[:, None]
         at = np.full(len(direction), within[len(within) // 2])
         squares.append(np.mean(range_error(fit, at, direction) ** 2))
-    return float(np.sqrt(np.mean(squares)))
+        later = found[number + 1][0] if number + 1 < len(found) else None
+        if later is not None and later.centre - fit.centre <= fit.half + later.half:
+            apart.append(np.mean((direction @ _contradiction(fit, later)) ** 2))
+    if len(apart) >= LEAST_OVERLAPS:
+        motion = 0.5 * np.mean(apart)  # both windows are off
+    else:
+        motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
+    return float(np.sqrt(np.mean(squares) + motion))
+
+
+def _contradiction(fit: SensorFit, later: SensorFit) -> np.ndarray:
+    """Difference of the positions from two overlapping windows, in the middle of what they share [m]."""
+    low = max(fit.centre - fit.half, later.centre - later.half)
+    high = min(fit.centre + fit.half, later.centre + later.half)
+    middle = np.array([0.5 * (low + high)])
+    return (sensor_at(later, middle)[0] - sensor_at(fit, middle)[0])[0]
 
 
 def _describe(

@@ -57,6 +57,7 @@ class CloudReader(Closing):
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
         self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        self.bounds = checked.header.mins, checked.header.maxs
         self._format = describe_format(checked)
         names = set(self._format.dimension_names)
         self.has_gps_time = "gps_time" in names

@@ -6,8 +6,10 @@ path and nothing that depends on the number of processes into the file.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
     GEOTIFF_ID,
+    MAX_EVLRS,
     PROJECTION,
     SOFTWARE,
     WAVEFORM_RECORD_ID,
@@ -41,6 +44,8 @@ from wavebatch.files.las.header import (
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
 
 _DESCRIPTORS = range(100, 356)
+MOST_PAYLOAD = 65535
+"""Bytes that a VLR can hold."""
 
 
 class CloudWriter(PointFile):
@@ -60,6 +65,8 @@ class CloudWriter(PointFile):
         self._inputs = [layout.source.path, *([packets.file] if packets else [])]
         self._evlrs, self.dropped = _choose_evlrs(layout.source.path, layout.source.header)
         header = _build_header(layout, provenance, self._evlrs)
+        for name in _clean_ids(header.vlrs):
+            self.dropped[name] = "bytes of its id or description that are no UTF-8 text are question marks"
         with protecting(self._inputs):
             super().__init__(target, header, layout.dtype, layout.extra_records, overwrite=overwrite)
 
@@ -68,7 +75,9 @@ class CloudWriter(PointFile):
             for evlr in self._evlrs:
                 start = evlr.start + EVLR_HEADER_SIZE
                 source.seek(evlr.start)
-                self.append_record(source.read(EVLR_HEADER_SIZE), source, start, start + evlr.length)
+                head = source.read(EVLR_HEADER_SIZE)
+                head = head[:2] + _as_text(head[2:18]) + head[18:28] + _as_text(head[28:])
+                self.append_record(head, source, start, start + evlr.length)
         packets = self._layout.packets
         if packets is None:
             return
@@ -102,7 +111,7 @@ def _choose_evlrs(path: Path, header: LasHeader) -> tuple[list[Evlr], dict[str, 
         else:
             kept.append(evlr)
     if missing:
-        dropped[f"{missing} EVLRs"] = "they lie outside the file"
+        dropped[f"{missing} EVLRs"] = f"they lie outside the file, or after the first {MAX_EVLRS}"
     return kept, dropped
 
 
@@ -140,6 +149,27 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
     )
 
 
+def _clean_ids(vlrs: list[Vlr]) -> list[str]:
+    """Make ids and descriptions UTF-8, in place, and name the records: laspy opens no file with others."""
+    changed = []
+    for place, vlr in enumerate(vlrs):
+        clean = replace(vlr, user_id=_as_text(vlr.user_id), description=_as_text(vlr.description))
+        if clean != vlr:
+            vlrs[place] = clean
+            changed.append(f"VLR {clean.user} {vlr.record_id}")
+    return changed
+
+
+def _as_text(field: bytes) -> bytes:
+    """The field, with question marks for bytes before its first NUL that are not UTF-8."""
+    text, end, rest = field.partition(b"\0")
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        return text.decode("ascii", "replace").replace("\ufffd", "?").encode() + end + rest
+    return field
+
+
 def _is_carried(vlr: Vlr, layout: OutputLayout) -> bool:
     if vlr.user == "copc":
         return False
@@ -153,13 +183,46 @@ def _plain(value: Any) -> Any:
 
 
 def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], number: int) -> Vlr:
-    """JSON with sorted keys and no time of day; it also keeps which program wrote the input, and names the columns."""
+    """JSON with sorted keys and no time of day; it also keeps which program wrote the input, and names the columns.
+
+    What a VLR cannot hold, for example the pulses of 180 digitizers, is left out and named; the report has it.
+    """
     path, source = layout.source.path, layout.source.header
     made_by = {key: decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
     columns = {written.column: written.record.name for written in layout.written}
     account = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
-    text = json.dumps(account, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
-    payload = text.encode(errors="backslashreplace")
-    if len(payload) > 65535:
-        raise ConfigError(f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most 65535")
+    payload = _encode_json(account)
+    if len(payload) > MOST_PAYLOAD:
+        payload = _encode_json(_shorten(json.loads(payload)))
+    if len(payload) > MOST_PAYLOAD:
+        raise ConfigError(
+            f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
+        )
     return Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
+
+
+def _encode_json(value: Any) -> bytes:
+    text = json.dumps(value, sort_keys=True, ensure_ascii=False, separators=(",", ":"), default=_plain)
+    return text.encode(errors="backslashreplace")
+
+
+def _shorten(account: dict[str, Any]) -> dict[str, Any]:
+    """The account, with the largest tables and lists replaced by their checksums until it fits into a VLR."""
+    parts = sorted(_list_parts(account, ""), key=lambda part: (-part[0], part[1]))
+    left_out: dict[str, str] = {}
+    account["left_out"] = {"why": "a VLR is too small; the report of the strip has them", "sha256": left_out}
+    for _, name, holder, key in parts:
+        if len(_encode_json(account)) <= MOST_PAYLOAD:
+            break
+        left_out[name] = hashlib.sha256(_encode_json(holder[key])).hexdigest()
+        holder[key] = None
+    return account
+
+
+def _list_parts(table: dict[str, Any], prefix: str) -> Iterator[tuple[int, str, dict[str, Any], str]]:
+    """Bytes, dotted name, table and key of every list and of every table without tables."""
+    for key, value in table.items():
+        if isinstance(value, dict) and any(isinstance(item, dict | list) for item in value.values()):
+            yield from _list_parts(value, f"{prefix}{key}.")
+        elif isinstance(value, dict | list | str):
+            yield len(_encode_json(value)), f"{prefix}{key}", table, key

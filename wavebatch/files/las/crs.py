@@ -10,12 +10,12 @@ import json
 import math
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from wavebatch.files.las.epsg_units import find_unit
 from wavebatch.files.las.header import EVLR_HEADER_SIZE, GEOTIFF_ID, WKT_ID, LasHeader, find_evlrs, is_projection
-from wavebatch.files.strip.packets import MAX_EVLRS
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
@@ -25,14 +25,25 @@ _MAX_RECORD = 1 << 20
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
 _MODEL, _LINEAR, _LINEAR_SIZE, _VERTICAL = 1024, 3076, 3077, 4099
+_GEOGRAPHIC_CODE, _PROJECTED_CODE, _VERTICAL_CODE = 2048, 3072, 4096
 _MODELS = {1: "projected", 2: "geographic", 3: "geocentric"}
 _USER_DEFINED, _UNIT_CODES = 32767, range(9001, 9200)
+_LEAST_CODE = 1024
+"""Least EPSG code; smaller values are those of other tables."""
 METRES = {
     9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937, 9004: 0.3048122529845059, 9005: 0.3047972654, 9006: 0.3047995142,
     9014: 1.8288, 9015: 1853.248, 9030: 1852.0, 9036: 1000.0, 9037: 0.9143917963, 9060: 0.30479951024814694,
     9093: 1609.344, 9096: 0.9144,
 }  # fmt: skip
 """Metres per unit by EPSG code of the unit (GeoTIFF specification 6.3.1.3)."""
+
+_EARTH = (6.34e6, 6.40e6)
+"""Distance of land from the centre of the Earth [m]: 6,357 km at the poles to 6,378 km at the equator, and room for
+mountains.
+"""
+
+_HIGHEST = 3e4
+"""Height that no projected strip has, be it in metres or feet."""
 
 _NAMES = {1.0: "metres", 0.3048: "international feet", 1200 / 3937: "US survey feet"}
 
@@ -64,6 +75,16 @@ class CrsUnits:
         return along if self.vertical is None or up == along else f"{along} with heights in {up}"
 
 
+def looks_geocentric(mins: Sequence[float], maxs: Sequence[float]) -> bool:
+    """Whether the extent of a strip lies on the surface of the Earth as seen from its centre.
+
+    Projected coordinates may be as far from their origin, but none has heights of tens of kilometres.
+    """
+    middle = [0.5 * (low + high) for low, high in zip(mins, maxs, strict=True)]
+    distance = math.hypot(*middle)
+    return _EARTH[0] < distance < _EARTH[1] and abs(middle[2]) > _HIGHEST
+
+
 def _name_unit(metres: float | None) -> str:
     if metres is None:
         return "metres"
@@ -74,7 +95,10 @@ def _name_unit(metres: float | None) -> str:
 
 
 def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits, ...]]:
-    """Return the WKT of a strip, else the name in its GeoTIFF keys, else None, and the units that each gives."""
+    """Return the WKT of a strip, else code or name of its GeoTIFF keys, else None, and the units that each gives.
+
+    Where none gives a kind or a unit, coordinates that are geocentric by their size are one more entry.
+    """
     records = _read_records(path, header)
     units, text = [], None
     if WKT_ID in records:
@@ -82,15 +106,17 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
         units.append(parse_wkt(text or ""))
     if GEOTIFF_ID in records:
         citation = records.get(CITATION_ID, b"").split(b"\0")[0].decode("latin-1").strip("| ")
-        text = text or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
+        text = text or _read_code(records[GEOTIFF_ID]) or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
         units.append(parse_geotiff(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b"")))
+    if all(unit == CrsUnits() for unit in units) and looks_geocentric(header.mins, header.maxs):
+        units.append(CrsUnits("geocentric"))
     return text, tuple(units)
 
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
-    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
+    evlrs, _ = find_evlrs(path, header)
     for evlr in evlrs:
         new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
         if new and evlr.length <= _MAX_RECORD:
@@ -103,16 +129,37 @@ def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
 def parse_geotiff(directory: bytes, doubles: bytes = b"", texts: bytes = b"") -> CrsUnits:
     """Return the units of a GeoKeyDirectory (34735); `doubles` and `texts` are the records 34736 and 34737.
 
-    If no key gives the unit, a citation that names feet does: the EPSG code of a projected CRS implies a unit, but
-    only the EPSG tables know it.
+    If no key gives the unit, the EPSG code of the CRS does (`epsg_units`), then a citation that names feet.
     """
-    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
-    keys = {key: (place, value) for key, place, _, value in rows[1 : rows[0][3] + 1]} if rows else {}
+    keys = _list_keys(directory)
     kind = _MODELS.get(keys.get(_MODEL, (0, 0))[1])
-    horizontal = _read_unit(keys, _LINEAR, doubles)
+    horizontal, vertical = _read_unit(keys, _LINEAR, doubles), _read_unit(keys, _VERTICAL, doubles)
     if horizontal is None and kind != "geographic":
-        horizontal = _guess_unit(texts.decode("latin-1"))
-    return CrsUnits(kind, horizontal, _read_unit(keys, _VERTICAL, doubles))
+        horizontal = find_unit(_find_code(keys, _PROJECTED_CODE)) or _guess_unit(texts.decode("latin-1"))
+    if vertical is None:
+        vertical = find_unit(_find_code(keys, _VERTICAL_CODE), vertical=True)
+    return CrsUnits(kind, horizontal, vertical)
+
+
+def _list_keys(directory: bytes) -> dict[int, tuple[int, int]]:
+    """Place and value of each key."""
+    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
+    return {key: (place, value) for key, place, _, value in rows[1 : rows[0][3] + 1]} if rows else {}
+
+
+def _find_code(keys: Mapping[int, tuple[int, int]], key: int) -> int:
+    """The EPSG code in a key, 0 without one."""
+    place, code = keys.get(key, (0, 0))
+    return code if place == 0 and _LEAST_CODE <= code < _USER_DEFINED else 0
+
+
+def _read_code(directory: bytes) -> str | None:
+    """The EPSG code of the CRS, with `+` and that of the heights if there is one."""
+    keys = _list_keys(directory)
+    geographic = _MODELS.get(keys.get(_MODEL, (0, 0))[1]) == "geographic"
+    code = _find_code(keys, _GEOGRAPHIC_CODE if geographic else _PROJECTED_CODE)
+    upright = _find_code(keys, _VERTICAL_CODE)
+    return None if not code else f"EPSG:{code}+{upright}" if upright else f"EPSG:{code}"
 
 
 def _read_unit(keys: Mapping[int, tuple[int, int]], key: int, doubles: bytes) -> float | None:

@@ -38,6 +38,8 @@ STANDARD_DTYPES = {number: PointFormat(number).dtype() for number in range(11)}
 """Record of every point format without extra bytes; fields have the names of laspy's raw arrays."""
 
 EVLR_HEADER_SIZE = 60
+MAX_EVLRS = 4096
+"""Most EVLRs that are looked at: a damaged header can claim 4 billion."""
 WAVEFORM_RECORD_ID = 65535
 PROJECTION = "LASF_Projection"
 """User id of the records that hold the CRS."""
@@ -247,7 +249,7 @@ def _read_vlrs(data: bytes, count: int, path: Path) -> Iterator[Vlr]:
         yield Vlr(user_id, record_id, data[at - length : at], description, reserved)
 
 
-def find_evlrs(path: Path, header: LasHeader, most: int = 2**32) -> tuple[list[Evlr], int]:
+def find_evlrs(path: Path, header: LasHeader, most: int = MAX_EVLRS) -> tuple[list[Evlr], int]:
     """Return the EVLRs that lie wholly inside a file, in file order, and how many more the header claims.
 
     Payloads are not read. The search ends after `most` records, or at the first that runs over the end of the file.

@@ -29,8 +29,6 @@ from wavebatch.files.las.header import (
 
 MAX_SAMPLES = 1 << 16
 """Longer waveforms are damage: digitizers record a few hundred samples."""
-MAX_EVLRS = 4096
-"""Most EVLRs that are looked at: a damaged header can claim 4 billion."""
 BLOCK_BYTES = 1 << 25
 """Most bytes of samples in one block, for any number of waveforms."""
 DESCRIPTOR = struct.Struct("<BBIIdd")
@@ -130,7 +128,7 @@ def _find_packet_file(path: Path, suffix: str = "wdp") -> Path | None:
 
 def _locate_internal(checked: CheckedHeader) -> PacketPlace:
     header, path, size = checked.header, checked.path, checked.size
-    evlrs, _ = find_evlrs(path, header, MAX_EVLRS)
+    evlrs, _ = find_evlrs(path, header)
     at, warnings = header.waveform_start, []
     if not at:
         at = next((evlr.start for evlr in evlrs if evlr.record_id == WAVEFORM_RECORD_ID), 0)

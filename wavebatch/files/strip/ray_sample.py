@@ -25,6 +25,12 @@ SLICE_POINTS, RAYS_PER_SLICE = 2048, 256
 SLICE_SECONDS = 0.5
 """Time [s] after which another place of the same unit is read: an aircraft moves 30 m in it."""
 
+SCALE_PLACES = 16
+"""Most places at which distances of returns are compared with their times."""
+
+LEAST_PAIRS, SCALE_SPREAD = 20, 0.05
+"""Fewest pairs of returns that show the unit of coordinates, and largest relative distance of their quartiles."""
+
 _SLICES_PER_UNIT = 4
 _LEAST_RATIO, _LARGEST_RATIO = 0.3, 3.0
 """Vectors with other lengths over c/2 are no directions."""
@@ -72,6 +78,32 @@ def sample_rays(reader: StripReader, scan: StripScan) -> tuple[Rays, Rays]:
         for edge in (start + np.arange(1, number) * ((stop - start) // number)).tolist():
             take(edge, min(edge + SLICE_POINTS, stop))
     return _join(kept), _join(pairs)
+
+
+def measure_scale(reader: StripReader, scan: StripScan) -> float | None:
+    """Distance of returns of one pulse by their coordinates over that by their times in the packet.
+
+    1 where coordinates and packet vectors have the same unit. From up to SCALE_PLACES places of the strip; None where
+    fewer than LEAST_PAIRS pairs of returns, or pairs that do not agree, show it.
+    """
+    ratios = [np.empty(0)]
+    units = _choose_units(scan)
+    for start, stop in units[:: max(1, -(-len(units) // SCALE_PLACES))]:
+        points = reader.read_points(start, min(start + SLICE_POINTS, stop))
+        xyz, time = locate(points, reader.facts.header), widen(points["gps_time"])
+        with np.errstate(all="ignore"):
+            vectors = read_toward(points, scan.vectors.direction, scan.vectors.form)
+            place = widen(points["return_point_wave_location"])
+            same = (time[1:] == time[:-1]) & (points["wavepacket_offset"][1:] == points["wavepacket_offset"][:-1])
+            by_time = np.abs(np.diff(place)) * np.sqrt((vectors[1:] ** 2).sum(axis=1))
+            apart = np.sqrt((np.diff(xyz, axis=0) ** 2).sum(axis=1))
+            good = same & (points["wavepacket_index"][1:] > 0) & (by_time > _LEAST_PAIR) & np.isfinite(apart)
+            ratios.append((apart / by_time)[good])
+    ratio = np.concatenate(ratios)
+    if len(ratio) < LEAST_PAIRS:
+        return None
+    low, middle, high = np.quantile(ratio, [0.25, 0.5, 0.75])
+    return float(middle) if high - low < SCALE_SPREAD * middle else None
 
 
 def _choose_units(scan: StripScan) -> list[tuple[int, int]]:

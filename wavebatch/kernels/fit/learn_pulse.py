@@ -58,15 +58,22 @@ class Stack(NamedTuple):
 
 
 def stack_pulse(
-    signal: np.ndarray, amplitude: np.ndarray, time: np.ndarray, before: float, after: float, std: float = 0.0
+    signal: np.ndarray,
+    amplitude: np.ndarray,
+    time: np.ndarray,
+    before: float,
+    after: float,
+    std: float = 0.0,
+    first: np.ndarray | int = 0,
 ) -> Stack:
     """Median of signal (m, s) over amplitude, by lag from `before` samples before each centre to `after` behind it.
 
+    first: sample at which each row of the signal begins, int or int (m,).
     std: error of a sample that counts have without any noise; where they are rounded more coarsely than they scatter,
     the values of a bin may all be equal without being exact.
     """
     least = max(std / float(np.median(amplitude)), 1e-6) if len(amplitude) else 1e-6
-    lag = np.arange(signal.shape[1]) - time[:, None]
+    lag = np.reshape(first, (-1, 1)) + np.arange(signal.shape[1]) - time[:, None]
     used = (lag >= -before) & (lag <= after) & np.isfinite(signal)
     values = (signal / amplitude[:, None])[used]
     bins = np.floor((lag[used] + before) / STEP).astype(np.int64)

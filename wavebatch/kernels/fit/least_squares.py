@@ -16,10 +16,15 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 BATCH_VALUES = 500_000
 """Numbers in the rows of one batch: large enough for NumPy's calls to cost little, small enough for the cache."""
 
+LARGEST_BATCH = 4 * BATCH_VALUES
+"""Most numbers in the rows of a batch: 256 windows of 65,536 samples would take gigabytes."""
+
 
 def batch_size(k: int, length: int) -> int:
     """Problems per batch of k echoes in windows of `length` samples."""
-    return int(np.clip(BATCH_VALUES // ((3 * k + 1) * length), 256, 16384))
+    values = (3 * k + 1) * length
+    least = min(max(LARGEST_BATCH // values, 1), 256)
+    return int(np.clip(BATCH_VALUES // values, least, 16384))
 
 
 OUTSIDE = np.float32(-1e4)

@@ -72,16 +72,41 @@ def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, 
     float64 (m, 3, k)
         In the units of the parameters.
     """
+    return fit_errors(parameters, std, rows, gram)[0]
+
+
+def fit_errors(
+    parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """One standard deviation of each parameter, and of each echo's energy, from the normal equations.
+
+    Parameters
+    ----------
+    parameters, std, rows, gram
+        As for `parameter_errors`.
+
+    Returns
+    -------
+    errors : float64 (m, 3, k)
+        In the units of the parameters.
+    energy : float64 (m, k)
+        Of amplitude times width, relative. Both errors are correlated, and not by the same number for lone and for
+        overlapping echoes, so that this cannot be found from `errors` alone (docs/algorithms.md 5).
+    """
     functions = gram[:, :-1, :-1]
-    variance = invert_diagonal(add_ridge(functions.copy()))
+    variance, joint = invert_parts(add_ridge(functions.copy()))
     if parameters.shape[2] > 1:
         inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
         steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
         if len(steep):
             exact = rows[steep, :-1].astype(np.float64)
-            variance[steep] = invert_diagonal(add_ridge(exact @ exact.transpose(0, 2, 1)))
-    error = np.sqrt(np.maximum(variance, 0)).reshape(parameters.shape)
-    return error * parameter_units(parameters, std) * std[:, None, None]
+            variance[steep], joint[steep] = invert_parts(add_ridge(exact @ exact.transpose(0, 2, 1)))
+    units = parameter_units(parameters, std)
+    variance = np.maximum(variance, 0).reshape(parameters.shape)
+    # A unit of both rows is the same relative change: 1 / amplitude.
+    energy = np.sqrt(np.maximum(variance[:, 0] + variance[:, 2] + 2 * joint, 0))
+    energy *= units[:, 2] / parameters[:, 2] * std[:, None]
+    return np.sqrt(variance) * units * std[:, None, None], energy
 
 
 def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -116,12 +141,22 @@ def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     return solution
 
 
-def invert_diagonal(matrix: np.ndarray) -> np.ndarray:
-    """Diagonals (m, p) of the inverses of symmetric matrices (m, p, p), float64."""
-    if matrix.shape[1] != 3:
-        return np.diagonal(np.linalg.inv(matrix), axis1=1, axis2=2).copy()
-    (xx, _, _, yy, _, zz), determinant = _cofactors(matrix)
-    return np.stack([xx, yy, zz], axis=1) / determinant[:, None]
+def invert_parts(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Parts of the inverses of symmetric matrices (m, 3 k, 3 k), float64.
+
+    Returns
+    -------
+    diagonal : float64 (m, 3 k)
+    joint : float64 (m, k)
+        The elements of amplitude and width of the same echo.
+    """
+    k = matrix.shape[1] // 3
+    if k != 1:
+        inverse = np.linalg.inv(matrix)
+        first = np.arange(k)
+        return np.diagonal(inverse, axis1=1, axis2=2).copy(), inverse[:, first, 2 * k + first]
+    (xx, _, xz, yy, _, zz), determinant = _cofactors(matrix)
+    return np.stack([xx, yy, zz], axis=1) / determinant[:, None], (xz / determinant)[:, None]
 
 
 def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.kernels.geometry.bends import find_bend
+
 THETA_STEP = 0.5
 """Step of the accumulator [deg]; the step of rho is one pixel."""
 BAND = 3.0
@@ -57,12 +59,13 @@ def find_lines(
     gap: float = 10.0,
     shortest: float = 20.0,
     most: int = 20,
+    pulse: np.ndarray | None = None,
 ) -> list[HoughLine]:
     """Line segments among pixels, the strongest first.
 
     A line is the largest sum in the accumulator of intensities, refined by weighted total least squares of the pixels
-    within BAND sigma. A segment is its longest run without a larger gap. Its pixels are removed, and the search goes
-    on.
+    within BAND sigma. A segment is its longest run without a larger gap. Where the centroids of pulses show a bend, it
+    is the stronger side of the bend. Its pixels are removed, and the search goes on.
 
     Parameters
     ----------
@@ -78,6 +81,8 @@ def find_lines(
         Smallest length of a segment.
     most : int
         Largest number of segments.
+    pulse : int64 (n,), optional
+        Pulse of each pixel, from 0; without it segments are not cut at bends.
 
     Returns
     -------
@@ -97,7 +102,7 @@ def find_lines(
         start = sheet.strongest()
         if start is None or len(rows) < 2:
             break
-        found, used = _settle(points, weight, rows, start, BAND * sigma, gap, shortest)
+        found, used = _settle(points, weight, pulse, rows, start, BAND * sigma, gap, shortest)
         if found is None:
             failures += 1
         else:
@@ -163,6 +168,7 @@ class _Run:
 def _settle(
     points: np.ndarray,
     weight: np.ndarray,
+    pulse: np.ndarray | None,
     rows: np.ndarray,
     start: tuple[float, float],
     band: float,
@@ -170,6 +176,52 @@ def _settle(
     shortest: float,
 ) -> tuple[_Run | None, np.ndarray]:
     """The segment near the line `start`, or None, and the pixels to remove."""
+    while True:
+        run, used = _follow(points, weight, rows, start, band, gap, shortest)
+        if run is None or pulse is None:
+            return run, used
+        other = _other_side(points, weight, pulse, run)
+        if other is None:
+            return run, used
+        # Whole pulses: pixels of half a pulse would turn the line.
+        rows = rows[~np.isin(pulse[rows], other)]
+        inside = np.intersect1d(run.rows, rows, assume_unique=True)
+        start = _normal_form(*_fit(points[inside], weight[inside]))
+
+
+def _other_side(points: np.ndarray, weight: np.ndarray, pulse: np.ndarray, run: _Run) -> np.ndarray | None:
+    """Pulses on the weaker side of a run's bend; None where it has no bend."""
+    apart, light = points[run.rows] - run.middle, weight[run.rows]
+    sums = np.bincount(pulse[run.rows], light)
+    seen = np.flatnonzero(sums)
+    place, off = (
+        np.bincount(pulse[run.rows], light * (apart @ axis))[seen] / sums[seen]
+        for axis in (run.along, _across(run.along))
+    )
+    bend = find_bend(place, off)
+    if bend is None:
+        return None
+    later = place > bend
+    stronger = 2 * sums[seen[later]].sum() > sums.sum()
+    return seen[later != stronger]
+
+
+def _normal_form(middle: np.ndarray, along: np.ndarray) -> tuple[float, float]:
+    """Angle [rad] and rho of a line."""
+    normal = _across(along)
+    return float(np.arctan2(normal[1], normal[0])), float(middle @ normal)
+
+
+def _follow(
+    points: np.ndarray,
+    weight: np.ndarray,
+    rows: np.ndarray,
+    start: tuple[float, float],
+    band: float,
+    gap: float,
+    shortest: float,
+) -> tuple[_Run | None, np.ndarray]:
+    """The straight run of `rows` near the line `start`, or None, and the pixels to remove."""
     angle, rho = start
     normal = np.array([np.cos(angle), np.sin(angle)])
     middle, along = rho * normal, _across(normal)

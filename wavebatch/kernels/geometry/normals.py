@@ -11,7 +11,8 @@ from enum import IntEnum
 import numpy as np
 import scipy  # parts of it load when they are first asked for
 
-from wavebatch.kernels.geometry.planes import fit_planes, is_flat, measure_angles
+from wavebatch.kernels.geometry.plane_halves import compare_halves, misfit_of_angles
+from wavebatch.kernels.geometry.planes import Planes, fit_planes, is_flat, measure_angles
 from wavebatch.kernels.physics.incidence import STEEPEST
 
 PAIRS = 500_000
@@ -141,11 +142,13 @@ def measure_normals(
     Returns
     -------
     (angle, error) : float32 (n,), deg
-        Angle and its standard deviation; NaN where `gap` is not KNOWN.
+        Angle and its standard deviation, with what two planes in place of one would change; NaN where `gap` is not
+        KNOWN.
     gap : uint8 (n,)
-        Codes of Gap. NO_PLANE: less than 60 % of the neighbours in the plane, thicker than a fifth of its width, or the
-        point itself not in it. TOO_STEEP: the ray nearly lies in the plane; plants seen by one sweep of the scanner
-        form such a plane, which is no surface.
+        Codes of Gap. NO_PLANE: less than 60 % of the neighbours in the plane, thicker than a fifth of its width, the
+        point itself not in it, or two planes (a ridge) fit so much better that the angle may be off by more than
+        max_error. TOO_STEEP: the ray nearly lies in the plane; plants seen by one sweep of the scanner form such a
+        plane, which is no surface.
     """
     angle, error = np.full((2, len(points)), np.nan, np.float32)
     gap = np.full(len(points), Gap.NO_RAY, np.uint8)
@@ -186,9 +189,26 @@ def _judge(
     angle, error = measure_angles(planes, unit)
     surface = is_flat(planes.spreads) & (planes.kept >= LEAST_KEPT * count) & (planes.kept >= min_points)
     surface &= planes.offset() <= planes.limit
+    folded = np.zeros(n)
+    rows = np.flatnonzero(surface)
+    folded[rows] = _find_folds(offset, point, planes, unit, rows)
+    surface &= ~((error <= max_error) & (np.hypot(error, folded) > max_error))
+    error = np.hypot(error, folded)
     gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
     gap = np.where(angle > STEEPEST, Gap.TOO_STEEP, gap)
     gap = np.where(surface, gap, Gap.NO_PLANE)
     gap = np.where(count < min_points, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
     known = gap == Gap.KNOWN
     return np.where(known, angle, np.nan), np.where(known, error, np.nan), gap
+
+
+def _find_folds(
+    offset: np.ndarray, point: np.ndarray, planes: Planes, unit: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """How far the angles of points `rows` may be off because their neighbours are two planes [rad]."""
+    place = np.full(len(unit), -1)
+    place[rows] = np.arange(len(rows))
+    local = place[point]
+    some = Planes(*(part[rows] for part in planes))
+    halves = compare_halves(offset[local >= 0], local[local >= 0], some)
+    return misfit_of_angles(halves, some, unit[rows])

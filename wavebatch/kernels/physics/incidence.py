@@ -21,18 +21,6 @@ STEEPEST = np.radians(80.0)
 PAPER_TAU = 3.5
 """Full width at half maximum of the pulse t exp(-t), in tau, as the paper prints it (docs/algorithms.md 1.4)."""
 
-RADIUS = np.array([
-    (-3.0, 0.543), (-2.0, 0.463), (-1.5, 0.446), (-1.0, 0.620), (-0.5, 0.872), (-1e-3, 1.136), (0.0, 0.853),
-    (0.1, 0.818), (0.2, 0.795), (0.3, 0.793), (0.4, 0.866), (0.5, 0.932), (0.6, 0.870), (0.7, 0.581), (0.8, 0.368),
-    (0.9, 0.432), (1.0, 0.440), (1.1, 0.421), (1.2, 0.389), (1.3, 0.365), (1.4, 0.345), (1.5, 0.315), (1.6, 0.309),
-    (1.7, 0.289), (1.8, 0.276), (1.9, 0.261), (2.0, 0.248), (2.3, 0.214), (2.7, 0.185),
-]).T  # fmt: skip
-"""Radius around sqrt(max(u, 0)) that holds sqrt(mu) for 68.3 % of the draws u of a normal law around mu, any mu >= 0.
-
-First row: u where it is negative, else sqrt(u); second row: the radius. Solved numerically for equal coverage. It must
-fall near 0.7: a true 0 lies within the radius for the lower 68.3 % of u and outside for all others.
-"""
-
 _LONGEST = 30.0
 """Spread of the last entry of a table [tau]; beyond it variances simply add."""
 
@@ -121,50 +109,6 @@ def spread_variance(table: WidthTable, width: np.ndarray) -> np.ndarray:
     of_pulse = table.width**2 - table.spread**2
     variance = width * width - np.interp(width, table.width, of_pulse)
     return np.where(width > table.width[-1], np.nan, variance) if table.cut else variance
-
-
-def angles_of_variance(
-    variance: np.ndarray, variance_err: np.ndarray, distance: np.ndarray, divergence: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Angles from the variance that a surface adds to the pulse.
-
-    Parameters
-    ----------
-    variance, variance_err : float (m,), ns2
-        Added variance and its standard deviation.
-    distance : float (m,), m
-        Sensor to echo.
-    divergence : float, rad
-        Full angle between the 1/e^2 points.
-
-    Returns
-    -------
-    angle, error : float64 (m,), rad
-        0 where the variance is not positive; NaN above 80 degrees and where an input is not known.
-
-    Notes
-    -----
-    For steep planes the error is sigma_s s c^2 / (w^2 tan sec^2), by propagation through the square root. Near 0 the
-    root is not linear and half of the variances are negative: there the error is a radius from RADIUS, such that 68.3 %
-    of the angles lie within it for any true angle. Source: docs/algorithms.md 1.4.
-    """
-    known = np.isfinite(variance) & np.isfinite(variance_err) & (variance_err > 0) & (np.asarray(distance) > 0)
-    variance, variance_err = np.where(known, variance, np.nan), np.where(known, variance_err, np.nan)
-    spread = np.sqrt(np.maximum(variance, 0.0))
-    radius = _radius(variance, variance_err, spread)
-    high, middle, low = (angle_of_spread(spread + step, distance, divergence) for step in (radius, 0.0, -radius))
-    error = 0.5 * (high - low)
-    steep = middle > STEEPEST
-    return np.where(steep, np.nan, middle), np.where(steep, np.nan, error)
-
-
-def _radius(variance: np.ndarray, variance_err: np.ndarray, spread: np.ndarray) -> np.ndarray:
-    """Error of the spread [ns] from the variance [ns2], its error, and its root."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        below = variance / variance_err
-        place = np.where(variance < 0, below, np.sqrt(np.maximum(below, 0.0)))
-        near = np.interp(place, *RADIUS) * np.sqrt(variance_err)
-        return np.where(place > RADIUS[0][-1], variance_err / (2.0 * spread), near)
 
 
 @lru_cache(maxsize=16)

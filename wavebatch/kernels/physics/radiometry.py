@@ -35,6 +35,30 @@ def transmit(distance: np.ndarray, attenuation: float) -> np.ndarray:
     return 10.0 ** (-2.0e-4 * attenuation * np.asarray(distance, np.float64))
 
 
+def attenuation_of_visibility(visibility: float, wavelength: float) -> float:
+    """Attenuation of hazy air by its meteorological visibility.
+
+    Parameters
+    ----------
+    visibility : float, km
+        Largest distance at which a dark object is seen (contrast 2 %).
+    wavelength : float, nm
+        Of the laser.
+
+    Returns
+    -------
+    float, dB/km
+        One way. Scattering by haze only: absorption, as that of water vapour near 940, 1130 and 1400 nm, is not in it.
+
+    References
+    ----------
+    Kruse, McGlauchlin, McQuistan (1962): 3.912 / V (wavelength / 550)^-q, q = 1.6 above 50 km, 1.3 above 6 km, else
+    0.585 V^(1/3); docs/algorithms.md 5.
+    """
+    exponent = 1.6 if visibility > 50.0 else 1.3 if visibility > 6.0 else 0.585 * visibility ** (1.0 / 3.0)
+    return 10.0 / math.log(10.0) * 3.912 / visibility * (wavelength / 550.0) ** -exponent
+
+
 def calibrate_echoes(
     reflectance: np.ndarray | float,
     incidence: np.ndarray | float,
@@ -136,7 +160,7 @@ def diffuse_reflectance(gamma: np.ndarray, incidence: np.ndarray) -> np.ndarray:
 def energy_error(
     amplitude: np.ndarray, sigma: np.ndarray, amplitude_err: np.ndarray, sigma_err: np.ndarray
 ) -> np.ndarray:
-    """Relative standard deviation of amplitude times sigma, whose errors have the correlation -1/sqrt(3).
+    """Relative standard deviation of amplitude times sigma of a lone echo: errors with the correlation -1/sqrt(3).
 
     Parameters
     ----------
@@ -160,6 +184,7 @@ def backscatter_error(
     attenuation: float,
     *,
     power: int = 2,
+    attenuation_err: float = 0.0,
 ) -> np.ndarray:
     """Relative standard deviation of gamma, or of the cross section.
 
@@ -175,14 +200,41 @@ def backscatter_error(
         Of the air, one way.
     power : int
         Power of the distance: 2 for gamma, 4 for the cross section.
+    attenuation_err : float, dB/km
+        Standard deviation of the attenuation.
 
     Returns
     -------
     float64 (m,)
     """
-    slope = power / known_distance(distance) + 2.0e-4 * attenuation * math.log(10.0)
-    ranging = slope * np.asarray(distance_err, np.float64)
-    return np.sqrt(energy_err * energy_err + ranging * ranging + constant_err * constant_err)
+    distance = known_distance(distance)
+    per_db = 2.0e-4 * math.log(10.0)
+    ranging = (power / distance + per_db * attenuation) * np.asarray(distance_err, np.float64)
+    air = per_db * attenuation_err * distance
+    return np.sqrt(energy_err * energy_err + ranging * ranging + constant_err * constant_err + air * air)
+
+
+def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
+    """Relative error of a reflectance for which a surface of unknown slope was taken as level.
+
+    Parameters
+    ----------
+    incidence : float (m,), rad
+        Angle at which the ray strikes level ground.
+    slope : float, rad
+        Slope of the surface, in any direction.
+
+    Returns
+    -------
+    float64 (m,)
+        Root mean square over the directions of cos(true angle) / cos(incidence) - 1.
+
+    Notes
+    -----
+    A surface of slope d whose steepest direction is turned by p from the ray has cos(true angle) = cos(a) cos(d) -
+    sin(a) sin(d) cos(p), a the angle to level ground.
+    """
+    return np.hypot(1.0 - math.cos(slope), np.tan(incidence) * (math.sin(slope) / math.sqrt(2.0)))
 
 
 def reflectance_error(relative: np.ndarray, incidence: np.ndarray, incidence_err: np.ndarray) -> np.ndarray:

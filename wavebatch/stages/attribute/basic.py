@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
-import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
@@ -15,6 +14,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
+from wavebatch.stages.attribute.light import area_factor, light_error
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
@@ -75,22 +75,23 @@ def skew(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTa
     return echoes.with_attributes(**{name: echoes.attributes.get(name, unknown) for name in ("skew", "skew_err")})
 
 
-@stage("attribute", makes=("energy",))
+@stage("attribute", makes=("energy", "energy_err"))
 def energy(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Integral of each echo over time [DN ns]: amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse.
+    """Integral of each echo over time [DN ns], and its error.
 
-    Of a generalized Gaussian it is that of its exponent.
+    Amplitude sigma sqrt(2 pi), times exp(kappa^2 / 2) of a skewed pulse; of a generalized Gaussian that of its
+    exponent; of a learned pulse the sum over its Gaussians, with tails and after-pulses.
     """
-    factor = (SQRT_2PI * np.exp(0.5 * _skew_of(system, echoes) ** 2)).astype(np.float32)
-    if "power" in echoes.attributes:
-        factor = _area_factor(echoes.attributes["power"].astype(np.float64)).astype(np.float32)
-    return echoes.with_attributes(energy=echoes.amplitude * echoes.sigma * factor)
-
-
-def _area_factor(power: np.ndarray) -> np.ndarray:
-    """Area of exp(-|z|^p / 2) over its full width at half maximum, times 2.354820; sqrt(2 pi) for p = 2."""
-    half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
-    return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width
+    shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing, most=BROADEST)
+    if shape.components:
+        whole = np.stack([echoes.amplitude, np.zeros(len(echoes)), echoes.sigma / block.spacing], axis=1)
+        amplitude, _, width = model_parameters(shape, limits, whole.astype(np.float64)).T
+        area = amplitude * width * block.spacing * (1.0 + sum(weight for weight, _, _ in shape.components))
+    else:
+        area = echoes.amplitude.astype(np.float64) * echoes.sigma * area_factor(system, echoes)
+    value = SQRT_2PI * area
+    error = np.abs(value) * light_error(echoes)
+    return echoes.with_attributes(energy=value.astype(np.float32), energy_err=error.astype(np.float32))
 
 
 def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str:

@@ -21,7 +21,7 @@ from wavebatch.stages.chain import Range, stage
 )
 def incidence_angle_normals(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    radius: Annotated[float, Range(1e-3, 1000.0)] = 1.5,
+    radius: Annotated[float, Range(0.0, 1000.0)] = 1.5,
     min_points: Annotated[int, Range(4, 10_000)] = 8,
     max_error: Annotated[float, Range(1e-3, 180.0)] = 5.0,
 ) -> EchoTable:  # fmt: skip
@@ -30,14 +30,16 @@ def incidence_angle_normals(
     `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
     is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
 
-    No-data where there are fewer than min_points; where the points are no plane (plants, ridges: less than 60 % of them
-    in it, thicker than a fifth of its width, or the echo not in it); where the angle exceeds 80 degrees (one sweep of
-    the scanner over plants makes a plane that contains its rays); and where its error exceeds max_error.
+    No-data where there are fewer than min_points; where the points are no plane (plants: less than 60 % of them in it,
+    thicker than a fifth of its width, or the echo not in it) or clearly two (a ridge, a valley or a step close by);
+    where the angle exceeds 80 degrees (one sweep of the scanner over plants makes a plane that contains its rays); and
+    where its error exceeds max_error. The error holds what two planes in place of one would change.
 
     Parameters
     ----------
     radius : float
-        Radius of the neighbourhood [m]; three times the distance between points is a good start.
+        Radius of the neighbourhood [m]; three times the distance between points is a good start. 0: `run` chooses 1.5
+        or as much more as the distance between the points of the strip asks for, 12 at most.
     min_points : int
         Least number of points in the neighbourhood, and in the plane.
     max_error : float
@@ -47,8 +49,8 @@ def incidence_angle_normals(
     ----------
     Rhomberg-Kauert et al. (2024), comparison of Fig. 6; docs/algorithms.md 1.4.
     """
-    if not 1e-3 <= radius <= 1e3 or min_points < 4 or not max_error > 0:
-        raise ConfigError("radius must lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")
+    if not (radius == 0 or 1e-3 <= radius <= 1e3) or min_points < 4 or not max_error > 0:
+        raise ConfigError("radius must be 0 or lie in 0.001 to 1000 m, min_points be 4 at least, max_error above 0")
     x, y, z = block.direction.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         length = np.sqrt(x * x + y * y + z * z)

@@ -11,14 +11,14 @@ from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW
+from wavebatch.kernels.physics.angle_errors import angles_above, angles_of_variance
 from wavebatch.kernels.physics.incidence import (
     angle_of_spread,
-    angles_of_variance,
     paper_table,
     pulse_table,
     spread_variance,
 )
-from wavebatch.stages.attribute.radiometry import is_alone, sensor_distance
+from wavebatch.stages.attribute.light import is_alone, sensor_distance
 from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
@@ -26,7 +26,7 @@ NARROW_ERRORS = 3.0
 """An echo whose variance is negative by so many errors is flagged as narrower than the system pulse."""
 
 CLEAR_ERRORS = 4.0
-"""An echo whose variance is positive by so many errors certainly comes from a slope."""
+"""A weak echo whose variance is positive by so many errors certainly comes from a slope, and has an angle."""
 
 _UNCLEAN = {
     NoData.OVERLAPPED: EchoFlag.OVERLAPPED | EchoFlag.MERGED,
@@ -75,9 +75,10 @@ def incidence_angle(
     slopes. Echoes narrower than the system pulse have angle 0; where they are narrower by more than three errors they
     have the flag NARROW.
 
-    No-data where the system pulse is shorter than 0.85 samples, where sensor or divergence are not known, and where the
-    error exceeds max_error: with a narrow beam and a long pulse that is everywhere. No-data also where the decomposer
-    fits another pulse than the mode compares widths with: Gaussians on a strip whose pulse is none, for example.
+    No-data where the system pulse is shorter than 0.85 samples, where sensor, divergence or the width of a surface that
+    faces the sensor are not known, and where the echo is too weak for max_error: with a narrow beam and a long pulse
+    that is everywhere. No-data also where the decomposer fits another pulse than the mode compares widths with:
+    Gaussians on a strip whose pulse is none, for example.
 
     Parameters
     ----------
@@ -88,8 +89,10 @@ def incidence_angle(
     divergence : float
         Full angle of the beam between the 1/e^2 points [mrad]; 0 takes that of the system.
     max_error : float
-        Largest standard deviation of an angle that is written [deg]. An echo that is not wider than the system pulse by
-        four errors must meet it even as a surface that faces the sensor, where angles are least certain.
+        Largest standard deviation that the angle of an echo of this strength would have on a surface that faces the
+        sensor, where angles are least certain [deg]. So an echo has an angle or not by its strength, not by its own
+        width. Weaker echoes have one only where they are wider than the system pulse by four errors of the variance;
+        angle and error then allow for the echoes that noise has kept from it.
     reference_error : float
         Standard deviation of the system pulse's width, relative.
     alone : bool
@@ -105,22 +108,29 @@ def incidence_angle(
     distance = sensor_distance(block, echoes)
     angle, error = angles_of_variance(variance, variance_err, distance, 1e-3 * beam if beam else np.nan)
     steep = np.isnan(angle) & np.isfinite(variance) & np.isfinite(variance_err) & np.isfinite(distance)
-    flat_error = angle_of_spread(np.sqrt(variance_err), distance, 1e-3 * beam if beam else np.nan)
+    facing_err = _facing_error(system, echoes, reference_error)
+    flat_error = angle_of_spread(np.sqrt(facing_err), distance, 1e-3 * beam if beam else np.nan)
     with np.errstate(invalid="ignore"):
-        # With the error of each echo alone, echoes that noise has widened would pass and equal ones would not.
-        decisive = np.where(variance > CLEAR_ERRORS * variance_err, error, np.maximum(error, flat_error))
-        uncertain = ~(decisive <= np.radians(max_error))
+        weak = ~(flat_error <= np.radians(max_error))
+        clear = weak & (variance > CLEAR_ERRORS * variance_err)
+    if clear.any():
+        known = variance[clear], variance_err[clear], distance[clear]
+        angle[clear], error[clear] = angles_above(*known, 1e-3 * beam if beam else np.nan, CLEAR_ERRORS)
+    error = np.hypot(error, 0.5 * np.sin(2.0 * angle) * system.divergence_error)
+    unproven = np.isinf(system.level_error or 0.0)
+    with np.errstate(invalid="ignore"):
         narrow = variance < -NARROW_ERRORS * variance_err
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_DIVERGENCE, not beam),
         (NoData.OTHER_PULSE, _other_pulse(system, mode)),
+        (NoData.NO_LEVEL, unproven),
         (NoData.SHORT_PULSE, short),
         (NoData.SHARED_PULSE, ~is_alone(block, echoes) & alone),
         *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
         (NoData.TOO_STEEP, steep),
         (NoData.OTHER, np.isnan(error)),
-        (NoData.UNCERTAIN, uncertain),
+        (NoData.UNCERTAIN, weak & ~clear),
     )
     bad = np.logical_or.reduce([np.broadcast_to(where, len(echoes)) for _, where in cases])
     angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))
@@ -159,7 +169,19 @@ def added_variance(
     else:
         width, error, reference = _model_width(block.spacing, system, width, error)
         variance = width * width - reference * reference - system.level_variance
-    return variance, 2.0 * np.hypot(width * error, reference * reference * reference_error)
+    fit_err = 2.0 * np.hypot(width * error, reference * reference * reference_error)
+    return variance, np.hypot(fit_err, system.level_error or 0.0)
+
+
+def _facing_error(system: SystemPulse, echoes: EchoTable, reference_error: float) -> np.ndarray:
+    """Error that the added variance [ns2] of each echo would have on a surface that faces the sensor.
+
+    The relative error of a width goes with 1/(amplitude sqrt(sigma)), whose noise has nothing to do with that of the
+    width (docs/algorithms.md 2.1): what is decided by it selects no echoes by their width.
+    """
+    square = system.sigma_ref**2
+    relative = np.hypot(echoes.sigma_err / echoes.sigma, system.width_scatter / system.sigma_ref)
+    return np.hypot(2.0 * square * np.hypot(relative, reference_error), system.level_error or 0.0)
 
 
 def _model_width(

@@ -85,12 +85,15 @@ def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) ->
     if len(waveform) < 2:
         return candidates
     pair = np.flatnonzero(waveform[1:] == waveform[:-1])
-    clipped = block.samples[waveform[pair]] >= clip
+    present, row = np.unique(waveform[pair], return_inverse=True)
+    s = block.samples.shape[1]
+    # Places of clipped samples, not a table of pairs by samples: one waveform of 65,536 samples may have 10,000 pairs.
+    clipped = np.flatnonzero(block.samples[present] >= clip)
+    if not len(clipped):
+        return candidates
     begin, end = np.rint(time[pair]).astype(np.int64), np.rint(time[pair + 1]).astype(np.int64)
-    last = block.samples.shape[1] - 1
-    count = np.cumsum(np.pad(clipped, ((0, 0), (1, 0))), axis=1, dtype=np.int32)
-    row = np.arange(len(pair))
-    between = count[row, np.clip(end, 0, last)] - count[row, np.clip(begin + 1, 0, last)]
+    first, stop = (row * s + np.clip(place, 0, s - 1) for place in (begin + 1, end))
+    between = np.searchsorted(clipped, stop) - np.searchsorted(clipped, first)
     flat = (between >= LEAST_PLATEAU) & (end - begin - 1 - between <= PLATEAU_SLACK)
     if not flat.any():
         return candidates

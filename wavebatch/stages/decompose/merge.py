@@ -102,6 +102,7 @@ def _merge(table: EchoTable, first: np.ndarray) -> EchoTable:
         time_err=np.minimum(a.time_err, b.time_err),
         amplitude_err=(relative * total / sigma).astype(np.float32),
         sigma_err=np.minimum(a.sigma_err, b.sigma_err),
+        relative_energy_err=np.minimum(a.relative_energy_err, b.relative_energy_err),
         flags=(a.flags | b.flags | np.uint16(EchoFlag.MERGED)).astype(np.uint16),
     )
     keep = np.ones(len(table), bool)

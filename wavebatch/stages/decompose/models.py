@@ -15,7 +15,7 @@ from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.gauss_newton import step_undamped
 from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
 from wavebatch.kernels.fit.least_squares import evaluate_model
-from wavebatch.kernels.fit.normal_equations import gram_matrix, parameter_errors
+from wavebatch.kernels.fit.normal_equations import fit_errors, gram_matrix
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
@@ -256,11 +256,11 @@ def _solve_undamped(
     parameters[:, 2] = np.clip(parameters[:, 2], settings.width_low, settings.width_high)
     model = evaluate_model(windows, parameters, settings.shape)
     gram = gram_matrix(model)
-    errors = parameter_errors(parameters, windows.std, model, gram)
+    errors, energy = fit_errors(parameters, windows.std, model, gram)
     parameters[:, 1] += begin[:, None]
     cost = gram[:, -1, -1] / windows.std**2
     used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
-    return Solution(rows, parameters, errors, np.sqrt(cost / used), cost, converged, bound)
+    return Solution(rows, parameters, errors, energy, np.sqrt(cost / used), cost, converged, bound)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:

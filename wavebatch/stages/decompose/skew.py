@@ -202,9 +202,11 @@ def _fit_each(
             fit, begin = _refit(block, noise, clusters, one, settings, prior, origin)
             parameters = fit.parameters[:, :3].copy()
             parameters[:, 1] += begin[:, None]
-            solutions.append(
-                Solution(one.cluster, parameters, fit.errors[:, :3], fit.misfit, fit.cost, fit.converged, fit.at_bound)
-            )
+            errors = fit.errors[:, :3]
+            # The skew takes part in the area: its error is not that of amplitude and width alone.
+            unknown = np.full_like(errors[:, 0], np.nan)
+            found = (fit.misfit, fit.cost, fit.converged, fit.at_bound)
+            solutions.append(Solution(one.cluster, parameters, errors, unknown, *found))
             columns["skew"].append(fit.parameters[:, 3].reshape(-1).astype(np.float32))
             columns["skew_err"].append(fit.errors[:, 3].reshape(-1).astype(np.float32))
     joined = {name: np.concatenate(values) for name, values in columns.items()}

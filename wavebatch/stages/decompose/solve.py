@@ -244,10 +244,12 @@ def describe_solutions(
     if not solutions:
         return EchoTable.empty().with_attributes(**given)
     flat = [_flatten(clusters, solution) for solution in solutions]
-    waveform, parameters, errors, misfit, flags = (np.concatenate(part) for part in zip(*flat, strict=True))
+    waveform, parameters, errors, energy_err, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
-    errors *= error_factors(fitted, block.spacing, parameters[:, 2])
+    factors = error_factors(fitted, block.spacing, parameters[:, 2])
+    errors *= factors[:, :3]
+    energy_err *= factors[:, 3]
     parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
@@ -261,7 +263,8 @@ def describe_solutions(
     spacing = block.spacing
     table = EchoTable.build(
         waveform[keep], time * spacing, amplitude, width * spacing, time_err=time_err * spacing,
-        amplitude_err=amplitude_err, sigma_err=width_err * spacing, residual=misfit[keep], flags=flags[keep],
+        amplitude_err=amplitude_err, sigma_err=width_err * spacing, relative_energy_err=energy_err[keep],
+        residual=misfit[keep], flags=flags[keep],
         attributes={name: values[keep] for name, values in given.items()},
     )  # fmt: skip
     table = merge_unresolved(drop_twins(table))
@@ -271,7 +274,7 @@ def describe_solutions(
 
 
 def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
-    """One row per echo: waveform, parameters (m, 3), errors (m, 3), misfit, flags."""
+    """One row per echo: waveform, parameters (m, 3), errors (m, 3), relative error of the energy, misfit, flags."""
     k = solution.parameters.shape[2]
     flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
     flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
@@ -281,6 +284,7 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
         np.repeat(clusters.waveform[solution.cluster], k),
         solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
         solution.errors.transpose(0, 2, 1).reshape(-1, 3),
+        solution.energy_errors.reshape(-1),
         np.repeat(solution.misfit, k),
         flags.reshape(-1),
     )

@@ -46,8 +46,10 @@ QUANTITIES: dict[str, Quantity] = {
     "acceptance": Quantity("acceptance", 1.0, 1e6, "least fall of chi2 for which an echo is added"),
     "misfit": Quantity("misfit", 0.0, 1.0, "of strong echoes to the pulse, as a share of them", optional=True),
     "level_variance_ns2": Quantity("level_variance", -1e8, 0.0, "of level ground's echoes less the pulse's", True),
+    "level_error_ns2": Quantity("level_error", 0.0, 1e8, "standard deviation of level_variance", True),
     "width_scatter_ns": Quantity("width_scatter", 0.0, 1e4, "of echo widths beyond the errors of their fits", True),
     "divergence_mrad": Quantity("divergence", 1e-3, 100.0, "full angle of the beam, 1/e^2, from its data sheet", True),
+    "divergence_error": Quantity("divergence_error", 0.0, 1.0, "standard deviation of the divergence, relative", True),
 }
 """Keys of the table [system] that are plain numbers."""
 
@@ -85,7 +87,7 @@ def describe_system(system: SystemPulse) -> dict[str, Any]:
 def _describe_pulse(system: SystemPulse) -> dict[str, Any]:
     values = {key: getattr(system, quantity.field) for key, quantity in QUANTITIES.items()}
     return {
-        **{key: None if value is None else float(value) for key, value in values.items()},
+        **{key: None if value is None or math.isinf(value) else float(value) for key, value in values.items()},
         _NOISE: {kind: float(value) for kind, value in system.noise_by_kind.items()},
         _CORRELATION: [float(value) for value in system.correlation],
         _PATTERN: [float(value) for value in system.pattern],

@@ -91,6 +91,6 @@ class _TableReader(ColumnReader):
         for name, read in self._readers.items():
             stored = self._stored[name]
             # Integers without no-data are copied: those above 2^53 are no floating-point numbers.
-            whole = self.dtype[name].kind in "ui" and stored in raw.dtype.names
+            whole = self.dtype[name].kind in "ui" and stored in (raw.dtype.names or ())
             rows[name] = raw[stored] if whole else read(raw)
         return rows

@@ -14,12 +14,13 @@ from typing import Any, Literal
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, split_columns
+from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, name_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
-from wavebatch.surveying.calibration import find_makers, load_calibration, needs_sensor
+from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -40,6 +41,8 @@ def run(
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
+    attenuation: float | tuple[float, float] | None = None,
+    pulse_energy: Path | str | None = None,
     columns: str | None = None,
     points: Literal["echoes", "returns"] = "echoes",
     format: Literal["laz", "las"] = "laz",
@@ -87,6 +90,12 @@ def run(
         Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
     calibration : path or str, optional
         A file of `wavebatch calibrate`.
+    attenuation : float or (float, float), optional
+        Of the air during the flight, one way, and its standard deviation [dB/km]; default: that of the calibration,
+        else 0.22.
+    pulse_energy : path or str, optional
+        Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
+        text file with columns time and energy.
     columns : str, optional
         "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
         them.
@@ -139,8 +148,8 @@ def run(
     """
     plan = plan_run(
         strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
-        calibration=calibration, columns=columns, points=points, format=format, point_format=point_format,
-        las_version=las_version, no_data=no_data, strict=strict, names=names,
+        calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, columns=columns, points=points,
+        format=format, point_format=point_format, las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
         memory=memory, block_size=block_size, overwrite=overwrite, resume=resume, recursive=recursive,
     )  # fmt: skip
@@ -158,6 +167,8 @@ def plan_run(
     survey: Literal["each", "flight"] = "each",
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
+    attenuation: float | tuple[float, float] | None = None,
+    pulse_energy: Path | str | None = None,
     columns: str | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
@@ -172,7 +183,9 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, force, survey, sensor, calibration, columns, jobs, scheduler, memory
+    strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
+        As for `run`.
+    scheduler, memory
         As for `run`.
     block_size, overwrite, resume, recursive
         As for `run`.
@@ -191,6 +204,8 @@ def plan_run(
     ConfigError
         For whatever is wrong with the options.
     """
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError("--scheduler: the address is empty; leave it out to work on this machine")
     found, request = find_request(chain, tolerance=tolerance, system=system)
     if force and system is None:
         raise ConfigError("--force is of no use without --system; leave it out")
@@ -201,14 +216,13 @@ def plan_run(
         request = replace(request, flight=True)
     sensor = sensor or SensorRequest()
     known = None if calibration is None else load_calibration(Path(calibration))
-    template = StripJob(Path(), found, RunOptions(), request, sensor, known)
+    air = None if attenuation is None else _read_air(attenuation)
+    template = StripJob(Path(), found, RunOptions(columns=name_columns(columns)), request, sensor, known, air)
+    template = replace(template, pulse_energy=None if pulse_energy is None else str(pulse_energy))
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)
-        extra = find_makers(found, [entry.lstrip("+") for entry in split_columns(columns)])
-        template = replace(template, added=extra)
-        found = template.extend(found)
-    _check_use(found, sensor, known)
+    _check_use(found, sensor, known, air, pulse_energy)
     options = RunOptions(columns=choose_columns(found, columns), **output)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips), recursive=recursive)
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
@@ -257,12 +271,23 @@ def find_request(
     return chain if isinstance(chain, Chain) else load_chain(chain), request
 
 
-def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any) -> None:
+def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
+    """Attenuation and its error [dB/km]; ConfigError where they cannot be."""
+    value, error = attenuation if isinstance(attenuation, tuple) else (attenuation, 0.0)
+    if not (0 <= value <= 100 and 0 <= error <= 100):
+        raise ConfigError(f"attenuation: {value:g} +- {error:g} dB/km must lie in 0 to 100; clear air has 0.1 to 0.5")
+    return float(value), float(error)
+
+
+def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, energy: Any) -> None:
     """Raise ConfigError for files that the chain, or another option, would ignore."""
     if sensor.trajectory is not None and sensor.height is not None:
         raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
-    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration}
+    given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
+             "--attenuation": air, "--pulse-energy": energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
-        stage = "attribute.backscatter_coefficient" if option == "--calibration" else "attribute.range"
+        stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
+                  "--pulse-energy": "amplitude_normalized"}  # fmt: skip
+        stage = f"attribute.{stages.get(option, 'range')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -124,7 +125,13 @@ def open_strip(path: Path | str, *, direction: str = "auto", headerless: bool = 
     return Strip(StripReader(path, direction=direction, headerless=headerless))
 
 
-def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergence: float | None = None) -> Survey:
+def survey(
+    strip: Strip | Path | str,
+    *,
+    waveforms: int | None = None,
+    divergence: float | None = None,
+    find_divergence: bool = False,
+) -> Survey:
     """Measure sensor and scene on a sample of the strip: noise, system pulse, saturation, overlapping echoes.
 
     Parameters
@@ -136,6 +143,9 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     divergence : float, optional
         Full angle of the beam between the 1/e^2 points [mrad]. With it the survey also says whether echo widths tell
         incidence angles.
+    find_divergence : bool
+        Also look for the beam's divergence in the widths of echoes from surfaces of known slope: the figures
+        `divergence_seen_mrad` and `divergence_seen_error_mrad`, where they tell.
 
     Returns
     -------
@@ -149,7 +159,7 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     """
     if not isinstance(strip, Strip):
         with open_strip(strip) as opened:
-            return survey(opened, waveforms=waveforms, divergence=divergence)
+            return survey(opened, waveforms=waveforms, divergence=divergence, find_divergence=find_divergence)
     sample = read_sample(strip.reader, strip.scan, waveforms)
     if not sample:
         path = strip.facts.path
@@ -157,6 +167,9 @@ def survey(strip: Strip | Path | str, *, waveforms: int | None = None, divergenc
     found = with_look(survey_blocks(sample), sample)
     if divergence is not None:
         found = survey_angles(strip.reader, strip.scan, found, divergence)
+    elif find_divergence:
+        with contextlib.suppress(InputError):  # coordinates that are not in metres
+            found = survey_angles(strip.reader, strip.scan, found, None)
     chosen = decide(found)
     parts = {decision.part for decision in chosen}
     # What the scene needs but no chain has without further files follows the decisions of the chosen chain.

@@ -19,9 +19,10 @@ from wavebatch.files.cloud.echo_reader import CLOUD_DTYPE, CloudReader
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
-from wavebatch.surveying import Survey, survey_blocks
-from wavebatch.surveying.auto_chain import choose_chain
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying import Survey
+from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.choose_chain import Request, make_choice
+from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
@@ -111,10 +112,11 @@ def match_sides(
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
         check_saved(reader, scan, survey, force=force)
-        survey = survey or survey_blocks(read_sample(reader, scan))
+        saved = None if survey is None else SavedSurvey(survey)
+        choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
-        chosen = choose_chain(survey)
-        runs = {key: ChainRun(side.chain or chosen, survey.system, tolerance_ns) for key, side in chains.items()}
+        system = choice.survey.system
+        runs = {key: ChainRun(side.chain or choice.chain, system, tolerance_ns) for key, side in chains.items()}
         blocks = reader.sample_blocks(scan, limit, _BLOCK) if limit is not None else reader.all_blocks(scan, _BLOCK)
         if clouds:
             between = _match_cloud(blocks, Path(strip), a, b, runs, tolerance_ns)

@@ -20,7 +20,10 @@ from wavebatch.tools.simulate.render import Recording, paint_echoes, record_coun
 from wavebatch.tools.simulate.scenes import Scene, find_scene
 
 SEED_BLOCK = 8192
-"""Pulses that share one random generator. Another value makes other strips of the same seed."""
+"""Pulses that share one random generator, at most. Another value makes other strips of the same seed."""
+
+SEED_SAMPLES = SEED_BLOCK * 2048
+"""Most samples of these pulses: waveforms of more than 2048 samples have smaller blocks, so that memory suffices."""
 
 NEIGHBOUR = 4.0
 """Echoes closer than this many sigma (of the wider one) count as overlapped (docs/algorithms.md 2.2)."""
@@ -76,19 +79,26 @@ def simulate_blocks(
     scene = find_scene(scene)
     if n < 0 or size < 1:
         raise ConfigError(f"cannot simulate {n} waveforms in blocks of {size}; give numbers above 0")
+    block = seed_block(scene)
     for start in range(0, n, size):
         stop = min(start + size, n)
         parts = []
-        for number in range(start // SEED_BLOCK, -(-stop // SEED_BLOCK)):
-            low = number * SEED_BLOCK
-            parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, SEED_BLOCK)))
+        for number in range(start // block, -(-stop // block)):
+            low = number * block
+            parts.append(simulate_seed_block(scene, seed, number).cut(max(start - low, 0), min(stop - low, block)))
         yield _join(parts, start)
 
 
+def seed_block(scene: Scene) -> int:
+    """Pulses of the scene that share one random generator."""
+    return min(SEED_BLOCK, SEED_SAMPLES // scene.recording.n_samples)
+
+
 def simulate_seed_block(scene: Scene, seed: int, number: int, flight: Flight | None = None) -> Simulated:
-    """Pulses [SEED_BLOCK number, SEED_BLOCK (number + 1)) of the scene with this seed."""
+    """Pulses [k number, k (number + 1)) of the scene with this seed, k from `seed_block`."""
+    n = seed_block(scene)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
-    return simulate_pulses(scene, SEED_BLOCK, rng, first=number * SEED_BLOCK, flight=flight)
+    return simulate_pulses(scene, n, rng, first=number * n, flight=flight)
 
 
 def simulate_pulses(

@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.strip.packets import MAX_SAMPLES
 from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
 
 REACH = 5.5
@@ -47,7 +48,7 @@ class Recording:
     def __post_init__(self) -> None:
         check = {
             "bits must be 8, 16 or 32": self.bits in (8, 16, 32),
-            "n_samples must be at least 8": self.n_samples >= 8,
+            f"n_samples must lie from 8 to {MAX_SAMPLES}": 8 <= self.n_samples <= MAX_SAMPLES,
             "spacing must be positive": self.spacing > 0,
             "noise_std must not be negative": self.noise_std >= 0,
             "noise_gain must not be negative": self.noise_gain >= 0,

@@ -20,7 +20,7 @@ from wavebatch.files.cloud.return_io import ReturnWriter
 from wavebatch.files.las.point_formats import WITHOUT_WAVES
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.stages.score import find_isolated
-from wavebatch.tools.simulate.blocks import SEED_BLOCK, Simulated, simulate_seed_block
+from wavebatch.tools.simulate.blocks import Simulated, seed_block, simulate_seed_block
 from wavebatch.tools.simulate.geometry import EAST, NORTH, Flight
 from wavebatch.tools.simulate.returns import DiscreteReceiver, Returns, fill_packets, list_returns
 from wavebatch.tools.simulate.scenes import Scene, find_scene
@@ -186,9 +186,10 @@ def _simulate_parts(
     """Pulses 0 to `pulses` of the scene, a seed block at a time; progress is called when the caller has used one."""
     if pulses < 1:
         raise ConfigError(f"a strip needs at least one pulse, not {pulses}")
-    for first in range(0, pulses, SEED_BLOCK):
-        n = min(SEED_BLOCK, pulses - first)
-        yield simulate_seed_block(scene, seed, first // SEED_BLOCK, flight).cut(0, n)
+    block = seed_block(scene)
+    for first in range(0, pulses, block):
+        n = min(block, pulses - first)
+        yield simulate_seed_block(scene, seed, first // block, flight).cut(0, n)
         if progress:
             progress(n)
 
@@ -221,8 +222,9 @@ def _write_part(
     block, n = simulated.block, len(simulated.block)
     returns = list_returns(simulated.truth, n, scene.recording, options.most_returns, keep_empty=options.keep_empty)
     # Always a whole block of random numbers: pulse k gets the same whatever the number of pulses.
-    jitter = rng.uniform(-0.5, 0.5, SEED_BLOCK)[:n] * scene.recording.spacing
-    stored = rng.random(SEED_BLOCK)[:n] >= options.without_waveform
+    whole = seed_block(scene)
+    jitter = rng.uniform(-0.5, 0.5, whole)[:n] * scene.recording.spacing
+    stored = rng.random(whole)[:n] >= options.without_waveform
     stored &= np.bincount(returns.pulse, minlength=n) > 0
     rows = np.flatnonzero(stored)
     offset = np.zeros(n, np.uint64)

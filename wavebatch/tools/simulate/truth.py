@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -44,6 +46,12 @@ PACKET_COLUMNS: dict[str, str] = {"packet_byte_offset": "<u8", "packet_gps_time"
 _DTYPES = {**ECHO_COLUMNS, **PACKET_COLUMNS}
 _META = "meta"
 _PIECE = 1 << 18
+_MOST_TEXT = 4 << 20
+"""Most bytes of the description: it takes a few hundred."""
+_DAMAGED = (
+    zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, KeyError, RuntimeError, OverflowError,
+)  # fmt: skip
+"""What zipfile, NumPy and JSON raise for damaged archives; RuntimeError for encrypted and unknown members."""
 
 
 class TruthWriter(NpzWriter):
@@ -65,20 +73,35 @@ class TruthReader(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
-        try:
+        with self._reading():
             self._archive = zipfile.ZipFile(self.path)
             known = set(self._archive.namelist())
             lacking = [name for name in (*_DTYPES, _META) if f"{name}.npy" not in known]
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
-                self.meta: dict[str, Any] = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
-        except (zipfile.BadZipFile, ValueError, EOFError) as error:
-            raise InputError(f"{self.path}: no truth file of wavebatch simulate: {error}") from error
+                self.meta: dict[str, Any] = json.loads(self._read_text(member))
+
+    @contextlib.contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Turn what damaged archives raise into one InputError line."""
+        try:
+            yield
+        except InputError:
+            raise
         except OSError as error:
-            if isinstance(error, InputError):
-                raise
             raise InputError(f"{self.path}: cannot be read: {error.strerror or error}; check the name") from error
+        except _DAMAGED as error:
+            raise InputError(
+                f"{self.path}: no truth file of wavebatch simulate, or damaged: {error}; simulate the strip again"
+            ) from error
+
+    def _read_text(self, member: IO[bytes]) -> str:
+        np.lib.format.read_magic(member)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
+            raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
+        return str(np.frombuffer(member.read(dtype.itemsize), dtype)[0])
 
     def close(self) -> None:
         """Closes the file."""
@@ -86,7 +109,7 @@ class TruthReader(Closing):
 
     def read_pieces(self, *names: str, size: int = _PIECE) -> Iterator[dict[str, np.ndarray]]:
         """The named columns, all per echo or all per packet, at most `size` rows at a time."""
-        with contextlib.ExitStack() as stack:
+        with self._reading(), contextlib.ExitStack() as stack:
             members = {name: stack.enter_context(self._archive.open(f"{name}.npy")) for name in names}
             lengths = {self._read_length(name, member) for name, member in members.items()}
             if len(lengths) != 1:

@@ -174,7 +174,9 @@ def find_segments(piece: Slice, options: SliceOptions) -> list[Segment]:
     x, y = piece.x[rows], piece.y[rows]
     weight, sigma = piece.line.value[rows].astype(np.float64), options.sigma / piece.line.spacing
     gap = _choose_gap(piece)
-    lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most)
+    # A flat surface is no straight line over time, so bends mean ridges in a plane only.
+    pulse = piece.line.row[rows] if piece.geometry == "plane" else None
+    lines = find_lines(x, y, weight, sigma=sigma, gap=gap, shortest=options.shortest, most=options.most, pulse=pulse)
     return [_describe(piece, found, rows[found.rows], number) for number, found in enumerate(lines)]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.tools.voxels.floor import Floor
 
 LEAST_CELL = 4.0
 """Least cell of the map [m]."""
@@ -102,9 +103,14 @@ class Ceiling:
         return x, key - x * _SHIFT
 
 
-def find_ceiling(reader: StripReader, scan: StripScan, middle: np.ndarray, size: float) -> Ceiling:
-    """The ceiling of a strip; reads all of its points."""
+def find_ceiling(
+    reader: StripReader, scan: StripScan, middle: np.ndarray, size: float, floor: Floor | None = None
+) -> Ceiling:
+    """The ceiling of a strip; reads all of its points, and adds them to `floor` too."""
     ceiling = Ceiling(middle, size)
     for begin, end in zip(scan.borders[:-1].tolist(), scan.borders[1:].tolist(), strict=True):
-        ceiling.add(locate(reader.read_points(begin, end), reader.facts.header))
+        xyz = locate(reader.read_points(begin, end), reader.facts.header)
+        ceiling.add(xyz)
+        if floor is not None:
+            floor.add(xyz)
     return ceiling.finish()

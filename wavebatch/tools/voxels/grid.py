@@ -56,7 +56,7 @@ COLUMNS = (
     VoxelColumn("rays", "u4", "-", "rays with light that crossed"),
     VoxelColumn("path", "f4", "m", "way of these rays in it"),
     VoxelColumn("light", "f4", "rays", "what was left of them"),
-    VoxelColumn("share", "f4", "-", "share of it that came back", -9999.0),
+    VoxelColumn("share", "f4", "-", "share of it that was caught", -9999.0),
 )
 """Values of every voxel; cross_section only with a calibration."""
 
@@ -139,8 +139,8 @@ class VoxelGrid(Closing):
             before = np.where(first, 0.0, total_until(total, ray, found.enter, spacing))
             return differences_along(_count(before, unit), ray, _count(total[:, -1], unit))
 
-        whole = rays.energy[:, -1:]
-        part = rays.energy / np.where(whole > 0, whole, 1.0)
+        whole = rays.caught[:, -1:]
+        part = rays.caught / np.where(whole > 0, whole, 1.0)
         values = np.zeros((len(ray), 7 if self._sections else 5), np.int64)
         values[:, _RAYS] = 1
         values[:, _CAUGHT] = spread(part, LIGHT_UNIT)

@@ -12,6 +12,7 @@ import numpy as np
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.geometry.voxels import accumulate_profile
 from wavebatch.kernels.physics import radiometry
+from wavebatch.tools.voxels.floor import Floor
 from wavebatch.tools.voxels.profile import Profiles
 
 MOST_SECTION = 2.0**14
@@ -32,6 +33,8 @@ class RayTable:
     """Time at which it ends, f8 (n,) [ns]."""
     energy: np.ndarray
     """Energy up to the end of each sample, f8 (n, s + 1) [DN ns]."""
+    caught: np.ndarray
+    """The same as light: normalised by range, that of the ground counted as much as that of canopy, f8 (n, s + 1)."""
     section: np.ndarray
     """Cross section up to the end of each sample, f8 (n, s + 1) [m2]; (n, 0) without calibration."""
     unknown: np.ndarray
@@ -42,8 +45,45 @@ class RayTable:
         return RayTable(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LightRule:
+    """How signal along a ray becomes light that was caught there."""
+
+    floor: Floor
+    ground_height: float
+    """Signal up to this height above the ground is the ground's [m]."""
+    ratio: float = 1.0
+    """Reflectance of canopy over that of ground."""
+
+    def split(self, block: WaveformBlock, profiles: Profiles) -> tuple[np.ndarray, np.ndarray]:
+        """Signal of each sample from canopy and from ground, f8 (n, s) each.
+
+        Times the square of its range where the sensor's position is known.
+        """
+        row, sample = np.nonzero(profiles.value)
+        place = block.origin[row] + block.direction[row] * (sample * block.spacing - profiles.offset[row])[:, None]
+        ground = self.floor.measure_height(place) <= self.ground_height
+        light = profiles.value[row, sample] * profiles.area
+        if block.sensor is not None:
+            away = measure_lengths(place - block.sensor[row])
+            light = light * np.where(np.isfinite(away), away**2, 1.0)
+        parts = np.zeros((2, *profiles.value.shape))
+        parts[ground.astype(int), row, sample] = light
+        return parts[0], parts[1]
+
+    def weigh(self, block: WaveformBlock, profiles: Profiles) -> np.ndarray:
+        """Light caught at each sample, f8 (n, s), in units that are the same along a ray."""
+        canopy, ground = self.split(block, profiles)
+        return canopy + self.ratio * ground
+
+
 def trace_profiles(
-    block: WaveformBlock, profiles: Profiles, *, headroom: np.ndarray | float = 0.0, system: SystemPulse | None = None
+    block: WaveformBlock,
+    profiles: Profiles,
+    rule: LightRule,
+    *,
+    headroom: np.ndarray | float = 0.0,
+    system: SystemPulse | None = None,
 ) -> RayTable:
     """The rays of a block with the signal of their profiles.
 
@@ -66,6 +106,7 @@ def trace_profiles(
         begin=begin,
         end=(np.where(profiles.seen, last, s) - 0.5) * block.spacing,
         energy=accumulate_profile(profiles.value * profiles.area),
+        caught=accumulate_profile(rule.weigh(block, profiles)),
         section=section,
         unknown=unknown,
     )
@@ -83,17 +124,20 @@ def _measure_sections(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cross section of each sample, f8 (n, s) [m2], and waveforms where it is unknown, bool (n,).
 
-    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (docs/algorithms.md 5).
+    C' pi divergence^2 / 4 R^4 A sigma / eta(R) of a system pulse as high as the profile (docs/algorithms.md 5), with C'
+    and pulse of the waveform's channel.
     """
+    system = system.of(block)
     section = np.zeros(profiles.value.shape)
     if block.sensor is None:
         return section, profiles.seen
     row, sample = np.nonzero(profiles.value)
+    constant, _ = system.calibrate(block)
     off = start[row] + block.direction[row] * (sample * block.spacing)[:, None] - block.sensor[row]
     distance = radiometry.known_distance(measure_lengths(off))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(
-            system.calibration, distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
+            constant[row], distance, profiles.value[row, sample], system.sigma_ref, system.attenuation
         )
         value = radiometry.cross_section(gamma, distance, 1e-3 * system.divergence)
     # A sample without range makes the sum of its ray NaN, which the comparison counts as unknown.

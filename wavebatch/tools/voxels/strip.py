@@ -22,18 +22,22 @@ from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.voxels import fits_keys
-from wavebatch.surveying import survey_blocks
+from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
+from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import Calibration
-from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.choose_chain import Request, make_choice
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
+from wavebatch.tools.voxels.floor import Floor
+from wavebatch.tools.voxels.gap import SAMPLED, find_rule
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
 from wavebatch.tools.voxels.profile_file import ProfileWriter, open_profiles
-from wavebatch.tools.voxels.rays import trace_profiles
+from wavebatch.tools.voxels.rays import LightRule, trace_profiles
 
 BLOCK_SAMPLES = 1 << 20
 """Samples read at a time."""
@@ -57,12 +61,21 @@ class VoxelOptions:
     """Length before the first sample over which every ray counts too [m]; None: up to the highest return near it."""
     all_crossed: bool = False
     """Write voxels that rays crossed without any signal, too."""
+    ground_height: float = 0.5
+    """Signal up to this height above the ground is the ground's [m]."""
+    reflectance_ratio: float | None = None
+    """Reflectance of canopy over that of ground; None: estimated from the strip."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= _LARGEST:
             raise ConfigError(f"--size {self.size:g}: the size of a voxel must lie above 0 and up to {_LARGEST:g} m")
         if self.headroom is not None and not 0 <= self.headroom < 1e5:
             raise ConfigError(f"--headroom {self.headroom:g}: must lie between 0 and 100000 m")
+        if not 0 <= self.ground_height <= 100:
+            raise ConfigError(f"--ground-height {self.ground_height:g}: must lie between 0 and 100 m")
+        ratio = self.reflectance_ratio
+        if ratio is not None and not LOWEST <= ratio <= HIGHEST:
+            raise ConfigError(f"--reflectance-ratio {ratio:g}: must lie between {LOWEST:g} and {HIGHEST:g}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,11 +108,19 @@ class VoxelSummary:
     sensor: str | None = None
     """Source of the sensor's positions; None without calibration."""
     unknown: int = 0
-    """Waveforms with signal of unknown cross section."""
+    """Waveforms with signal of unknown cross section: channels without a constant, pulses without a sensor position."""
+    reflectance_ratio: float = 1.0
+    """Reflectance of canopy over that of ground, by which light is shared between them."""
+    reflectance_ratio_err: float | None = None
+    """Its standard deviation; None where it was given or assumed."""
+    reflectance_ratio_source: str = "assumed"
+    """`given`, `strip`, `assumed` (1, because the strip does not show it), or `no canopy`."""
     profiles: str | None = None
     """File with the profiles of single pulses."""
     profile_samples: int = 0
     """Samples with signal in that file."""
+    warnings: tuple[str, ...] = ()
+    """Why cross sections may be less sure than the calibration says."""
 
 
 def voxelize_strip(
@@ -134,20 +155,24 @@ def voxelize_strip(
         raise ConfigError(f"--profiles {profiles}: is the output of the voxels too; give it another name")
     with StripReader(strip, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
         check_saved(reader, scan, system and system.survey, force=force)
-        pulse = _find_pulse(reader, scan, system, calibration)
-        source = UNKNOWN if calibration is None else _find_sensor(reader, scan, sensor)
+        source = _seek_sensor(reader, scan) if calibration is None else _find_sensor(reader, scan, sensor)
+        pulse, doubts = _find_pulse(reader, scan, system, calibration, source)
         middle = _find_middle(reader, scan, options)
-        ceiling = find_ceiling(reader, scan, middle, options.size) if options.headroom is None else None
+        floor = Floor(middle)
+        ceiling = find_ceiling(reader, scan, middle, options.size, floor)
+        sample = (source.fill(block) for block in reader.sample_blocks(scan, SAMPLED))
+        deconvolution, height, given = options.deconvolution, options.ground_height, options.reflectance_ratio
+        rule, ratio = find_rule(sample, pulse, deconvolution, floor.finish(), height, given)
         with (
             _open_grid(reader, middle, options, calibration is not None, held) as grid,
             open_profiles(profiles, strip, calibration is not None, overwrite) as writer,
         ):
             counts: Counter[str] = Counter()
             for block in _read_blocks(reader, scan, block_size):
-                _add_block(grid, counts, source.fill(block), pulse, options, ceiling, writer)
+                _add_block(grid, counts, source.fill(block), pulse, options, ceiling, rule, writer)
                 if progress is not None:
                     progress(len(block), scan.packets)
-            meta = _describe(strip, options, pulse, calibration)
+            meta = _describe(strip, options, pulse, calibration) | {"reflectance_ratio": asdict(ratio)}
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             voxels = _write_both(target, space, grid, writer, overwrite)
             return VoxelSummary(
@@ -167,6 +192,10 @@ def voxelize_strip(
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
                 noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
+                reflectance_ratio=ratio.ratio,
+                reflectance_ratio_err=ratio.error,
+                reflectance_ratio_source=ratio.source,
+                warnings=doubts,
             )
 
 
@@ -186,22 +215,28 @@ def _write_both(
 
 
 def _find_pulse(
-    reader: StripReader, scan: StripScan, saved: SavedSurvey | None, calibration: Calibration | None
-) -> SystemPulse:
-    """The system pulse, saved or learned from the strip, with the calibration."""
+    reader: StripReader,
+    scan: StripScan,
+    saved: SavedSurvey | None,
+    calibration: Calibration | None,
+    sensor: SensorSource,
+) -> tuple[SystemPulse, tuple[str, ...]]:
+    """The system pulse that `wavebatch run` would use, with the calibration of each channel, and warnings."""
     path = reader.facts.path
     if not scan.packets:
         raise InputError(f"{path}: holds no waveform to put into voxels; see `wavebatch check`")
-    system = survey_blocks(read_sample(reader, scan)).system if saved is None else saved.survey.system
+    choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
+    system = choice.survey.system
     if calibration is None:
-        return system
-    system = calibration.apply(system)
+        return system, ()
+    fitted = match_strip(calibration, reader, scan, system, sensor, choice.chain)
+    system = fitted.calibration.apply(system)
     if system.divergence is None:
         raise ConfigError(
             "--calibration: cross sections need the beam's divergence: add divergence_mrad to the calibration or give "
             "a --system file that has it"
         )
-    return system
+    return system, (*fitted.warnings, *filter(None, [sensor.doubt()]))
 
 
 def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | None) -> SensorSource:
@@ -212,6 +247,14 @@ def _find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest | 
             "--flight-height, or leave --calibration out"
         )
     return source
+
+
+def _seek_sensor(reader: StripReader, scan: StripScan) -> SensorSource:
+    """Positions of the sensor for ranges within a ray, which are left as they are where the strip does not give any."""
+    try:
+        return find_sensor(reader, scan, SensorRequest())
+    except InputError:
+        return UNKNOWN
 
 
 def _find_middle(reader: StripReader, scan: StripScan, options: VoxelOptions) -> np.ndarray:
@@ -264,14 +307,19 @@ def _add_block(
     block: WaveformBlock,
     pulse: SystemPulse,
     options: VoxelOptions,
-    ceiling: Ceiling | None,
+    ceiling: Ceiling,
+    rule: LightRule,
     writer: ProfileWriter | None,
 ) -> None:
     profiles = deconvolve_block(block, pulse, options.deconvolution)
+    headroom = options.headroom
+    if headroom is None:
+        headroom = ceiling.measure_headroom(block.origin, block.direction)
     rays = trace_profiles(
         block,
         profiles,
-        headroom=options.headroom if ceiling is None else ceiling.measure_headroom(block.origin, block.direction),
+        rule,
+        headroom=headroom,
         system=pulse if pulse.calibration is not None else None,
     )
     grid.add(rays, block.spacing)
@@ -293,6 +341,7 @@ def _describe(
         "size_m": options.size,
         "headroom_m": options.headroom,
         "all_crossed": options.all_crossed,
+        "ground_height_m": options.ground_height,
         "deconvolution": asdict(deconvolution) | {"iterations": deconvolution.steps},
         "system": describe_system(pulse),
         "calibration": None if calibration is None else calibration.describe(),

@@ -1,0 +1,41 @@
+"""The kind of the processor: equal where arithmetic is, different where a BLAS takes other code."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from wavebatch.core.processor import describe_processor, probe_arithmetic
+from wavebatch.tools.simulate import simulate_strip
+
+KINDS = ("Haswell", "SkylakeX", "Prescott")
+
+
+def _probe(kind):
+    code = "from wavebatch.core.processor import probe_arithmetic; print(probe_arithmetic())"
+    env = {**os.environ, "OPENBLAS_CORETYPE": kind, "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env).stdout
+
+
+def test_the_probe_is_the_same_each_time():
+    assert describe_processor() == describe_processor()
+    assert describe_processor()["probe"] == probe_arithmetic() and len(probe_arithmetic()) == 16
+    assert describe_processor()["name"]
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.uname().machine != "x86_64", reason="kinds of x86 processors")
+def test_strips_differ_only_between_processors_that_the_probe_tells_apart(tmp_path):
+    """Else `run --scheduler` would mix them."""
+    simulate_strip("mixed", tmp_path / "a.las", pulses=1500, seed=3)
+    probes, clouds = [], []
+    for kind in KINDS:
+        out = tmp_path / kind
+        env = {**os.environ, "OPENBLAS_CORETYPE": kind, "OPENBLAS_NUM_THREADS": "1"}
+        command = ["run", tmp_path / "a.las", "-o", out, "--format", "las", "-q"]
+        subprocess.run([sys.executable, "-m", "wavebatch", *map(str, command)], check=True, env=env)
+        probes.append(_probe(kind))
+        clouds.append((out / "a.las").read_bytes())
+    for i in range(len(KINDS)):
+        for j in range(i):
+            assert probes[i] != probes[j] or clouds[i] == clouds[j], (KINDS[i], KINDS[j])

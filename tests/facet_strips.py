@@ -1,0 +1,197 @@
+"""A small simulator of full-waveform strips over tilted planes, independent of `wavebatch simulate`.
+
+The footprint is cut into sub-rays; each meets the planes by itself, and the echo is the sum of what they return. So
+pulse widths, edges and mixed targets come out of geometry, not out of the formulas that they test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.strip.writer import FullwaveWriter
+
+C_AIR = 0.299792458 * 0.9997 / 2
+"""One-way metres per two-way ns."""
+EAST, NORTH, START = 500_000.0, 5_400_000.0, 300_000_000.0
+AIR = 0.22
+"""Attenuation [dB/km]."""
+
+
+@dataclass(frozen=True)
+class Facet:
+    """A plane z = z0 + sx (x - x0) + sy (y - y0) where `inside(x, y)`; `inside` None: everywhere."""
+
+    reflectance: float | Callable[[np.ndarray, np.ndarray], np.ndarray]
+    z0: float = 0.0
+    slope: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
+    inside: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+
+
+def box(x0: float, y0: float, x1: float, y1: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A rectangle as the `inside` of a facet."""
+    return lambda x, y: (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What is recorded, and how the sensor flies; coordinates are relative to EAST, NORTH and height 0."""
+
+    pulse: Sequence[tuple[float, float, float]] = ((1.0, 0.0, 2.0),)
+    """Weight, delay [ns] and sigma [ns] of the Gaussians of the pulse; the first has weight 1."""
+    light: float = 1.2e8
+    """Amplitude of a white surface that faces the sensor at 1 m [DN m2]; times the gain of the channel."""
+    gains: Mapping[int, float] = field(default_factory=lambda: {1: 1.0})
+    """Gain of each digitizer by index; pulses take them in turn."""
+    scanners: bool = False
+    """Number the channels as scanner channels of digitizer 1, in place of digitizers."""
+    divergence: float = 0.5e-3
+    """Full angle between the 1/e2 points [rad]."""
+    noise: float = 0.6
+    energy_spread: float = 0.0
+    """Relative standard deviation of the energy of shots."""
+    bits: int = 16
+    spacing: float = 1.0
+    n_samples: int = 80
+    descriptor_gain: float = 1.0
+    height: float = 700.0
+    speed: float = 60.0
+    rate: float = 10_000.0
+    line_rate: float = 25.0
+    half_angle: float = 15.0
+    heading: float = 90.0
+    """Of the flight, clockwise from north [deg]."""
+    start: tuple[float, float] = (0.0, 0.0)
+    time: float = START
+
+
+def path_of(sensor: Sensor, seconds: np.ndarray) -> np.ndarray:
+    """Positions of the sensor (n, 3)."""
+    heading = np.radians(sensor.heading)
+    along = sensor.speed * seconds
+    x = sensor.start[0] + along * np.sin(heading) + 0.5 * np.sin(0.3 * seconds)
+    y = sensor.start[1] + along * np.cos(heading)
+    return np.stack([x, y, sensor.height + 2.0 * np.sin(0.2 * seconds)], axis=1)
+
+
+def write_trajectory(path: Path, sensor: Sensor, duration: float, lower: float = 0.0) -> Path:
+    """The sensor's positions as a text file, `lower` metres too low."""
+    seconds = np.arange(-2.0, duration + 2.0, 0.05)
+    xyz = path_of(sensor, seconds) + [EAST, NORTH, -lower]
+    rows = np.column_stack([sensor.time + seconds, xyz])
+    text = "\n".join(",".join(f"{value:.6f}" for value in row) for row in rows)
+    path.write_text("time,x,y,z\n" + text)
+    return path
+
+
+def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int, seed: int = 1) -> Path:
+    """A strip over the facets (the first that a sub-ray meets counts), point format 4, or 9 with scanner channels."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(pulses) / sensor.rate
+    origin = path_of(sensor, seconds)
+    ray = _rays(sensor, seconds)
+    distance, strength = _trace(origin, ray, facets, sensor)
+    near = np.where(strength > 0, distance, np.inf).min(axis=1)
+    assert np.isfinite(near).all(), "every ray must meet a facet"
+    first = near / C_AIR - 20.0 - rng.uniform(0, 1, pulses)
+    channels = list(sensor.gains)
+    channel = np.array(channels)[np.arange(pulses) % len(channels)]
+    energy = np.array([sensor.gains[number] for number in channel]) * (
+        1 + sensor.energy_spread * rng.standard_normal(pulses)
+    )
+    wave = _render(distance / C_AIR - first[:, None], strength * energy[:, None], sensor)
+    clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
+    samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)
+    hit = (strength * distance).sum(axis=1) / strength.sum(axis=1)
+    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit)
+    return path
+
+
+def _rays(sensor: Sensor, seconds: np.ndarray) -> np.ndarray:
+    phase = (seconds * sensor.line_rate) % 1.0
+    angle = np.radians(sensor.half_angle) * (1.0 - 2.0 * phase)
+    heading = np.radians(sensor.heading)
+    forward = np.array([np.sin(heading), np.cos(heading), 0.0])
+    left = np.array([-np.cos(heading), np.sin(heading), 0.0])
+    ahead = np.tan(np.radians(3.0))
+    ray = np.tan(angle)[:, None] * left + ahead * forward + [0.0, 0.0, -1.0]
+    return ray / np.linalg.norm(ray, axis=1)[:, None]
+
+
+def _trace(origin: np.ndarray, ray: np.ndarray, facets: Sequence[Facet], sensor: Sensor):
+    """Distance and returned strength of every sub-ray (n, k)."""
+    rings = np.sqrt(-0.5 * np.log(1 - (np.arange(6) + 0.5) / 6))  # equal energy per ring, in 1/e2 radii
+    turns = np.arange(8) * (2 * np.pi / 8)
+    offsets = np.array([(r * np.cos(t + 0.4 * i), r * np.sin(t + 0.4 * i)) for i, r in enumerate(rings) for t in turns])
+    side = np.cross(ray, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    up = np.cross(ray, side)
+    half = 0.5 * sensor.divergence
+    unit = ray[:, None] + half * (offsets[:, :1] * side[:, None] + offsets[:, 1:] * up[:, None])
+    unit /= np.linalg.norm(unit, axis=2)[..., None]
+    best, strength = np.full(unit.shape[:2], np.inf), np.zeros(unit.shape[:2])
+    for facet in facets:
+        sx, sy = facet.slope
+        height = origin[:, 2] - facet.z0 - sx * (origin[:, 0] - facet.centre[0]) - sy * (origin[:, 1] - facet.centre[1])
+        fall = sx * unit[..., 0] + sy * unit[..., 1] - unit[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = height[:, None] / fall
+        x, y = (origin[:, None, axis] + t * unit[..., axis] for axis in (0, 1))
+        hit = (fall > 0) & (t > 0) & (t < best) & (True if facet.inside is None else facet.inside(x, y))
+        facing = fall / np.sqrt(1 + sx * sx + sy * sy)
+        best = np.where(hit, t, best)
+        bright = facet.reflectance(x, y) if callable(facet.reflectance) else facet.reflectance
+        strength = np.where(hit, bright * facing, strength)
+    best = np.where(np.isfinite(best), best, 1e6)
+    air = 10.0 ** (-2e-4 * AIR * best)
+    return best, sensor.light * strength * air / best**2 / len(offsets)
+
+
+def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarray:
+    grid = np.arange(sensor.n_samples) * sensor.spacing
+    wave = np.zeros((len(time), len(grid)))
+    for k in range(time.shape[1]):
+        lag = grid - time[:, k : k + 1]
+        for weight, delay, sigma in sensor.pulse:
+            wave += strength[:, k : k + 1] * weight * np.exp(-0.5 * ((lag - delay) / sigma) ** 2)
+    return wave
+
+
+def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit) -> None:
+    indices = [1] if sensor.scanners else list(sensor.gains)
+    digitizers = [
+        Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices
+    ]
+    kind = {"version": "1.4", "point_format": 9} if sensor.scanners else {"version": "1.3", "point_format": 4}
+    with FullwaveWriter(
+        path, internal=True, digitizers=digitizers, offsets=(EAST, NORTH, 0.0), overwrite=True, **kind
+    ) as writer:
+        used = np.ones(len(channel), int) if sensor.scanners else channel
+        offset = np.zeros(len(channel), np.uint64)
+        for index in indices:
+            rows = used == index
+            offset[rows] = writer.write_packets(samples[rows], index)
+        points = np.zeros(len(channel), writer.dtype)
+        for axis, name in enumerate("XYZ"):
+            points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
+            points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
+        points["gps_time"] = sensor.time + seconds
+        points["bit_fields"] = 1 | (1 << (4 if sensor.scanners else 3))
+        heading = np.radians(sensor.heading)
+        across = np.degrees(np.arctan2(ray @ [-np.cos(heading), np.sin(heading), 0.0], -ray[:, 2]))
+        if sensor.scanners:
+            points["scan_angle"] = np.rint(across / 0.006)
+            points["classification_flags"] = (channel - 1) << 4
+        else:
+            points["scan_angle_rank"] = np.rint(across)
+        points["wavepacket_index"] = used
+        points["wavepacket_offset"] = offset
+        points["wavepacket_size"] = sensor.n_samples * samples.dtype.itemsize
+        points["return_point_wave_location"] = (hit / C_AIR - first) * 1000.0
+        writer.write_points(points)
+        writer.commit()

@@ -1,0 +1,202 @@
+"""A small simulator of strips over tilted planes: sub-rays of the footprint, each traced by itself, and summed.
+
+Widths, energies and angles come out of geometry here, not out of the formulas that the physical columns use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.strip.writer import FullwaveWriter
+
+SPEED = 0.299792458 * 0.9997 / 2
+"""One-way metres per two-way ns, in air."""
+EAST, NORTH, START = 500_000.0, 5_400_000.0, 300_000_000.0
+
+
+@dataclass(frozen=True)
+class Plane:
+    """z = z0 + sx (x - x0) + sy (y - y0) where `inside(x, y)`, everywhere without it; coordinates less EAST, NORTH."""
+
+    reflectance: float = 0.3
+    slope: tuple[float, float] = (0.0, 0.0)
+    z0: float = 0.0
+    centre: tuple[float, float] = (0.0, 0.0)
+    inside: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+
+
+def roofs(degrees: Sequence[float], *, reflectance: float = 0.4, south: float = -100.0) -> list[Plane]:
+    """Roofs that fall towards the east, each 16 m wide, one after the other from south to north, 2 m apart."""
+    planes = []
+    for number, degree in enumerate(degrees):
+        low, slope = south + 18.0 * number, -np.tan(np.radians(degree))
+
+        def inside(x: np.ndarray, y: np.ndarray, low: float = low) -> np.ndarray:
+            return (y >= low) & (y < low + 16)
+
+        planes.append(Plane(reflectance, (slope, 0.0), 3.0 + 50.0 * abs(slope), (0.0, low), inside))
+    return planes
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Sensor, flight and recording."""
+
+    pulse: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.64),)
+    """Weight, delay [ns] and sigma [ns] of the Gaussians of the emitted pulse, weights of their heights."""
+    divergence: float = 1.1
+    """Full angle, 1/e2 [mrad]."""
+    light: float = 1.4e8
+    """Height of the echo of a white surface that faces the sensor at 1 m [DN m2]."""
+    noise: float = 0.8
+    height: float = 640.0
+    half_angle: float = 12.0
+    spacing: float = 0.5
+    n_samples: int = 128
+    bits: int = 16
+    speed: float = 60.0
+    rate: float = 100_000.0
+    line_rate: float = 160.0
+    air: float = 0.22
+    """Attenuation [dB/km]."""
+    energy_spread: float = 0.0
+    """Relative standard deviation of the energies of the shots."""
+    point_error: float = 0.01
+    """Standard deviation of the vendor's points along the ray [m]."""
+    store_energy: bool = False
+    """Write the energy of each shot as the extra byte `shot_energy`."""
+
+    @property
+    def constant(self) -> float:
+        """C' of these waveforms for a Gaussian pulse."""
+        return 4.0 / (self.light * self.pulse[0][2])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of each pulse, arrays (n,), by GPS time."""
+
+    gps_time: np.ndarray
+    range: np.ndarray
+    incidence: np.ndarray
+    """[deg]."""
+    reflectance: np.ndarray
+    plane: np.ndarray
+    """Number of the plane that the middle of the footprint meets."""
+    pure: np.ndarray
+    """Whether all of the footprint lies on this plane."""
+    energy: np.ndarray
+    """Of the shot, over its mean."""
+
+    @property
+    def gamma(self) -> np.ndarray:
+        """Backscatter coefficient of a Lambertian surface."""
+        return 4 * self.reflectance * np.cos(np.radians(self.incidence))
+
+
+def write_strip(path: Path, planes: Sequence[Plane], flight: Flight, pulses: int, seed: int = 1) -> Truth:
+    """Writes a strip; the first plane that a sub-ray meets counts."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(pulses) / flight.rate
+    origin, ray = _fly(flight, seconds)
+    share, unit = _split(ray, flight)
+    distance, facing, plane = _trace(origin, unit, planes)
+    _, middle_facing, middle = _trace(origin, ray[:, None], planes)
+    reflect = np.array([one.reflectance for one in planes])
+    energy = 1 + flight.energy_spread * rng.standard_normal(pulses)
+    strength = flight.light * share * reflect[plane] * facing * 10.0 ** (-2e-4 * flight.air * distance) / distance**2
+    strength *= energy[:, None]
+    first = distance.min(axis=1) / SPEED - 12.0 - rng.uniform(0, 1, pulses)
+    wave = _render(distance / SPEED - first[:, None], strength, flight)
+    counts = np.rint(20.0 + wave + flight.noise * rng.standard_normal(wave.shape))
+    counts = np.clip(counts, 0, (1 << flight.bits) - 1).astype(np.uint16 if flight.bits > 8 else np.uint8)
+    hit = _trace(origin, ray[:, None], planes)[0][:, 0]
+    noisy = hit + flight.point_error * rng.standard_normal(pulses)
+    _write(path, flight, origin, ray, seconds, counts, first, noisy, energy)
+    incidence = np.degrees(np.arccos(np.clip(middle_facing[:, 0], -1, 1)))
+    pure = (plane == middle).all(axis=1)
+    return Truth(START + seconds, hit, incidence, reflect[middle[:, 0]], middle[:, 0], pure, energy)
+
+
+def match(cloud_time: np.ndarray, truth: Truth) -> np.ndarray:
+    """Row of the truth for each point of a cloud."""
+    return np.searchsorted(truth.gps_time, cloud_time - 1e-7)
+
+
+def _fly(flight: Flight, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the sensor and unit rays (n, 3); east is ahead, lines are swept from north to south."""
+    origin = np.stack([flight.speed * seconds, 0.5 * np.sin(0.3 * seconds), flight.height + np.sin(0.2 * seconds)], 1)
+    angle = np.radians(flight.half_angle) * (1.0 - 2.0 * ((seconds * flight.line_rate) % 1.0))
+    ray = np.stack([np.full(len(angle), 0.03), np.tan(angle), np.full(len(angle), -1.0)], axis=1)
+    return origin, ray / np.linalg.norm(ray, axis=1)[:, None]
+
+
+def _split(ray: np.ndarray, flight: Flight) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of the energy (k,), and unit vectors (n, k, 3), of the sub-rays of a Gaussian beam.
+
+    Rings at Gauss-Laguerre nodes and evenly spaced turns: moments of the beam up to the eleventh are exact.
+    """
+    nodes, weights = np.polynomial.laguerre.laggauss(6)
+    turns = np.arange(12) * (2 * np.pi / 12)
+    radius = 0.5e-3 * flight.divergence * np.sqrt(nodes / 2)
+    side = np.cross(ray, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    up = np.cross(ray, side)
+    off_side, off_up = (np.outer(radius, wave(turns)).ravel() for wave in (np.cos, np.sin))
+    unit = ray[:, None] + off_side[:, None] * side[:, None] + off_up[:, None] * up[:, None]
+    return np.repeat(weights / 12, 12), unit / np.linalg.norm(unit, axis=2)[..., None]
+
+
+def _trace(origin: np.ndarray, unit: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance, cosine of the incidence, and plane, of the first plane that each sub-ray (n, k, 3) meets."""
+    best, facing, plane = np.full(unit.shape[:2], np.inf), np.zeros(unit.shape[:2]), np.zeros(unit.shape[:2], int)
+    for number, one in enumerate(planes):
+        sx, sy = one.slope
+        above = origin[:, 2] - one.z0 - sx * (origin[:, 0] - one.centre[0]) - sy * (origin[:, 1] - one.centre[1])
+        fall = sx * unit[..., 0] + sy * unit[..., 1] - unit[..., 2]
+        along = above[:, None] / fall
+        hit = (along > 0) & (along < best)
+        if one.inside is not None:
+            hit &= one.inside(*(origin[:, None, axis] + along * unit[..., axis] for axis in (0, 1)))
+        best, plane = np.where(hit, along, best), np.where(hit, number, plane)
+        facing = np.where(hit, fall / np.sqrt(1 + sx * sx + sy * sy), facing)
+    assert np.isfinite(best).all(), "every sub-ray must meet a plane"
+    return best, facing, plane
+
+
+def _render(time: np.ndarray, strength: np.ndarray, flight: Flight) -> np.ndarray:
+    grid = np.arange(flight.n_samples) * flight.spacing
+    wave = np.zeros((len(time), len(grid)))
+    for k in range(time.shape[1]):
+        lag = grid - time[:, k : k + 1]
+        for weight, delay, sigma in flight.pulse:
+            wave += strength[:, k : k + 1] * weight * np.exp(-0.5 * ((lag - delay) / sigma) ** 2)
+    return wave
+
+
+def _write(path, flight, origin, ray, seconds, counts, first, hit, energy) -> None:
+    digitizer = Digitizer(1, flight.bits, flight.n_samples, flight.spacing)
+    extra = [ExtraRecord.build("shot_energy", "f4", "energy of the pulse")] if flight.store_energy else []
+    with FullwaveWriter(
+        path, version="1.3", point_format=4, internal=True, digitizers=[digitizer], offsets=(EAST, NORTH, 0.0),
+        extra_bytes=extra, overwrite=True,
+    ) as writer:  # fmt: skip
+        offset = writer.write_packets(counts, 1)
+        points = np.zeros(len(counts), writer.dtype)
+        for axis, name in enumerate("XYZ"):
+            points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
+            points["xyz"[axis] + "_t"] = -ray[:, axis] * SPEED / 1000.0
+        points["gps_time"], points["bit_fields"] = START + seconds, 1 | (1 << 3)
+        points["wavepacket_index"], points["wavepacket_offset"] = 1, offset
+        points["wavepacket_size"] = counts.shape[1] * counts.itemsize
+        points["return_point_wave_location"] = (hit / SPEED - first) * 1000.0
+        if flight.store_energy:
+            points[writer.dtype.names[-1]] = energy * 7.5
+        writer.write_points(points)
+        writer.commit()

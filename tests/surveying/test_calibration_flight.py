@@ -1,0 +1,228 @@
+"""Calibration of several strips and channels together, against an independent simulator."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wavebatch as wb
+from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
+from wavebatch.cli import main
+from wavebatch.surveying.calibrating.adjust_flight import adjust_constants
+from wavebatch.surveying.calibrating.calibration_file import load_calibration
+from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, measure_ties
+
+GAINS = {("a", 1): 1.0, ("b", 1): 1.08, ("c", 1): 0.95, ("c", 2): 0.4275}
+"""Of each strip and channel: strips drift, and channel 2 has 0.45 of the gain of channel 1."""
+LIGHT = 1.2e8
+TRUE = 4.0 / (LIGHT * 2.0)
+SLOPE = (0.02, 0.01)
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+def fields(x, y):
+    """Fields of 20 m with reflectances of 0.1 to 0.6."""
+    i, j = np.floor(x / 20), np.floor(y / 20)
+    return 0.1 + 0.5 * np.abs(np.sin(12.9898 * i + 78.233 * j) * 43758.5453 % 1.0)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Three strips that overlap; the only target lies on a and c, and c has two channels. Strip d overlaps none."""
+    folder = tmp_path_factory.mktemp("flight")
+    ground = [Facet(0.3, slope=SLOPE, inside=box(40, 0, 60, 20)), Facet(fields, slope=SLOPE)]
+    base = {"speed": 30.0, "rate": 20_000.0, "half_angle": 8.0}
+    sensors = {
+        "a": Sensor(**base, light=LIGHT),
+        "b": Sensor(**base, light=1.08 * LIGHT, start=(110, 90), heading=270.0, time=START + 600),
+        "c": Sensor(**base, light=0.95 * LIGHT, start=(0, -100), gains={1: 1.0, 2: 0.45}, time=START + 900),
+        "d": Sensor(**base, light=LIGHT, start=(5000, 0), time=START + 1200),
+    }
+    for seed, (name, sensor) in enumerate(sensors.items()):
+        write_strip(folder / f"{name}.las", ground, sensor, 40_000, seed=seed)
+    x0, y0 = EAST + 41, NORTH + 1
+    corners = f"{x0} {y0} {x0 + 18} {y0} {x0 + 18} {y0 + 18} {x0} {y0 + 18}"
+    (folder / "t.csv").write_text(f"name,reflectance,vertices\nfield,0.3,{corners}\n")
+    strips = [folder / f"{name}.las" for name in sensors]
+    options = ("--targets", folder / "t.csv", "-o", folder / "cal.toml", "--divergence", 0.5)
+    outputs = ("--report", folder / "cal.json", "--plot", folder / "cal.png")
+    done = call("calibrate", *strips, *options, *outputs)
+    assert done.exit_code == 0, done.output
+    return folder, done.stderr
+
+
+def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight):
+    folder, _ = flight
+    rows = {(row.strip[0], row.digitizer): row for row in load_calibration(folder / "cal.toml").strips}
+    assert rows.keys() == GAINS.keys()
+    for key, row in rows.items():
+        assert row.constant * GAINS[key] / TRUE == pytest.approx(1.0, abs=0.002), key
+        assert row.relative_error == pytest.approx(0.03, abs=0.002)
+        assert row.ties > 100
+    mean = np.mean([-np.log(GAINS[name, 1]) for name in "abc"])
+    for name in "abc":
+        assert rows[name, 1].drift == pytest.approx(np.exp(-np.log(GAINS[name, 1]) - mean) - 1, abs=0.002)
+        assert 0 < rows[name, 1].drift_error < 0.002
+
+
+def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(flight):
+    first, second = load_calibration(flight[0] / "cal.toml").channels
+    assert first.relative_error == pytest.approx(np.hypot(0.03, np.std(np.log([1, 1.08, 0.95]), ddof=1)), rel=0.02)
+    assert second.constant * 0.4275 / TRUE == pytest.approx(1.0, abs=0.002)
+    assert second.relative_error == pytest.approx(first.relative_error, rel=0.02)
+
+
+def test_a_strip_that_nothing_ties_is_named_and_has_no_constant(flight):
+    folder, said = flight
+    assert "warning: d.las: has no constant: no target lies on it" in said
+    assert all(row.strip != "d.las" for row in load_calibration(folder / "cal.toml").strips)
+
+
+def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
+    folder, said = flight
+    assert "b.las: its constant is -6." in said
+    assert "b.las over a.las:" in said and "calibrated +0.0" in said
+    report = json.loads((folder / "cal.json").read_text())
+    pair = next(row for row in report["pairs"] if (row["a"], row["b"]) == ("b.las", "a.las"))
+    assert pair["ratio"] == pytest.approx(1.08, abs=0.003) and pair["after"] == pytest.approx(1.0, abs=0.002)
+    assert abs(pair["height"]) < 0.003
+    assert (folder / "cal.png").stat().st_size > 10_000
+
+
+def test_every_strip_is_run_with_its_own_constant(tmp_path, flight):
+    folder, _ = flight
+    done = call("run", folder / "b.las", folder / "c.las", "-o", tmp_path, "--calibration", folder / "cal.toml")
+    assert done.exit_code == 0 and "warning" not in done.stderr, done.output
+    for name in "bc":
+        cloud = wb.read_cloud(tmp_path / f"{name}.laz")
+        x, y = cloud["x"] - EAST, cloud["y"] - NORTH
+        middle = (np.abs(x % 20 - 10) < 9) & (np.abs(y % 20 - 10) < 9)
+        target = (x >= 40) & (x < 60) & (y >= 0) & (y < 20)
+        true = np.where(target, 0.3, fields(x, y))
+        rho = cloud["backscatter_coefficient"] / 4
+        good = middle & np.isfinite(rho)
+        assert np.median(rho[good] / true[good]) == pytest.approx(1.0, abs=0.02)
+
+
+def make_ties(rng, constants, cells, outliers=0.0):
+    """Ties of sources that each see half of the cells."""
+    bright = rng.normal(-1, 0.4, cells)
+    seen = np.argsort(rng.random((cells, len(constants))), axis=1)[:, :2]
+    cell = np.repeat(np.arange(cells), 2)
+    source = seen.ravel()
+    value = bright[cell] - np.asarray(constants)[source] + rng.normal(0, 0.01, 2 * cells)
+    value[rng.random(2 * cells) < outliers] += 0.7
+    centre = np.column_stack([5.0 * cell, np.zeros(2 * cells)])
+    zero = np.zeros(2 * cells)
+    return Ties(cell, source, value, np.full(2 * cells, 0.005), zero, zero, centre, 5.0)
+
+
+def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
+    constants = np.array([0.0, 0.3, -0.2, 0.1])
+    ties = make_ties(rng, constants, 2000, outliers=0.1)
+    given = np.array([0.0, np.nan, np.nan, np.nan])
+    found = adjust_constants(ties, given, np.full(4, 0.01))
+    assert np.abs(found.value - constants).max() < 0.01
+
+
+def test_the_errors_of_the_adjustment_hold_its_errors(rng):
+    constants = np.array([0.0, 0.3, -0.2])
+    ratios = []
+    for _ in range(60):
+        ties = make_ties(rng, constants, 120)
+        given = np.array([rng.normal(0, 0.01), np.nan, rng.normal(-0.2, 0.02)])
+        found = adjust_constants(ties, given, np.array([0.01, np.nan, 0.02]))
+        ratios += list((found.value - constants) / found.error)
+    assert 0.55 < np.mean(np.abs(ratios) < 1) < 0.8
+
+
+def test_sources_without_ties_stay_unknown(rng):
+    ties = make_ties(rng, np.zeros(2), 5)
+    found = adjust_constants(ties, np.array([0.0, np.nan, 0.4]), np.full(3, 0.01))
+    assert np.isfinite(found.value).tolist() == [True, False, True]
+
+
+def test_channels_without_any_tie_have_the_constants_of_their_targets():
+    nothing = measure_ties(np.zeros(0, TIE), 5.0)
+    found = adjust_constants(nothing, np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02]))
+    assert found.value[[0, 2]].tolist() == pytest.approx([0.1, 0.4], rel=1e-9) and np.isnan(found.value[1])
+    assert found.error[[0, 2]] == pytest.approx([0.01, 0.02], rel=0.35)
+
+
+def test_cells_that_are_rough_or_seen_in_one_line_tie_nothing(rng):
+    def rows(source, xy, z):
+        out = np.zeros(len(xy), TIE)
+        out["xyz"] = np.column_stack([xy, z])
+        out["ray"], out["light"], out["source"] = (0.0, 0.0, -1.0), 2.0, source
+        return out
+
+    def spread(n, x=0.0):
+        return rng.uniform(0, 5, (n, 2)) + [x, 0]
+
+    line = np.column_stack([rng.uniform(10, 15, 30), np.full(30, 2.0)])
+    parts = []
+    for source in (0, 1):
+        parts += [rows(source, spread(20), rng.normal(0, 0.01, 20))]
+        parts += [rows(source, spread(20, 5.0), rng.uniform(0, 2, 20))]
+        parts += [rows(source, line, rng.normal(0, 0.01, 30)), rows(source, spread(3, 20.0), np.zeros(3))]
+    ties = measure_ties(np.concatenate(parts), 5.0)
+    assert set(map(tuple, ties.centre)) == {(2.5, 2.5)}
+    assert np.exp(ties.value) == pytest.approx([0.5, 0.5], rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def clouds(flight, tmp_path_factory):
+    """Clouds of strips a and b with the flight's calibration, and of b with that of a."""
+    folder, out = flight[0], tmp_path_factory.mktemp("clouds")
+    text = (folder / "cal.toml").read_text()
+    # Without the rows of the strips both get the mean constant of the channel, and their drifts show.
+    (out / "mean.toml").write_text(text[: text.index("[[flight_strip]]")])
+    for name, cal in (("own", folder / "cal.toml"), ("mean", out / "mean.toml")):
+        done = call("run", folder / "a.las", folder / "b.las", "-o", out / name, "--calibration", cal)
+        assert done.exit_code == 0, done.output
+    return out
+
+
+@pytest.mark.parametrize(("kind", "ratio"), [("own", 0.0), ("mean", 1 / 1.08 - 1)])
+def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
+    done = call("compare", clouds / kind / "a.laz", clouds / kind / "b.laz", "--overlap", "--json")
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    gamma = found["columns"]["backscatter_coefficient"]
+    # The scan angle does not know that the ground falls to one side: the error holds that.
+    assert gamma["cells"] > 100 and abs(gamma["median"] - ratio) < 2 * gamma["error"] < 0.01
+    assert 0.03 < gamma["stated"] < 0.2
+    assert abs(found["height"]["median"]) < 0.003
+
+
+def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
+    import laspy
+
+    cloud = laspy.read(clouds / "own" / "b.laz")
+    cloud.z = cloud.z + 0.12
+    cloud.write(tmp_path / "b.laz")
+    done = call("compare", clouds / "own" / "a.laz", tmp_path / "b.laz", "--overlap")
+    line = next(line for line in done.stdout.splitlines() if line.startswith("height"))
+    assert float(line.split()[6]) == pytest.approx(-0.12, abs=0.003)
+
+
+def test_clouds_that_do_not_overlap_are_one_line(flight):
+    folder, _ = flight
+    done = call("compare", folder / "a.las", folder / "d.las", "--overlap")
+    assert done.exit_code == 2 and "they do not overlap" in done.stderr
+    done = call("compare", folder / "a.las", "--overlap")
+    assert done.exit_code == 2 and "--overlap needs two clouds" in done.stderr
+
+
+def test_a_strip_in_a_folder_is_never_replaced(flight, tmp_path):
+    folder, _ = flight
+    strip = tmp_path / "a.las"
+    strip.write_bytes((folder / "a.las").read_bytes())
+    for options in (("-o", strip), ("-o", tmp_path / "cal.toml", "--report", strip)):
+        done = call("calibrate", tmp_path, "--targets", folder / "t.csv", *options, "--overwrite")
+        assert done.exit_code == 2 and "would replace this input" in done.stderr
+    assert strip.read_bytes() == (folder / "a.las").read_bytes()

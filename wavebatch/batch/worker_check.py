@@ -1,0 +1,135 @@
+"""Whether a worker of a cluster fits: same programs, same kind of processor, same files. Runs on the workers.
+
+`dask_cluster` asks all workers before anything starts, and `describe_worker` again with every call, because workers
+join later. Before you change it: a worker that does not fit must never make a row of a cloud.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import platform
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy
+import scipy
+
+import wavebatch
+from wavebatch.core.processor import describe_processor
+
+
+@functools.cache
+def describe_worker() -> dict[str, str]:
+    """Return what results depend on, of this process: versions of packages, and the kind of the processor."""
+    files = sorted(Path(wavebatch.__file__).parent.rglob("*.py"))
+    return {
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "wavebatch": f"{wavebatch.__version__} {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x}",
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        **describe_processor(),
+    }
+
+
+def compare_workers(here: dict[str, str], there: dict[str, str]) -> str:
+    """Return in what a worker differs from this machine; empty where it does not.
+
+    Parameters
+    ----------
+    here, there : dict
+        From `describe_worker`.
+
+    Returns
+    -------
+    str
+        The end of a message about the worker.
+    """
+    for name in ("python", "wavebatch", "numpy", "scipy"):
+        if there.get(name) != here[name]:
+            return f"has {name} {there.get(name)}, this machine {here[name]}; install the same there"
+    if there.get("probe") != here["probe"]:
+        return (
+            f"has another kind of processor ({there.get('name')}), which rounds in another way than this machine "
+            f"({here['name']}); take workers of one kind, and start wavebatch on one of them"
+        )
+    return ""
+
+
+def list_sizes(files: Sequence[str]) -> list[int]:
+    """Return the size of each file as this process sees it [bytes], -1 where it sees none.
+
+    Parameters
+    ----------
+    files : sequence of str
+        Absolute paths.
+
+    Returns
+    -------
+    list of int
+    """
+    return [_size(file) for file in files]
+
+
+def _size(file: str) -> int:
+    try:
+        return os.path.getsize(file)
+    except (OSError, ValueError):
+        return -1
+
+
+def travelling_call() -> Callable[[bytes, dict[str, str]], bytes]:
+    """Return a function that makes a pickled call and pickles (result, error), if the worker is of the client's kind.
+
+    It is sent as code, calls and results as bytes: the scheduler unpickles all else, and may lack wavebatch.
+    """
+
+    def call(pickled: bytes, kind: dict[str, str]) -> bytes:
+        import pickle
+        import traceback
+
+        try:
+            from wavebatch.batch.worker_check import describe_worker
+
+            found = describe_worker()
+        except Exception as error:  # an older wavebatch, or none
+            found = {"python": f"(without this wavebatch: {error})"}
+        if found != kind:
+            from distributed import get_worker
+
+            return pickle.dumps(((get_worker().address, found), "misfit"))
+        try:
+            function, arguments = pickle.loads(pickled)
+            return pickle.dumps((function(*arguments), None), pickle.HIGHEST_PROTOCOL)
+        except Exception as error:
+            error.add_note(traceback.format_exc())
+            return pickle.dumps((None, error))
+
+    return call
+
+
+def travelling_versions() -> Callable[[tuple[str, ...]], dict[str, str]]:
+    """Return a function that finds the versions of installed packages, and for wavebatch a checksum of its files.
+
+    It is sent as code: a worker may lack wavebatch.
+    """
+
+    def find_versions(names: tuple[str, ...]) -> dict[str, str]:
+        import importlib
+        import pathlib
+        import zlib
+
+        found = {}
+        for name in names:
+            try:
+                package = importlib.import_module(name)
+            except ImportError:
+                continue
+            found[name] = package.__version__
+            if name == "wavebatch":
+                files = sorted(pathlib.Path(package.__file__).parent.rglob("*.py"))
+                found[name] += f" (files {zlib.crc32(b''.join(file.read_bytes() for file in files)):08x})"
+        return found
+
+    return find_versions

@@ -1,0 +1,73 @@
+"""What kind of processor computes here: kinds differ in the last bits of sums, and a survey's decisions follow them.
+
+`batch.dask_cluster` refuses workers of another kind, because a strip's bytes would depend on which worker it meets.
+NumPy and its BLAS choose code for the processor when they load; the probe shows what was chosen by its results.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from pathlib import Path
+
+import numpy as np
+
+_SIZES = ((3, 40), (13, 80), (19, 200), (64, 300))
+"""Parameters and samples of the systems that are solved: from one echo in a window to the stack of a pulse."""
+
+
+def describe_processor() -> dict[str, str]:
+    """Return the kind of the processor of this process.
+
+    Returns
+    -------
+    dict
+        `name` for people; `probe`: equal on two machines if and only if arithmetic gave the same bits on both.
+
+    References
+    ----------
+    docs/reliability.md, "The same bytes".
+    """
+    return {"name": _find_name(), "probe": probe_arithmetic()}
+
+
+def probe_arithmetic() -> str:
+    """Return a checksum of products, solutions, sums and functions whose last bits differ between processors."""
+    digest = hashlib.sha256()
+    for parameters, samples in _SIZES:
+        for kind in (np.float64, np.float32):
+            rows = _make_rows(parameters, samples).astype(kind)
+            gram = rows @ rows.T
+            matrix = gram.astype(np.float64) + np.eye(parameters)
+            results = [
+                gram,
+                rows @ rows[0],
+                np.linalg.solve(matrix, rows[:, :5].astype(np.float64)),
+                np.linalg.inv(matrix),
+                np.linalg.eigvalsh(matrix),
+                np.linalg.lstsq(rows.T.astype(np.float64), np.arange(samples, dtype=np.float64), rcond=None)[0],
+                np.einsum("pl,ql->pq", rows, rows),
+                rows.sum(axis=1),
+                np.exp(-rows),
+                np.log1p(np.abs(rows)),
+                np.sqrt(np.abs(rows)).sum(axis=0),
+            ]
+            for result in results:
+                digest.update(np.ascontiguousarray(result).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _make_rows(parameters: int, samples: int) -> np.ndarray:
+    """Numbers of many digits (parameters, samples) that every machine makes alike: whole numbers, then one division."""
+    place = np.arange(parameters * samples, dtype=np.uint64)
+    mixed = (place * np.uint64(2654435761) + np.uint64(12345)) % np.uint64(1_000_003)
+    return (mixed.astype(np.float64) / 500_001.5 - 1.0).reshape(parameters, samples)
+
+
+def _find_name() -> str:
+    """The model of the processor, as well as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

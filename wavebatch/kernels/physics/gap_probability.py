@@ -1,0 +1,124 @@
+"""How much brighter canopy is than ground, from the light that pulses share between them.
+
+Used by the voxels: what is left of a pulse after its signal from the canopy is its gap probability only if signal from
+the ground counts as much as that from leaves.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+LEAST_PULSES = 100
+"""Smallest number of pulses."""
+
+LEAST_SPREAD = 0.1
+"""Smallest standard deviation of the ground's share of the light: below, nothing shows what it counts."""
+
+LARGEST_ERROR = 0.25
+"""Largest relative error of a ratio that is used."""
+
+LOWEST, HIGHEST = 0.02, 50.0
+"""Ratios that are looked for."""
+
+MODEL_ERROR = 0.03
+"""Least relative error of a ratio. Besides, light that varies from pulse to pulse by a relative s moves the ratio by up
+to s^2 (simulated: 3 to 10 % for reflectances that vary by a fifth).
+"""
+
+PARTS = 10
+"""Parts of the strip; the error is found from leaving out one after the other."""
+
+_STEPS, _HALVINGS = 33, 8
+_NEAR = np.log(2.0)
+"""Without a part of the strip, the ratio is looked for within this of the logarithm of that of all."""
+
+_CLIP = 4.0
+"""Pulses whose light is further off than this many robust standard deviations do not count."""
+
+
+class CanopyRatio(NamedTuple):
+    """Reflectance of the canopy over that of the ground, as the sensor sees both."""
+
+    ratio: float
+    error: float
+    """Its standard deviation."""
+
+
+def estimate_canopy_ratio(canopy: np.ndarray, ground: np.ndarray) -> CanopyRatio | None:
+    """Ratio of reflectances for which the light of a pulse does not depend on how much of it reached the ground.
+
+    Parameters
+    ----------
+    canopy, ground : float64 (n,)
+        Energy of each pulse from canopy and ground, normalised by the square of the range, in the order of the strip.
+
+    Returns
+    -------
+    CanopyRatio or None
+        None where too few pulses, or too similar ones, show it.
+
+    Notes
+    -----
+    canopy = E r_c (1 - P), ground = E r_g P for a gap probability P, so that canopy + (r_c / r_g) ground = E r_c
+    (Ni-Meister et al. 2001; Armston et al. 2013: the slope of canopy energy against ground energy). The ratio is that
+    at which the logarithm of this sum has no slope over the ground's share of it: energy that varies from pulse to
+    pulse then makes no slope. docs/algorithms.md 2.5.
+    """
+    used = (canopy >= 0) & (ground >= 0) & (canopy + ground > 0) & np.isfinite(canopy + ground)
+    canopy, ground = canopy[used], ground[used]
+    found = _find_ratio(canopy, ground, np.linspace(np.log(LOWEST), np.log(HIGHEST), _STEPS))
+    if found is None:
+        return None
+    part, near = np.arange(len(canopy)) * PARTS // len(canopy), found + np.linspace(-_NEAR, _NEAR, 5)
+    others = [_find_ratio(canopy[part != number], ground[part != number], near) for number in range(PARTS)]
+    if any(other is None for other in others):
+        return None
+    error = float(np.sqrt((PARTS - 1) * np.mean((np.array(others) - np.mean(others)) ** 2)))
+    error = float(np.hypot(np.hypot(error, MODEL_ERROR), _measure_scatter(canopy, ground, np.exp(found)) ** 2))
+    return CanopyRatio(float(np.exp(found)), float(np.exp(found) * error)) if error < LARGEST_ERROR else None
+
+
+def _find_ratio(canopy: np.ndarray, ground: np.ndarray, logs: np.ndarray) -> float | None:
+    """Logarithm of the ratio, within the range of `logs`, ascending; None where it is not determined."""
+    if len(canopy) < LEAST_PULSES:
+        return None
+    slopes = np.array([_slope(canopy, ground, float(np.exp(value))) for value in logs])
+    if not np.isfinite(slopes).all():
+        return None
+    rises = np.flatnonzero((slopes[:-1] < 0) & (slopes[1:] >= 0))
+    if len(rises) != 1:
+        return None
+    low, high = (float(logs[rises[0] + side]) for side in (0, 1))
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _slope(canopy, ground, np.exp(middle)) < 0 else (low, middle)
+    found = 0.5 * (low + high)
+    return found if _share(canopy, ground, np.exp(found)).std() >= LEAST_SPREAD else None
+
+
+def _share(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> np.ndarray:
+    return ratio * ground / (canopy + ratio * ground)
+
+
+def _measure_scatter(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
+    """Robust relative standard deviation of the light of pulses."""
+    light = np.log(canopy + ratio * ground)
+    return 1.4826 * float(np.median(np.abs(light - np.median(light))))
+
+
+def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
+    """Slope of the logarithm of all light over the ground's share, without outliers; NaN for a constant share."""
+    share, light = _share(canopy, ground, ratio), np.log(canopy + ratio * ground)
+    used = np.ones(len(share), bool)
+    slope = level = 0.0
+    for _ in range(3):
+        x, y = share[used] - share[used].mean(), light[used] - light[used].mean()
+        if not x @ x > 0:
+            return np.nan
+        slope = float(x @ y / (x @ x))
+        level = light[used].mean() - slope * share[used].mean()
+        off = np.abs(light - level - slope * share)
+        used = off <= _CLIP * max(1.4826 * float(np.median(off)), 1e-9)
+    return slope

@@ -1,0 +1,156 @@
+"""Reflectance of surfaces that fill the beam. It needs the angle at which the surface was struck.
+
+The angle comes from the points around an echo (known after the second pass over the strip), or from the echo's width.
+Where neither is known, a column of another name takes the surface as level, with an error for its unknown slope.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.no_data import NoData
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.physics import radiometry
+from wavebatch.stages.attribute.light import (
+    POSITION,
+    Light,
+    add_column,
+    is_alone,
+    level_angle,
+    measure_light,
+    without_calibration,
+)
+from wavebatch.stages.chain import Range, stage
+
+_ANGLE = {"normals": "incidence_angle_normals", "echo": "incidence_angle"}
+"""Column of the angle, by the parameter `surface`."""
+
+_NEEDS = {"surface": {kind: (column, f"{column}_err") for kind, column in _ANGLE.items()}}
+
+
+def _complete(name: str, columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Reflectance and error once the angles to the normals are known; see `Stage.complete`."""
+    angle, angle_err = (np.radians(columns[key].astype(np.float64)) for key in _NEEDS["surface"]["normals"])
+    facing = columns[f"facing_{name}"].astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = columns[f"facing_{name}_err"] / facing
+        value = 4.0 * radiometry.diffuse_reflectance(facing, angle)
+        return {name: value, f"{name}_err": value * radiometry.reflectance_error(relative, angle, angle_err)}
+
+
+def _complete_reflectance(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return _complete("reflectance", columns)
+
+
+def _complete_relative(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return _complete("relative_reflectance", columns)
+
+
+@stage(
+    "attribute",
+    makes=("reflectance", "reflectance_err", "facing_reflectance", "facing_reflectance_err"),
+    needs=POSITION,
+    needs_if=_NEEDS,
+    complete=_complete_reflectance,
+)
+def reflectance(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    surface: Literal["normals", "echo"] = "normals",
+) -> EchoTable:  # fmt: skip
+    """Diffuse reflectance of each echo that is alone in its waveform, and its error; no-data for all others.
+
+    gamma / (4 cos(alpha)): only a target that fills the beam has a reflectance. Its error holds that of the angle. With
+    `normals`, `run` computes it in the second pass; a block alone gives no-data.
+
+    Parameters
+    ----------
+    surface : {"normals", "echo"}
+        Where alpha comes from: the points around the echo (column incidence_angle_normals of an earlier stage), or its
+        width (column incidence_angle of an earlier stage). No-data where that column has none.
+
+    References
+    ----------
+    docs/algorithms.md 5.
+    """
+    return _reflectance(block, echoes, "reflectance", measure_light(block, system, echoes, 2), surface)
+
+
+@stage(
+    "attribute",
+    makes=("relative_reflectance", "relative_reflectance_err", "facing_relative_reflectance",
+           "facing_relative_reflectance_err"),
+    needs=POSITION,
+    needs_if=_NEEDS,
+    complete=_complete_relative,
+)  # fmt: skip
+def relative_reflectance(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    surface: Literal["normals", "echo"] = "normals",
+) -> EchoTable:  # fmt: skip
+    """Reflectance of each echo that is alone in its waveform, in units of its strip [DN ns m2], and its error.
+
+    R^2 A sigma / (4 cos(alpha) eta(R)): the reflectance without the constant C', for strips without calibration.
+
+    Parameters
+    ----------
+    surface : {"normals", "echo"}
+        Where alpha comes from: the points around the echo (column incidence_angle_normals of an earlier stage), or its
+        width (column incidence_angle of an earlier stage). No-data where that column has none.
+    """
+    light = measure_light(block, without_calibration(system), echoes, 2)
+    return _reflectance(block, echoes, "relative_reflectance", light, surface)
+
+
+@stage("attribute", makes=("level_reflectance", "level_reflectance_err"), needs=POSITION)
+def level_reflectance(
+    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
+    slope: Annotated[float, Range(0.0, 80.0)] = 30.0,
+) -> EchoTable:  # fmt: skip
+    """Diffuse reflectance of each echo alone in its waveform if its surface is level, and its error.
+
+    gamma / (4 cos(angle of the ray to the vertical)). It needs no neighbours, but roofs and hillsides are not level:
+    the error holds what a slope of `slope` degrees in an unknown direction does to it.
+
+    Parameters
+    ----------
+    slope : float
+        Slope of surfaces that the error shall cover [deg]; 0 where all of them are known to be level.
+
+    References
+    ----------
+    docs/algorithms.md 5.
+    """
+    light, angle = measure_light(block, system, echoes, 2), level_angle(block)[echoes.waveform]
+    relative = np.hypot(light.relative_error, radiometry.slope_error(angle, np.radians(slope)))
+    return _divide(block, echoes, "level_reflectance", light, angle, relative)
+
+
+def _reflectance(block: WaveformBlock, echoes: EchoTable, name: str, light: Light, surface: str) -> EchoTable:
+    """Reflectance by widths; by normals only what it would be on a surface that faces the sensor, and no-data."""
+    unknown = np.full(len(echoes), np.nan)
+    none = np.zeros(len(echoes))
+    if surface == "echo":
+        known = (echoes.attributes.get(key, unknown) for key in _NEEDS["surface"]["echo"])
+        angle, angle_err = (np.radians(values.astype(np.float64)) for values in known)
+        facing = _divide(block, echoes, f"facing_{name}", light._replace(gamma=unknown), none, none)
+    else:
+        angle = angle_err = unknown
+        facing = _divide(block, echoes, f"facing_{name}", light, none, light.relative_error)
+    relative = radiometry.reflectance_error(light.relative_error, angle, angle_err)
+    hidden = {key: facing.attributes[key] for key in (f"facing_{name}", f"facing_{name}_err")}
+    return _divide(block, echoes, name, light, angle, relative).with_attributes(**hidden)
+
+
+def _divide(
+    block: WaveformBlock, echoes: EchoTable, name: str, light: Light, angle: np.ndarray, relative: np.ndarray
+) -> EchoTable:
+    """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
+    alone = is_alone(block, echoes)
+    rho = np.where(alone, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
+    steep = angle >= radiometry.STEEPEST
+    more = (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)), (NoData.TOO_STEEP, steep)
+    return add_column(echoes, name, rho, relative, *light.cases, *more)

@@ -1,0 +1,140 @@
+"""CAL.toml: a calibration as a file that a person can read and change.
+
+`wavebatch calibrate` writes it, `run` and `voxelize` read it. Before you change it: files of earlier versions must stay
+readable, and a key that is taken out by hand must only take its check away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from wavebatch import __version__
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.text_file import read_text
+from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
+
+CALIBRATION_SCHEMA = "wavebatch.calibration/1"
+
+_NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
+    "constant": (
+        "constant", 1e-30, 1e30, REQUIRED, "C' [1/(m2 count ns)]: gamma = C' R^2 amplitude sigma / transmission"
+    ),
+    "relative_error": ("relative_error", 0.0, 10.0, REQUIRED, "standard deviation of the constant, relative"),
+    "attenuation_db_km": ("attenuation", 0.0, 100.0, 0.22, "of the air, one way, as it was used for the constant"),
+    "divergence_mrad": (
+        "divergence", 1e-3, 100.0, None, "full angle of the beam between the 1/e^2 points; needed for m2"
+    ),
+    "height_m": ("height", 0.0, 1e7, None, "of the sensor above the targets, median"),
+    "distance_m": ("distance", 0.0, 1e7, None, "from the sensor to the targets, median: runs at others are less sure"),
+    "section_constant": (
+        "section_constant", 0.0, 1e30, None, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
+    ),
+}  # fmt: skip
+"""Numbers of the file by key: field of Calibration, least and largest value, default, meaning."""
+
+_TEXTS = ("strip", "date", "conditions", "sensor", "flight", "chain", "decomposer")
+_HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
+
+
+def format_calibration(found: Calibration) -> str:
+    """Return the TOML text of a calibration; `parse_calibration` gives the same constants again."""
+    numbers = {key: getattr(found, name) for key, (name, *_) in _NUMBERS.items()}
+    document = {
+        "schema": CALIBRATION_SCHEMA,
+        "version": __version__,
+        **{key: getattr(found, key) for key in _TEXTS},
+        **{key: None if value is None else float(value) for key, value in numbers.items()},
+        "channel": [asdict(row) for row in found.channels] or None,
+        "flight_strip": [asdict(row) for row in found.strips] or None,
+        "target": [asdict(row) for row in found.targets] or None,
+        "fingerprint": {key: item for key, item in found.fingerprint.items() if not isinstance(item, Mapping)} or None,
+    }
+    return format_toml(document, heading=_HEADING, comments={key: row[-1] for key, row in _NUMBERS.items()})
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read a calibration file; raises ConfigError, in one line, where it cannot be read or is wrong."""
+    return parse_calibration(read_text(path, "calibration file"), str(path))
+
+
+def parse_calibration(text: str, name: str) -> Calibration:
+    """Read the TOML text of a calibration.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        Start of every message, usually the path.
+
+    Returns
+    -------
+    Calibration
+        Without `targets` and `fingerprint`, which nothing uses after the measurement.
+
+    Raises
+    ------
+    ConfigError
+        When a key is unknown, missing or out of its range, or where section_constant does not fit the others.
+    """
+    table = parse_toml(text, name)
+    table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, "channel", "flight_strip", "target", "fingerprint"))
+    table.check_schema(CALIBRATION_SCHEMA)
+    values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
+    section = values.pop("section_constant")
+    texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
+    channels: dict[tuple[int, int], ChannelConstant] = {}
+    for row in table.tables("channel"):
+        channel = _read_channel(row)
+        key = (channel.digitizer, channel.scanner)
+        if key in channels:
+            raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} is there already")
+        channels[key] = channel
+    strips = tuple(map(_read_strip, table.tables("flight_strip")))
+    found = Calibration(**values, **texts, channels=tuple(channels.values()), strips=strips)
+    if section is not None:
+        _check_section(section, found, name)
+    return found
+
+
+def _check_section(section: float, found: Calibration, name: str) -> None:
+    """Raise ConfigError where C_cal does not follow from the other two: one was changed by hand."""
+    expected = found.section_constant
+    if expected is None or abs(section - expected) > 1e-3 * expected:
+        wanted = "no divergence_mrad" if expected is None else f"{expected!r} by constant and divergence_mrad"
+        problem = f"section_constant is {section!r}, but there is {wanted}"
+        raise ConfigError(f"{name}: {problem}; correct these, or leave section_constant out")
+
+
+def _read_channel(table: TomlTable) -> ChannelConstant:
+    table.check_keys(ChannelConstant.__dataclass_fields__)
+    return ChannelConstant(
+        table.integer("digitizer", 1, 255),
+        table.integer("scanner", 0, 3, 0),
+        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
+        spread=table.number("spread", 0.0, 1e6, 0.0),
+        echoes=table.integer("echoes", 0, 10**12, 0),
+        shot_energy=table.number("shot_energy", 0.0, 1e6, 0.0),
+        bits=table.integer("bits", 1, 32, None),
+        samples=table.integer("samples", 1, 1 << 32, None),
+        spacing_ns=table.number("spacing_ns", 1e-6, 1e9, None),
+        gain=table.number("gain", default=None),
+        pulse_ns=table.number("pulse_ns", 1e-6, 1e9, None),
+    )
+
+
+def _read_strip(table: TomlTable) -> StripConstant:
+    table.check_keys(StripConstant.__dataclass_fields__)
+    return StripConstant(
+        table.get("strip", str, ""),
+        table.get("sha256", str),
+        table.integer("digitizer", 1, 255),
+        table.integer("scanner", 0, 3, 0),
+        *(table.number(key, *_NUMBERS[key][1:]) for key in ("constant", "relative_error")),
+        drift=table.number("drift", -1.0, 1e6, 0.0),
+        drift_error=table.number("drift_error", 0.0, 1e6, 0.0),
+        ties=table.integer("ties", 0, 10**12, 0),
+    )

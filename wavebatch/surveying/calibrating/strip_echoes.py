@@ -1,0 +1,180 @@
+"""Clean single echoes of a strip, decomposed as `wavebatch run` does, with their energy, range and channel.
+
+`targets` opens each strip with `open_source` and reads echoes on targets and on tie cells. Pulse, chain and energy are
+those of a run: the same choice, and the stage that `backscatter_coefficient` comes from with a constant of 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.las.header import decode_text
+from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.scan_result import StripScan
+from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.choose_chain import Choice, Request, make_choice
+from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
+from wavebatch.surveying.systems.saved_check import check_saved
+
+SCANNERS = 4
+"""Scanner channels of LAS points (0 to 3). A channel number here is SCANNERS x digitizer + scanner channel."""
+
+ECHO = np.dtype([
+    ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
+    ("channel", "<i4"),
+])  # fmt: skip
+"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel."""
+
+_BLOCK = 8192
+"""Waveforms that are read at a time."""
+
+_CHANNEL_SAMPLE = 4096
+"""Waveforms that show which scanner channels a strip has."""
+
+_LIGHT = "relative_backscatter"
+_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+_ADJUSTED = 1e9
+"""Seconds that LAS takes off standard GPS time."""
+_WEEK = 604_800.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EchoSource:
+    """An open strip with pulse, chain and sensor."""
+
+    reader: StripReader
+    scan: StripScan
+    choice: Choice
+    chain: Chain
+    """The chosen one, and the stage that gives the energy."""
+    system: SystemPulse
+    sensor: SensorSource
+
+    @property
+    def path(self) -> Path:
+        """Of the strip."""
+        return self.reader.facts.path
+
+    def echoes(self, wanted: Callable[[np.ndarray], np.ndarray]) -> Iterator[np.ndarray]:
+        """Yield arrays of ECHO.
+
+        wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
+        """
+        for block in self.reader.all_blocks(self.scan, _BLOCK):
+            near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
+            if len(near):
+                part = self.sensor.fill(block.rows(near))
+                yield take_clean(part, self.chain.run(part, self.system))
+
+
+@contextmanager
+def open_source(
+    path: Path,
+    *,
+    sensor: SensorRequest,
+    chain: Chain | None,
+    request: Request,
+    attenuation: float,
+    direction: str,
+) -> Iterator[EchoSource]:
+    """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
+
+    Parameters
+    ----------
+    path : Path
+    sensor : SensorRequest
+    chain : Chain or None
+        None: the widest, for an automatic choice.
+    request : Request
+    attenuation : float
+        Of the air, one way [dB/km].
+    direction : str
+        Where packet vectors point: auto, toward or away.
+
+    Yields
+    ------
+    EchoSource
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be read or the sensor's position is unknown.
+    """
+    with StripReader(path, direction=direction) as reader, reader.scan() as scan:
+        source = find_sensor(reader, scan, sensor)
+        if source.kind == "none":
+            raise InputError(f"{path}: the sensor's position is unknown: give --trajectory or --flight-height")
+        check_saved(reader, scan, request.system and request.system.survey, force=request.force)
+        choice = make_choice(reader, scan, chain or widest_chain(), request)
+        # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
+        system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
+        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source)
+
+
+def with_energy(chain: Chain) -> Chain:
+    """Return the chain without its physical attributes, and with the energy of each echo."""
+    needed = ("attribute.amplitude", "attribute.echo_width", "attribute.position")
+    steps = [step for step in chain.steps if step.stage.kind != "attribute" or step.stage.name in needed]
+    have = {step.stage.name for step in steps}
+    steps += [Step(STAGES[name]) for name in ("attribute.position", f"attribute.{_LIGHT}") if name not in have]
+    return replace(chain, steps=tuple(steps))
+
+
+def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
+    """Take the echoes of a block that are alone in their waveform and whose place and energy are sure, as ECHO."""
+    alone = echoes.count(len(block))[echoes.waveform] == 1
+    echoes = echoes.take(np.flatnonzero(alone & ((echoes.flags & np.uint16(UNCLEAN | EchoFlag.UNANCHORED)) == 0)))
+    rows = np.zeros(len(echoes), ECHO)
+    rows["xyz"] = np.stack([echoes.attributes[name] for name in "xyz"], axis=1)
+    away = rows["xyz"] - block.sensor[echoes.waveform]
+    rows["distance"] = np.sqrt((away * away).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rows["ray"] = away / rows["distance"][:, None]
+    rows["light"] = echoes.attributes[_LIGHT]
+    rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
+    scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
+    rows["channel"] = SCANNERS * block.digitizer.index + scanner
+    known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
+    return rows[known]
+
+
+def read_day(reader: StripReader) -> str:
+    """Return the day of the flight as 2026-11-22; empty where GPS times are not standard ones."""
+    header = reader.facts.header
+    if not header.point_count or not header.global_encoding & 1:
+        return ""
+    second = float(reader.read_points(0, 1)["gps_time"][0]) + _ADJUSTED
+    if not _WEEK < second < 4e9:
+        return ""
+    return (_GPS_EPOCH + timedelta(seconds=second)).date().isoformat()
+
+
+def read_sensor_name(facts: StripFacts) -> str:
+    """Return the system identifier of the header; empty where it names no sensor."""
+    name = decode_text(facts.header.system_identifier).strip()
+    return "" if name.upper() in ("OTHER", "MERGE", "MODIFICATION", "EXTRACTION", "TRANSFORMATION", "") else name
+
+
+def see_channels(reader: StripReader, scan: StripScan) -> dict[tuple[int, int], float]:
+    """Return the share of the waveforms of each digitizer and scanner channel, by a sample for the scanner channels."""
+    total = sum(scan.by_descriptor.values())
+    counts: dict[int, np.ndarray] = {}
+    for block in reader.sample_blocks(scan, _CHANNEL_SAMPLE):
+        scanner = np.zeros(len(block), np.int64) if block.scanner is None else block.scanner
+        counts[block.digitizer.index] = counts.get(block.digitizer.index, 0) + np.bincount(scanner, minlength=SCANNERS)
+    shares = {}
+    for index, number in sorted(scan.by_descriptor.items()):
+        of = counts.get(index, np.eye(SCANNERS)[0])
+        shares |= {(index, scanner): number / total * of[scanner] / of.sum() for scanner in np.flatnonzero(of).tolist()}
+    return shares

@@ -1,0 +1,180 @@
+"""The constant that reference targets give, with an error that holds angle, edges, scatter and disagreement.
+
+`targets.calibrate_strip` calls `measure_target` per target and channel, and `combine_targets` per channel. A target
+that cannot say is refused with the reason, never used with a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.kernels.geometry.facets import fit_facet
+from wavebatch.surveying.calibrating.strip_echoes import SCANNERS
+from wavebatch.surveying.calibrating.target_file import Target
+from wavebatch.surveying.calibration import ChannelConstant, TargetResult
+
+LEAST_ECHOES = 10
+"""A target with fewer echoes is left out: a median of fewer is no better than one echo."""
+
+MOST_FACING_ERROR = 0.05
+"""A target is refused where its angle leaves the cosine more uncertain than this: the next one will know it better."""
+
+GIVEN_ANGLE_ERROR = np.radians(1.0)
+"""Error of an incidence that the target file gives."""
+
+INSET = 1.5
+"""Echoes count this many 1/e2 radii inside the outline: 0.13 % of a footprint's light lies beyond a straight edge."""
+
+ASSUMED_DIVERGENCE = 1.0
+"""Full angle of the beam [mrad] for the inset where none is given: as wide as topographic lasers have."""
+
+STRANGE_SIGMA, MOST_STRANGE = 6.0, 0.1
+"""Echoes this many robust standard deviations off the median are of another surface; more than this share is named."""
+
+EDGE_SIGMA, LEAST_EDGE = 4.0, 0.01
+"""Echoes of the outer half differ from the others where their medians do by so many errors and by this share."""
+
+
+def measure_target(
+    target: Target, rows: np.ndarray, divergence: float | None, reflectance_error: float
+) -> tuple[TargetResult, np.ndarray, np.ndarray]:
+    """Measure the constant of one target.
+
+    Parameters
+    ----------
+    target : Target
+    rows : array of ECHO (n,)
+        Clean single echoes inside its outline.
+    divergence : float or None
+        Full angle of the beam between the 1/e^2 points [mrad].
+    reflectance_error : float
+        Standard deviation of the target's reflectance, relative.
+
+    Returns
+    -------
+    result : TargetResult
+    used : array of ECHO (k,)
+        Echoes on the target's plane, with their whole footprint inside.
+    constant : float64 (k,)
+        The constant of each [1/(m2 count ns)].
+
+    Notes
+    -----
+    docs/algorithms.md 5.
+    """
+    blank = TargetResult(target.name, target.reflectance, len(rows))
+    nothing = rows[:0], np.empty(0)
+    if len(rows) < LEAST_ECHOES:
+        return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed"), *nothing
+    facet = fit_facet(rows["xyz"], rows["ray"])
+    if target.incidence is None:
+        angle, angle_err, facing_err = facet.angles(rows["ray"]), facet.angle_error, facet.facing_error
+    else:
+        angle, angle_err = np.full(len(rows), np.radians(target.incidence)), GIVEN_ANGLE_ERROR
+        facing_err = np.tan(angle[0]) * angle_err + 0.5 * angle_err**2
+    if facing_err > MOST_FACING_ERROR:
+        found = "unknown" if np.isinf(angle_err) else f"known to {np.degrees(angle_err):.0f} deg"
+        reason = (
+            f"its {len(rows)} echoes lie in one scan line or nearly so: the angle across it is {found}; "
+            "give its incidence [deg] in the target file, or a target that several scan lines cross"
+        )
+        return replace(blank, refused=reason), *nothing
+    depth = target.depth(rows["xyz"][:, 0], rows["xyz"][:, 1])
+    radius = 0.5e-3 * (divergence or ASSUMED_DIVERGENCE) * float(np.median(rows["distance"]))
+    inset = INSET * radius / max(float(np.cos(np.median(angle))), 0.1)
+    used = facet.kept & (depth >= inset)
+    if used.sum() < LEAST_ECHOES:
+        assumed = "" if divergence else f" (of an assumed {ASSUMED_DIVERGENCE:g} mrad; give --divergence)"
+        reason = (
+            f"too small for a footprint of {2 * radius:.2f} m{assumed}: {used.sum()} of {len(rows)} echoes lie "
+            f"{inset:.2f} m inside its outline, {LEAST_ECHOES} are needed"
+        )
+        return replace(blank, refused=reason, inset_m=round(inset, 3)), *nothing
+    constant = 4.0 * target.reflectance * np.cos(angle[used]) / rows["light"][used]
+    relative = _by_channel(constant, rows["channel"][used])
+    edge, edge_err = _compare_edge(relative, depth[used])
+    result = replace(
+        summarise(blank, constant),
+        incidence_deg=float(np.degrees(np.median(angle[used]))),
+        incidence_error_deg=float(np.degrees(angle_err)),
+        inset_m=round(inset, 3),
+        edge=edge,
+        strange=_share_strange(relative),
+    )
+    inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
+    error = float(np.sqrt(reflectance_error**2 + facing_err**2 + inner**2 + edge_err**2))
+    return replace(result, relative_error=error), rows[used], constant
+
+
+def summarise(blank: TargetResult, constant: np.ndarray) -> TargetResult:
+    """Return the result with number, median and relative robust spread of constants (n,), n > 0."""
+    middle = float(np.median(constant))
+    spread = MAD_TO_STD * float(np.median(np.abs(constant - middle))) / middle
+    return replace(blank, echoes=len(constant), constant=middle, spread=spread)
+
+
+def _by_channel(constant: np.ndarray, channel: np.ndarray) -> np.ndarray:
+    """Constants over the median of their channel."""
+    _, group = np.unique(channel, return_inverse=True)
+    return constant / np.array([np.median(constant[group == k]) for k in range(int(group.max()) + 1)])[group]
+
+
+def _share_strange(constant: np.ndarray) -> float:
+    """Share of echoes whose constant is that of another surface."""
+    off = np.abs(constant / np.median(constant) - 1.0)
+    return float(np.mean(off > max(STRANGE_SIGMA * MAD_TO_STD * float(np.median(off)), LEAST_EDGE)))
+
+
+def _compare_edge(constant: np.ndarray, depth: np.ndarray) -> tuple[float | None, float]:
+    """The outer half's constant over the inner one's, less 1, where they differ; and the error that follows."""
+    outer = depth < np.median(depth)
+    if min(outer.sum(), (~outer).sum()) < LEAST_ECHOES // 2:
+        return None, 0.0
+    parts = [constant[outer], constant[~outer]]
+    middle = [float(np.median(part)) for part in parts]
+    spreads = [MAD_TO_STD * np.median(np.abs(p / m - 1.0)) for p, m in zip(parts, middle, strict=True)]
+    errors = [MEDIAN_ERROR * s / np.sqrt(len(p)) for s, p in zip(spreads, parts, strict=True)]
+    off = middle[0] / middle[1] - 1.0
+    if abs(off) < max(LEAST_EDGE, EDGE_SIGMA * float(np.hypot(*errors))):
+        return None, 0.0
+    return float(off), abs(float(off))
+
+
+def combine_targets(results: Sequence[TargetResult], light_err: np.ndarray, channel: int = 0) -> ChannelConstant | None:
+    """Combine the constants of several targets; None where none of them has one.
+
+    Parameters
+    ----------
+    results : sequence of TargetResult
+    light_err : float64 (n,)
+        Relative errors of the fits of all their echoes.
+    channel : int
+        Number of the channel.
+
+    Returns
+    -------
+    ChannelConstant or None
+        The median over the targets. Its error is that of their mean, or their disagreement where that is larger.
+    """
+    good = [result for result in results if result.constant is not None]
+    if not good:
+        return None
+    constants = np.array([result.constant for result in good])
+    constant = float(np.median(constants))
+    stated = float(np.sqrt(sum(result.relative_error**2 for result in good))) / len(good)
+    between = float(np.std(constants, ddof=1) / constant / np.sqrt(len(good))) if len(good) > 1 else 0.0
+    spread = float(np.median([result.spread for result in good]))
+    fits = float(np.median(light_err)) if len(light_err) else 0.0
+    return ChannelConstant(
+        digitizer=channel // SCANNERS,
+        scanner=channel % SCANNERS,
+        constant=constant,
+        relative_error=max(stated, between),
+        spread=spread,
+        echoes=sum(result.echoes for result in good),
+        shot_energy=float(np.sqrt(max(spread * spread - fits * fits, 0.0))),
+    )

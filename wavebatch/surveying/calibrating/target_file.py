@@ -1,0 +1,113 @@
+"""Reference targets: areas of known reflectance, read from GeoJSON or CSV.
+
+`wavebatch calibrate` reads them; `target_constants` asks which echoes lie inside, and how far.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.geojson import find_inside, read_features
+from wavebatch.files.text_file import read_text
+
+_CORNERS = 64
+"""Corners of the polygon that stands for a circle."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Target:
+    """An area of known reflectance."""
+
+    name: str
+    reflectance: float
+    corners: np.ndarray
+    """Corners of its outline, f8 (k, 2) [m]."""
+    incidence: float | None = None
+    """Angle between ray and normal [deg]; None: taken from the plane of the target's echoes."""
+
+    def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return whether points at x, y, f8 (n,) [m], lie inside, bool (n,)."""
+        return find_inside([self.corners], x, y)
+
+    def depth(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance of points at x, y to the outline, f8 (n,) [m]; it does not say on which side."""
+        best = np.full(len(x), np.inf)
+        for (x0, y0), (x1, y1) in zip(self.corners, np.roll(self.corners, -1, axis=0), strict=True):
+            dx, dy = x1 - x0, y1 - y0
+            square = dx * dx + dy * dy
+            part = np.clip(((x - x0) * dx + (y - y0) * dy) / square, 0.0, 1.0) if square > 0 else 0.0
+            best = np.minimum(best, np.hypot(x - x0 - part * dx, y - y0 - part * dy))
+        return best
+
+
+def load_targets(path: Path | str) -> list[Target]:
+    """Read reference targets from a GeoJSON or CSV file.
+
+    Parameters
+    ----------
+    path : path
+        GeoJSON: polygons with the property reflectance. CSV: the column reflectance, and x, y, radius, or vertices as
+        `x y x y x y ...`. Both may have name and incidence [deg]. Coordinates are those of the strip.
+
+    Returns
+    -------
+    list of Target
+
+    Raises
+    ------
+    ConfigError
+        In one line, where the file cannot be read, is empty or holds a wrong target.
+    """
+    text = read_text(path, "target file", 1 << 30)
+    lines = io.StringIO(text, newline=None)
+    try:
+        rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise ConfigError(f"{path}: target file is neither GeoJSON nor CSV ({error})") from error
+    targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
+    if not targets:
+        raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
+    return targets
+
+
+def _read_geojson(text: str, path: Path | str) -> list[dict[str, Any]]:
+    rows = []
+    for properties, rings in read_features(text, path):
+        if len(rings) > 1:
+            raise ConfigError(f"{path}: a target has {len(rings)} rings; make every part a target, without holes")
+        corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
+        rows.append({**properties, "vertices": corners})
+    return rows
+
+
+def _read_target(row: Mapping[str, Any], where: str) -> Target:
+    fields = {str(key).strip().lower(): value for key, value in row.items() if value not in (None, "")}
+    try:
+        reflectance = float(fields["reflectance"])
+        incidence = float(fields["incidence"]) if "incidence" in fields else None
+        if "vertices" in fields:
+            corners = np.array(str(fields["vertices"]).split(), np.float64).reshape(-1, 2)
+        else:
+            angle = np.arange(_CORNERS) * (2 * np.pi / _CORNERS)
+            circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            with np.errstate(invalid="ignore", over="ignore"):
+                corners = float(fields["radius"]) * circle + [float(fields["x"]), float(fields["y"])]
+    except KeyError as error:
+        raise ConfigError(
+            f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"
+        ) from error
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{where}: not numbers: {error}") from error
+    if not 0 < reflectance <= 1.5 or len(corners) < 3 or not np.isfinite(corners).all():
+        raise ConfigError(f"{where}: reflectance must lie in 0 to 1.5, and the outline needs three corners")
+    if incidence is not None and not 0 <= incidence < 85:
+        raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
+    return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)
