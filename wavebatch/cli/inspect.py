@@ -47,7 +47,7 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
         if verbose and facts.get("packets", {}).get("count") and not facts["problems"]:
             facts["pulse"] = _describe_pulse(path, **reading)
         if not as_json:
-            click.echo("\n".join(["", *_list_lines(facts)][path == paths[0] :]))
+            click.echo("\n".join(["", *map(printable, _list_lines(facts))][path == paths[0] :]))
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
