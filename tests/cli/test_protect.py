@@ -95,7 +95,8 @@ def test_every_option_that_writes_is_known_as_such():
     assert found - logs == {
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
-        "voxelize --profiles",
+        "voxelize --profiles", "slice --overview", "slice --cube", "survey --angles", "compare --output",
+        "section --output", "profile --output", "cube --output",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
         "calibrate --plot", "bench --output",
         "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
