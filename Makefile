@@ -1,9 +1,10 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
 #   make test      the fast tests          make test-all   all of them
-#   make papers    the tables of five papers on simulated data
+#   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
+#   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make lint      ruff                    make clean      remove what was made
 
@@ -15,7 +16,7 @@ BENCH  := bench
 MINUTES ?= 10
 SEED   ?= 1
 
-.PHONY: demo test test-all papers bench fuzz docs lint clean
+.PHONY: demo test test-all papers bench fuzz docs man lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -29,6 +30,10 @@ $(VENV)/.run: pyproject.toml | $(BIN)/python
 
 $(VENV)/.test: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	@touch $@ $(VENV)/.run
+
+$(VENV)/.plot: pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
 	@touch $@ $(VENV)/.run
 
 $(VENV)/.docs: pyproject.toml | $(BIN)/python
@@ -51,9 +56,8 @@ test: $(VENV)/.test
 test-all: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto
 
-papers: $(VENV)/.run
-	@status=0; for script in examples/papers/s?_*.py; do \
-	  echo "== $$script"; $(BIN)/python $$script || status=1; echo; done; exit $$status
+papers: $(VENV)/.plot
+	$(BIN)/python examples/papers/page.py -o papers.html
 
 bench: $(VENV)/.test
 	@mkdir -p $(BENCH)
@@ -73,9 +77,12 @@ docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site: site/index.html"
 
+man: $(VENV)/.test
+	$(BIN)/wavebatch --man-pages build/man
+
 lint: $(VENV)/.test
 	$(BIN)/python -m ruff check .
 
 clean:
-	rm -rf $(VENV) $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	rm -rf $(VENV) papers.html $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

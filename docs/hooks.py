@@ -17,6 +17,8 @@ import click
 
 import wavebatch
 from wavebatch.cli import COMMANDS, main
+from wavebatch.cli.program.command import group_options
+from wavebatch.cli.program.examples import EXAMPLES
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.stages.chain import KINDS, STAGES
 from wavebatch.stages.chain_file import format_step
@@ -44,11 +46,15 @@ def _command(command: click.Command, parent: click.Context, name: str, level: in
     usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
     yield f"```\n{usage}\n```"
     yield _paragraphs(inspect.cleandoc(command.help or ""))
-    rows = [record for option in command.params if (record := option.get_help_record(context))]
-    lines = ["| option | what it does |", "|---|---|"]
-    lines += [f"| `{_cell(names)}` | {_cell(_plain(text))} |" for names, text in rows if text and "--help" not in names]
-    if len(lines) > 2:
-        yield "\n".join(lines)
+    for heading, records in group_options(command, context):
+        rows = [(names, text) for names, text in records if text and "--help" not in names]
+        lines = [f"| {heading} | what it does |", "|---|---|"]
+        lines += [f"| `{_cell(names)}` | {_cell(_plain(text))} |" for names, text in rows]
+        if rows:
+            yield "\n".join(lines)
+    examples = EXAMPLES.get(context.command_path.removeprefix("wavebatch "), ())
+    if examples:
+        yield "```sh\n" + "\n".join(f"{line}  # {purpose}" for line, purpose in examples) + "\n```"
     if isinstance(command, click.Group):
         for inner in command.list_commands(context):
             yield from _command(command.get_command(context, inner), context, inner, level + 1)

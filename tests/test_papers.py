@@ -204,3 +204,40 @@ def test_tables_say_where_their_inputs_come_from(load):
     assert " 8.9 " in counts and " 11.2 " in counts
     misses = scripts["s4_ussyshkin"].table_of_separations(4000, 0)
     assert sum("miss" in row[0] for row in misses.rows) == 4
+
+
+def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    page = load("page")
+    rows = [["figure", "1", "-", "2", "0..3", "ok"], ["b", "-", "-", "9", "1", "FAIL"]]
+    tables = [{"title": "one <table>", "rows": rows}]
+    monkeypatch.setattr(page, "measure", lambda script, *rest: (tables, script != "s2_jutzi"))
+    monkeypatch.setattr(page, "run_command", lambda words, folder: _fake(words, folder))
+    text, fine = page.build(None, 1000, 0)
+    assert not fine, "a script whose figures are not accepted is a failure"
+    assert text.count("<table>") == len(SCRIPTS) == len(page.PAPERS)
+    assert [paper.script for paper in page.PAPERS] == SCRIPTS
+    pictures = sum(len(paper.pictures) for paper in page.PAPERS)
+    assert text.count("<figure>") == pictures and text.count("data:image/png") == pictures - 1
+    assert "not drawn: error: no &lt;pulse&gt;" in text and "one &lt;table&gt;" in text
+    assert "http" not in text.replace("http-equiv", ""), "the page needs no network"
+
+
+def _fake(words, folder):
+    if "cube" in words[:2]:
+        return "error: no <pulse>"
+    if words[0] in ("plot", "slice") and words[-2].endswith(".png"):
+        (folder / words[-2]).write_bytes(b"picture")
+    return ""
+
+
+def test_commands_of_the_page_are_those_of_wavebatch(load):
+    from wavebatch.cli import main
+
+    for picture in [picture for paper in load("page").PAPERS for picture in paper.pictures]:
+        words = picture.command.split()
+        command = main
+        while hasattr(command, "commands") or command is main:
+            command = command.get_command(None, words.pop(0))
+        known = {option for one in command.params for option in one.opts}
+        assert {word for word in words if word.startswith("--")} | {picture.option} <= known

@@ -12,6 +12,12 @@ def main() -> None:
 
 
 def _run() -> None:
+    import os
+
+    from wavebatch.core.memory import ONE_THREAD
+
+    for name in ONE_THREAD:  # before NumPy is imported; what the user has set stays
+        os.environ.setdefault(name, "1")
     from wavebatch.cli import main
 
     main.main()

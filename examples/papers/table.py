@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from wavebatch.tools.bench.report import align
 
@@ -71,9 +73,13 @@ def main(measure: Callable[[int, int], list[Table | str]], doc: str, number: int
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
     parser.add_argument("--number", type=int, default=number, help=f"waveforms, or pulses (default {number})")
+    parser.add_argument("--json", type=Path, help="write the tables to this file, too")
     options = parser.parse_args()
     tables = measure(options.number, options.seed)
     print("\n\n".join(str(table) for table in tables))
     failures = [f"{t.title}: {name}" for t in tables if isinstance(t, Table) for name in t.failures]
+    if options.json is not None:
+        rows = [{"title": t.title, "rows": t.rows} if isinstance(t, Table) else {"text": t} for t in tables]
+        options.json.write_text(json.dumps(rows), "utf-8")
     print(f"\n{len(failures)} figures not accepted" + "".join(f"\n  {line}" for line in failures))
     return 1 if failures else 0

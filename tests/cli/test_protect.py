@@ -90,10 +90,14 @@ def test_every_option_that_writes_is_known_as_such():
         command = main.get_command(None, name)
         for one in getattr(command, "commands", {name: command}).values():
             found |= {f"{one.name} {p.opts[-1]}" for p in one.params if isinstance(p.type, OutputPath)}
-    assert found == {
+    logs = {name for name in found if name.endswith(" --log-file")}
+    assert len(logs) == len(COMMANDS) + 2  # `plot` has three commands
+    assert found - logs == {
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",
-        "voxelize --profiles",
+        "voxelize --profiles", "slice --overview", "slice --cube", "survey --angles", "compare --output",
+        "section --output", "profile --output", "cube --output",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
         "calibrate --plot", "bench --output",
+        "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
     }  # fmt: skip

@@ -31,7 +31,8 @@ def invoke(*arguments):
         (["compare", "--strip", "a.las", "fats"], "fats: is neither a file nor a shipped chain; did you mean 'fast'?"),
         (["run", "a.las", "-o", "d", "--columns", ""], "--columns: names no column; leave it out for the usual ones"),
         (["slice", "a.las", "--lines", "3:1"], "invalid value for '--lines': '3:1' is empty; END is the number"),
-        (["slice", "a.las"], "give -o for the segments, --png for a picture, or both; see `wavebatch slice --help`"),
+        (["slice", "a.las"], "give -o for the segments, --png or --overview for a picture, or --cube; see `wavebatch "
+         "slice --help`"),
         (["run", "a.las", "-o", "d", "--overwrite", "--resume"], "--overwrite and --resume exclude each other"),
     ],
 )

@@ -20,8 +20,17 @@ def _probe(kind):
 
 def test_the_probe_is_the_same_each_time():
     assert describe_processor() == describe_processor()
-    assert describe_processor()["probe"] == probe_arithmetic() and len(probe_arithmetic()) == 16
+    assert probe_arithmetic() == probe_arithmetic() and len(describe_processor()["probe"]) == 16
     assert describe_processor()["name"]
+
+
+def test_threads_are_no_other_kind():
+    code = "from wavebatch.core.processor import describe_processor; print(describe_processor()['probe'])"
+    found = set()
+    for threads in ("1", "2", "4"):
+        env = {**os.environ, "OPENBLAS_NUM_THREADS": threads}
+        found.add(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=env).stdout)
+    assert len(found) == 1
 
 
 @pytest.mark.skipif(sys.platform != "linux" or os.uname().machine != "x86_64", reason="kinds of x86 processors")

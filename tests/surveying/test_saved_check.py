@@ -40,7 +40,9 @@ def folder(tmp_path_factory):
 
 def contradiction(strip, saved):
     with StripReader(strip) as reader, reader.scan() as scan:
-        return find_contradiction(reader, scan, saved)
+        reason, sure = find_contradiction(reader, scan, saved)
+        assert sure == bool(reason)
+        return reason
 
 
 @pytest.mark.parametrize("plain", [False, True], ids=["with figures", "hand-written"])

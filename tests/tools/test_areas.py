@@ -209,6 +209,32 @@ def test_wrong_polygons_are_one_line(tmp_path, features, words):
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
+def test_separations_by_rank_and_depth_of_pulses(tmp_path):
+    pulse, xyz, number = make_cloud(tmp_path / "c.las")
+    (one,), total = count_returns([tmp_path / "c.las"], divisions=[Grid(25.0)])
+    cells, depths = {}, {}
+    for each in np.unique(pulse):
+        rows = np.flatnonzero(pulse == each)
+        rows = rows[np.argsort(number[rows])]
+        place = tuple(np.floor(xyz[rows[0], :2] / 25) * 25)
+        for rank, (a, b) in enumerate(zip(rows[:-1], rows[1:], strict=True), 1):
+            cells.setdefault((*place, f"{rank}-{rank + 1}"), []).append(math.dist(xyz[a], xyz[b]))
+        if len(rows) > 1:
+            depths.setdefault(place, []).append(xyz[rows[0], 2] - xyz[rows[-1], 2])
+    assert sum(len(area.separations) for area in one.areas) == len(cells)
+    for area in one.areas:
+        for name, found in area.separations.items():
+            apart = cells[area.x, area.y, name]
+            assert found.pairs == len(apart) and found.least == pytest.approx(min(apart))
+            assert found.mean == pytest.approx(np.mean(apart))
+        depth = depths.get((area.x, area.y), [])
+        assert area.several == len(depth)
+        assert area.depth == pytest.approx(np.mean(depth) if depth else math.nan, nan_ok=True)
+    every = np.concatenate(list(depths.values()))
+    for stats_of in (one, total):
+        assert stats_of.several == len(every) and stats_of.depth == pytest.approx(every.mean())
+
+
 def test_table_text_and_json_say_the_same(tmp_path):
     make_cloud(tmp_path / "c.las")
     path = write_features(tmp_path / "p.json", feature("Polygon", [[[300_000, -30], [300_050, -30], [300_050, 30]]],
@@ -226,6 +252,12 @@ def test_table_text_and_json_say_the_same(tmp_path):
             assert float(row[name] or "nan") == pytest.approx(
                 float("nan") if area[key] is None else area[key], nan_ok=True
             )
+        ranks = {pair: int(row[f"pairs_{pair}"]) for pair in ("1_2", "2_3", "3_4", "4")}
+        assert sum(ranks.values()) == area["pairs"] and int(row["pulses_with_several"]) == area["several"]
+        for pair, number in ranks.items():
+            one = area["separations"].get(pair.replace("_", "-"), {})
+            assert number == one.get("pairs", 0)
+            assert float(row[f"mean_m_{pair}"] or 0) == pytest.approx(one.get("mean", 0))
         for k in range(1, 5):
             assert float(row[f"return_{k}"]) == pytest.approx(area["by_number"].get(str(k), 0), abs=1e-9)
             assert float(row[f"pulses_with_{k}"]) == pytest.approx(area["by_count"].get(str(k), 0), abs=1e-9)

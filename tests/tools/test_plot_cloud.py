@@ -10,40 +10,19 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from plot_tools import POINTS, write_cloud
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
+from wavebatch.core.flag_names import read_flags
 from wavebatch.files.cloud import echo_reader as io_cloud
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
-from wavebatch.tools.plots.values import Selection, read_flags, robust_limits
-
-POINTS = 5000
-
-
-def write_cloud(path, *, seed=1, n=POINTS, point_format=6, **columns):
-    """A cloud of n points over 40 m x 25 m with the given extra columns: (values, no-data, scale) each."""
-    rng = np.random.default_rng(seed)
-    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format >= 6 else "1.2")
-    header.scales, header.offsets = (0.001,) * 3, (500_000.0, 5_400_000.0, 0.0)
-    for name, (stored, no_data, scale, description) in columns.items():
-        scaling = {} if scale is None else {"scales": np.array([scale]), "offsets": np.array([0.0])}
-        header.add_extra_dim(laspy.ExtraBytesParams(name, stored.dtype, description, no_data=no_data, **scaling))
-    las = laspy.LasData(header)
-    las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
-    las.x, las.y, las.z = 500_000 + rng.uniform(0, 40, n), 5_400_000 + rng.uniform(0, 25, n), rng.normal(100, 5, n)
-    las.intensity = rng.integers(0, 3000, n)
-    las.return_number = rng.integers(1, 4, n)
-    if point_format >= 6:
-        las.scan_angle = rng.integers(-3000, 3000, n)
-    for name, (stored, *_) in columns.items():
-        las.points.array[name] = stored
-    las.write(path)
-    return path
+from wavebatch.tools.plots.values import Selection, robust_limits
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +190,104 @@ def test_each_cloud_has_its_series_and_all_together_are_their_sum(cloud, tmp_pat
     wrong = write_cloud(tmp_path / "dB.las", amplitude=(np.ones(POINTS, "f4"), None, None, "of the echo [dB]"))
     with pytest.raises(ConfigError, match=r"dB.las.*\[dB\].*cloud.laz.*\[DN\]"):
         count_values([cloud, wrong], Selection("amplitude"))
+
+
+def test_columns_and_groups_are_series_of_one_histogram(tmp_path):
+    n = 4000
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(5, 1, n).astype("f4"), rng.normal(8, 1, n).astype("f4")
+    a[7] = -1
+    path = write_cloud(tmp_path / "g.las", n=n, width=(a, np.array([-1.0]), None, "w [ns]"),
+                       other=(b, None, None, "o [ns]"), power=(b, None, None, "p [dB]"))  # fmt: skip
+    las = laspy.read(path)
+    las.classification = rng.choice([2, 5], n)
+    las.write(path)
+    kind = np.array(las.classification)
+    whole = {"bins": 30, "limits": (0.0, 12.0)}
+    found = count_values([path], Selection("width"), by="classification", **whole)
+    assert found.names == ("classification 2 (ground)", "classification 5 (high vegetation)")
+    known = a != -1
+    for series, code in enumerate((2, 5)):
+        mine = a[(kind == code) & known].astype(np.float64)
+        assert found.counts[series].tolist() == np.histogram(mine, found.edges)[0].tolist()
+        assert found.values[series] == len(mine) and found.means[series] == pytest.approx(mine.mean())
+        assert found.percentiles[series][1] == pytest.approx(np.median(mine))
+    assert (found.total.values, found.total.no_data, found.total.points) == (n - 1, 1, n)
+    both = count_values([path], [Selection("width"), Selection("other")], **whole)
+    assert both.names == ("width", "other") and both.facts.name == "width, other"
+    assert both.counts[1].tolist() == np.histogram(b, both.edges)[0].tolist()
+    with pytest.raises(ConfigError, match=r"power is in \[dB\], width in \[ns\]"):
+        count_values([path], [Selection("width"), Selection("power")])
+    with pytest.raises(ConfigError, match="more than 12 different values"):
+        count_values([path], Selection("width"), by="other")
+
+
+def test_points_without_data_in_the_column_of_groups_are_a_group(tmp_path):
+    group = np.array([1, 1, 2, -9, -9], "f4")
+    path = write_cloud(tmp_path / "n.las", n=5, group=(group, np.array([-9.0]), None, "g"))
+    found = count_values([path], Selection("z"), by="group")
+    assert found.names == ("no group", "group 1", "group 2") and found.values.tolist() == [2, 2, 1]
+
+
+def test_two_columns_are_both_drawn(cloud, tmp_path):
+    pytest.importorskip("matplotlib")
+    target = tmp_path / "two.svg"
+    result = run("histogram", cloud, "-o", target, "--column", "amplitude", "--column", "z", "--by", "return_number")
+    assert result.exit_code == 0, result.output
+    text = target.read_text("utf-8")
+    for part in ("amplitude: peak of the echo", "z [m]", "return_number 3: ", "share of the series", "mean"):
+        assert part in text, part
+    assert "outside the picture; " in result.stderr
+
+
+def test_rare_far_values_are_outside_and_counted(tmp_path):
+    values = np.random.default_rng(3).normal(10, 1, 20_000)
+    values[:10] = 1000.0
+    path = write_cloud(tmp_path / "far.las", n=20_000, a=(values, None, None, "a"))
+    found = count_values([path], Selection("a"))
+    low, high = np.percentile(values, (0.1, 99.9))
+    width = found.edges[1] - found.edges[0]
+    assert abs(found.edges[0] - low) <= width and abs(found.edges[-1] - high) <= width
+    assert found.above[0] >= 10 and found.below[0] + found.above[0] + found.counts.sum() == 20_000
+    # A rare class is no outlier, and a small group sets limits of its own.
+    rare = write_cloud(tmp_path / "rare.las", n=20_000)
+    las = laspy.read(rare)
+    las.classification = np.where(np.arange(20_000) < 3, 18, 2)
+    las.write(rare)
+    assert count_values([rare], Selection("classification")).above[0] == 0
+
+
+def test_maps_say_their_crs_and_refuse_two(tmp_path, riegl, cloud):
+    pytest.importorskip("matplotlib")
+    found = grid_values([riegl], Selection("z"))
+    assert "UTM" in found.crs and found.unit == "m"
+    assert run("map", riegl, "--column", "z", "-o", tmp_path / "r.svg").exit_code == 0
+    assert f"CRS: {found.crs}" in (tmp_path / "r.svg").read_text("utf-8")
+    feet = 'PROJCS["feet",GEOGCS["g"],PROJECTION["x"],UNIT["US survey foot",0.304800609601219]]'
+    other = write_cloud(tmp_path / "feet.las")
+    las = laspy.read(other)
+    las.header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(feet))
+    las.header.global_encoding.wkt = True
+    las.write(other)
+    assert grid_values([other], Selection("z")).unit == "us-ft"
+    assert grid_values([other], Selection(None), "density").label == "points per area [1/us-ft2]"
+    with pytest.raises(ConfigError, match="its CRS is"):
+        grid_values([riegl, other], Selection("z"))
+    assert grid_values([cloud], Selection("z")).crs == ""
+
+
+def test_clouds_far_apart_are_refused(tmp_path, cloud):
+    away = write_cloud(tmp_path / "away.las")
+    las = laspy.read(away)
+    las.x = np.array(las.x) + 3000.0
+    las.write(away)
+    with pytest.raises(ConfigError, match=r"away.las: lies 3000.* from .*cloud.laz.*one by one"):
+        grid_values([cloud, away], Selection("z"))
+    bounds = (500_000.0, 5_400_000.0, 500_040.0, 5_400_025.0)
+    assert grid_values([cloud, away], Selection("z"), bounds=bounds).total.values == 2 * POINTS
+    las.x = np.array(las.x) - 2900.0
+    las.write(away)
+    assert grid_values([cloud, away], Selection("z")).outside == 0
 
 
 def test_flags_select_and_are_counted(cloud):

@@ -1,5 +1,6 @@
 """`wavebatch plot waveform`: the views hold what the strip and its run hold, and the pictures say it."""
 
+import csv
 import os
 import subprocess
 import sys
@@ -8,46 +9,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from plot_tools import PULSE, make_chain, simulate
 from strips import make_raw
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.strip import reader as io_strip
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
-from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.stages.chain_file import load_profile, parse_chain
 from wavebatch.stages.decompose.rebuild import MODELS
-from wavebatch.tools.bench.plot import _draw_panel, _place_labels
+from wavebatch.tools.bench.plot import _draw_panel
 from wavebatch.tools.plots.draw_sheet import draw_sheet
+from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
+from wavebatch.tools.plots.echo_table import list_echoes
+from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Wanted, find_places
 from wavebatch.tools.plots.waveform import build_views, read_views
 
-PULSE = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0)
 KAPPA = 0.15
 
 
 def run(*words):
     return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
-
-
-def simulate(shape, echoes, *, n=20, s=80, seed=1, top=255):
-    """A block of n waveforms of the echoes (amplitude, time, width), noise 1, baseline 12."""
-    rng = np.random.default_rng(seed)
-    x = np.arange(float(s))
-    signal = sum(a * evaluate_pulse(shape, x - 0.0, np.array([t]), np.array([w]))[0] for a, t, w in echoes)
-    counts = np.clip(np.rint(12 + signal + rng.normal(0, 1, (n, s))), 0, top)
-    return WaveformBlock.from_samples(counts.astype(np.uint8), bits=8)
-
-
-def make_chain(decomposer, **parameters):
-    attributes = [STAGES[f"attribute.{name}"] for name in ("amplitude", "echo_width")]
-    detector = "detect.asdf" if decomposer == "decompose.asdf_only" else "detect.maximum"
-    steps = [Step(STAGES["noise.pooled"]), Step(STAGES[detector]), Step(STAGES[decomposer], parameters)]
-    return Chain((*steps, *map(Step, attributes)), "test")
 
 
 @pytest.mark.parametrize("name", [name for name, shape in MODELS.items() if shape is not None])
@@ -226,7 +212,8 @@ def test_pictures_say_what_they_show_with_the_same_bytes_each_time(tiny_strip, t
     first = (tmp_path / "p.svg").read_bytes()
     assert run(*words, "-q").output == "" and (tmp_path / "p.svg").read_bytes() == first
     text = first.decode()
-    for part in ("tiny.las", "profile auto", "packet 3", "GPS time", "signal [DN]", "[noise std]", "amplitude [DN]"):
+    parts = ("tiny.las", "auto: detect.maximum, decompose", "packet 3", "GPS time", "signal [DN]", "[noise std]")
+    for part in (*parts, "amplitude [DN]"):
         assert part in text, part
     assert "time after the first sample [ns]" in text and "returns of the file" in text
 
@@ -265,6 +252,62 @@ def test_no_display_and_no_home_are_needed(tiny_strip, tmp_path):
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_signal_is_shown_and_the_whole_on_request(tiny_strip):
+    block = simulate(PulseShape(), [(100.0, 30.3, 2.0), (50.0, 45.0, 2.0)], s=400)
+    for view in build_views(block, make_chain("decompose.gaussian"), PULSE, range(20)):
+        low, high = view.span
+        assert 0 <= low < 25 and 50 < high < 100 and view.span_is_cut((low, high))
+        seen = view.time[view.samples > view.level + 5 * view.std]
+        assert low < seen.min() and seen.max() < high
+        assert not view.span_is_cut((-0.5, 399.5))
+    quiet = simulate(PulseShape(), [], s=100, n=1)
+    (view,) = build_views(quiet, make_chain("decompose.gaussian"), PULSE, [0])
+    assert len(view.echoes) or view.span == (-0.5, 99.5)
+
+
+def test_error_bars_stay_inside_and_cut_ones_are_marked(tmp_path):
+    pytest.importorskip("matplotlib")
+    block = simulate(PulseShape(), [(100.0, 30.3, 2.0)], n=1)
+    (view,) = build_views(block, make_chain("decompose.gaussian"), PULSE, [0])
+    for error, heads in ((20.0, {"_"}), (1e5, {"^", "v"})):
+        table = replace(view.echoes, amplitude_err=np.array([error], np.float32))
+        with open_picture(tmp_path / "e.png", (6, 5), overwrite=True) as figure:
+            panels = _draw_panels(figure, figure.add_gridspec(1, 1)[0], replace(view, echoes=table), view.span,
+                                  small=False, room=5.0)  # fmt: skip
+        low, high = panels[0].get_ylim()
+        lines = [line for line in panels[0].lines if line.get_color() == ECHO]
+        for line in lines:
+            assert low <= np.min(line.get_ydata()) and np.max(line.get_ydata()) <= high
+        assert heads <= {line.get_marker() for line in lines}
+        assert high - low < 400
+
+
+def test_echoes_are_listed_and_written(tiny_strip, tmp_path):
+    target = tmp_path / "e.csv"
+    result = run(tiny_strip, "-o", target, "--packet", "0:30", "--profile", "balanced")
+    assert result.exit_code == 2 and f"{MOST} fit" in result.stderr
+    assert run(tiny_strip, "-o", target, "--packet", "0:20", "--profile", "balanced").exit_code == 0
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        places = find_places(reader, scan, Wanted(packets=((0, 20),)), None)
+        views = read_views(reader, scan, places, load_profile("balanced"), PULSE)
+    rows = list(csv.DictReader(target.read_text().splitlines()))
+    assert [int(row["packet"]) for row in rows if row["echo"] in ("", "1")] == list(range(20))
+    found = [row for row in rows if row["echo"]]
+    assert len(found) > 15 and len(rows[0]) == len(set(rows[0]))
+    for row in found:
+        view = views[int(row["packet"])]
+        assert int(row["point"]) == view.point
+        near = np.argmin(np.abs(view.echoes.time - float(row["echo_time [ns]"])))
+        assert float(row["echo_time [ns]"]) == pytest.approx(float(view.echoes.time[near]), abs=0.5)
+        assert float(row["echo_width [ns]"]) > 0 and float(row["amplitude_err [DN]"]) > 0
+        # The distance from the sensor, which simulated vectors give.
+        assert 100 < float(row["range [m]"]) < 10_000
+    refused = run(tiny_strip, "-o", target, "--packet", 1)
+    assert refused.exit_code == 1 and "--overwrite" in refused.stderr
+    text = list_echoes(views, most=3)
+    assert "more: -o FILE.csv" in text and "packet" in text.split("\n")[0]
+
+
 def test_real_waveforms(riegl, leica, tmp_path):
     chain = load_profile("accurate")
     with StripReader(riegl) as reader, reader.scan() as scan:
@@ -299,7 +342,7 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
         axes = figure.subplots()
         labels = _draw_panel(axes, rows, "wrong", 100.0, "wrong [%]")
         figure.draw_without_rendering()
-        _place_labels(axes, labels)
+        place_labels(axes, labels, keep=True)
         boxes = [text.get_window_extent() for text in axes.texts]
         frame = axes.get_window_extent()
     assert len(boxes) == 5

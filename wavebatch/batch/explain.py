@@ -96,7 +96,11 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     choice, echoes = prepared.choice, report.count("echoes")
     lines = []
     if prepared.forced:
-        lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
+        if prepared.job.request.force:
+            lines.append(f"--force: the survey given by --system is not of this sensor: {prepared.forced}")
+        else:
+            doubt = "the survey given by --system is of another sensor, or this is a hillside"
+            lines.append(f"{doubt}: {prepared.forced}")
     lines += _miss_all(prepared, report)
     if not choice.doubted or not echoes:
         return tuple(lines)

@@ -25,11 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.interrupts import uninterrupted
-from wavebatch.core.memory import keep_freed_memory
+from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
-"""Each process works on one thread: more threads than cores only wait for each other."""
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
 _PATIENCE = 3.0
@@ -201,12 +199,12 @@ def settle(future: Future, function: Callable, *arguments: Any) -> Future:
 @contextlib.contextmanager
 def _single_threaded() -> Iterator[None]:
     """Libraries of processes that are started inside use one thread each."""
-    before = {name: os.environ[name] for name in _ONE_THREAD if name in os.environ}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    before = {name: os.environ[name] for name in ONE_THREAD if name in os.environ}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:
-        for name in _ONE_THREAD:
+        for name in ONE_THREAD:
             del os.environ[name]
         os.environ.update(before)
 

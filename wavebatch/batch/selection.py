@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import laspy
 import numpy as np
 
 from wavebatch.batch.counts import LEFT_OUT, RunReport, count_flags
@@ -24,9 +23,8 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.flag_names import read_flags
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_names import normalise
-from wavebatch.files.cloud.echo_reader import describe_dimension, read_dimension
+from wavebatch.files.cloud.echo_reader import describe_dimension, list_fields, read_dimension, read_field
 from wavebatch.files.cloud.layout import OutputLayout
-from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.point_formats import ANGLE_UNIT
 from wavebatch.stages.chain import STAGES, Chain
@@ -179,9 +177,7 @@ class RowSelector:
         """Names that --where may use, by kind, each with what it stands for; the first kind that has a name counts."""
         made = [name for name in self.chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
         computed = {name: name for name in [*made, *_WITHOUT_STAGE]}
-        dimensions = laspy.PointFormat(self.layout.point_format).dimensions
-        fields = [*"xyz", *(one.name for one in dimensions if one.name not in ("X", "Y", "Z"))]
-        standard = {name: name for name in fields}
+        standard = {name: name for name in list_fields(self.layout.point_format)}
         standard |= {"scan_angle": "scan_angle", "scan_angle_rank": "scan_angle"}
         fields = zip(self.layout.carried, self.layout.extra_fields, strict=False)
         carried = {one.record.name: field for one, field in fields if not self.layout.dtype[field].shape}
@@ -216,8 +212,7 @@ class RowSelector:
         modern = self.layout.point_format >= 6
         if found == "scan_angle":
             return rows["scan_angle"] * ANGLE_UNIT if modern else rows["scan_angle_rank"].astype(np.float64)
-        record = laspy.PackedPointRecord(rows, laspy.PointFormat(self.layout.point_format))
-        return widen(np.asarray(record[found]))
+        return read_field(rows, self.layout.point_format, found)
 
 
 def build_selection(

@@ -141,7 +141,7 @@ class Prepared:
     doubts: tuple[str, ...] = ()
     """Warnings about inputs that do not quite fit the strip, such as its calibration or the beam's divergence."""
     forced: str = ""
-    """What contradicts the saved survey that the strip is run with by --force; empty where nothing does."""
+    """What contradicts the saved survey with which the strip is run, by --force or in doubt; empty for nothing."""
 
     @property
     def system(self) -> SystemPulse:
@@ -337,7 +337,7 @@ def _hold_height(reader: StripReader, request: SensorRequest, sensor: SensorSour
 
 
 def _hold(reader: StripReader, scan: StripScan, job: StripJob) -> tuple[str, str]:
-    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a forced survey."""
+    """Why the strip does not belong to the flight whose survey the job has, and what contradicts a saved survey."""
     request = job.request
     if request.system is None:
         return "", ""

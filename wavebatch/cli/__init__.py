@@ -7,11 +7,11 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import Any
 
 import click
 
-from wavebatch import __version__
 from wavebatch.cli.messages import NearestGroup
 from wavebatch.core.interrupts import guard
 
@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "slice": ("wavebatch.cli.slice:slice_", "Find straight surface lines in the scan lines of a strip."),
     "voxelize": ("wavebatch.cli.voxelize:voxelize", "Deconvolve waveforms into the voxels of a 3D grid."),
     "plot": ("wavebatch.cli.plot:plot", "Draw waveforms with their fit, histograms and maps."),
+    "grid": ("wavebatch.cli.gis.grid:grid", "Write columns of clouds as a GeoTIFF."),
     "calibrate": ("wavebatch.cli.calibrate:calibrate", "Find the calibration constant from known reflectances."),
     "bench": ("wavebatch.cli.bench:bench", "Measure error and run time of chains on simulated truth."),
 }
@@ -50,7 +51,9 @@ class LazyGroup(NearestGroup):
         if cmd_name not in COMMANDS:
             return None
         module, _, function = COMMANDS[cmd_name][0].partition(":")
-        return getattr(importlib.import_module(module), function)
+        from wavebatch.cli.program.command import dress
+
+        return dress(getattr(importlib.import_module(module), function), cmd_name)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the list of commands without importing them."""
@@ -58,10 +61,35 @@ class LazyGroup(NearestGroup):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
 
+def _print_version(context: click.Context, parameter: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from wavebatch.cli.program.about import describe_version
+
+        click.echo(describe_version())
+        context.exit()
+
+
+def _write_man_pages(context: click.Context, parameter: click.Parameter, folder: Path | None) -> None:
+    if folder is not None and not context.resilient_parsing:
+        from wavebatch.cli.messages import report_errors, talk
+        from wavebatch.cli.program.about import write_man_pages
+
+        pages = report_errors()(write_man_pages)(main, folder)
+        talk(f"{folder}: {len(pages)} manual pages written")
+        context.exit()
+
+
 @click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="wavebatch", message="%(prog)s %(version)s")
+@click.option("--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version,
+              help="Print the versions of wavebatch, Python and the libraries.")
+@click.option("--man-pages", type=click.Path(file_okay=False, path_type=Path), metavar="DIR", is_eager=True,
+              expose_value=False, callback=_write_man_pages, help="Write the manual pages into DIR.")
 def main() -> None:
     """Decompose full-waveform lidar strips: LAS/LAZ wave packets in, enriched point clouds out.
 
-    `wavebatch COMMAND --help` explains a command.
-    """
+    `wavebatch COMMAND --help` explains a command, with examples.
+
+    Defaults of options can be given by variables (WAVEBATCH_JOBS=4, or for one command WAVEBATCH_RUN_JOBS=4) and in
+    wavebatch.toml beside the inputs (a table per command: [run] with jobs = 4). Options on the command line count
+    first, then variables, then the file.
+    """  # fmt: skip

@@ -16,7 +16,15 @@ from typing import Any
 import click
 
 from wavebatch.cli.messages import one_line, print_json, print_result, talk
-from wavebatch.cli.options import common_options, from_options, output_option, parse_length, seed_option
+from wavebatch.cli.options import (
+    check_html,
+    common_options,
+    from_options,
+    html_option,
+    output_option,
+    parse_length,
+    seed_option,
+)
 from wavebatch.core.errors import InputError
 
 
@@ -50,9 +58,11 @@ from wavebatch.core.errors import InputError
               "checkout, and by this one, in turn; print the ratios and their range.")
 @output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
                folder=True)
+@html_option
 @common_options("json", "quiet")
 def bench(
-    files: tuple[Path, ...], output: Path | None, tolerance: str | None, against: Path | None, **options: Any
+    files: tuple[Path, ...], output: Path | None, tolerance: str | None, against: Path | None,
+    html_file: Path | None, **options: Any,
 ) -> None:
     """Measure error and run time of all shipped chains, of CHAIN files (.toml) and of other decomposers.
 
@@ -72,15 +82,18 @@ def bench(
     from wavebatch.tools.bench.promises import format_promises
     from wavebatch.tools.bench.report import format_document, write_outputs
 
+    check_html(html_file)
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
     if options["real"]:
         if not strips or len(strips) < len(files):
             raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
-        _bench_real(strips, output, options, say)
+        _bench_real(strips, output, html_file, options, say)
         return
     if against is not None:
+        if html_file is not None:
+            raise click.UsageError("--against has no page: leave --html out; -o writes its table")
         _bench_against(against, strips, files, output, options, say)
         return
     if len(strips) > 1:
@@ -99,6 +112,11 @@ def bench(
         text += "\n\n" + format_promises(document["promises"])
     for line in write_outputs(document, text, output) if output else []:
         talk(line)
+    if html_file is not None:
+        from wavebatch.tools.html.bench_page import write_bench_page
+
+        write_bench_page(html_file, document, text)
+        talk(f"{html_file}: written")
     print_result(options["as_json"], document, [text])
 
 
@@ -133,8 +151,9 @@ def _bench_against(
 
 
 def _bench_real(
-    strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
-) -> None:
+    strips: Sequence[Path], output: Path | None, html_file: Path | None, options: Mapping[str, Any],
+    say: Callable[[str], None],
+) -> None:  # fmt: skip
     """Measures strip after strip; one that cannot be measured is named, and the others go on."""
     from wavebatch.tools.bench.real.measure import measure_real
     from wavebatch.tools.bench.real.report import format_report, write_report
@@ -152,6 +171,11 @@ def _bench_real(
             talk(write_report(report, output))
         if not options["as_json"]:
             click.echo(format_report(report) + "\n")
+    if html_file is not None and reports:
+        from wavebatch.tools.html.bench_page import write_real_page
+
+        write_real_page(html_file, [(report.strip, format_report(report)) for report in reports])
+        talk(f"{html_file}: written")
     if options["as_json"]:
         print_json({"strips": [asdict(report) for report in reports]}, "real")
     if failed:

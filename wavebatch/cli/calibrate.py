@@ -44,8 +44,11 @@ if TYPE_CHECKING:
 @shared.system_option
 @shared.sensor_options
 @shared.direction_option
+@shared.html_option
 @shared.common_options("overwrite")
-def calibrate(strips: tuple[Path, ...], targets: Path, output: Path, overwrite: bool, **options: Any) -> None:
+def calibrate(
+    strips: tuple[Path, ...], targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
+) -> None:
     """Find the calibration constants of STRIPs over targets of known reflectance, for `wavebatch run --calibration`.
 
     STRIP is a LAS or LAZ file with waveforms, a glob, a folder, or @list.txt with one of these per line. Each channel
@@ -70,17 +73,22 @@ def calibrate(strips: tuple[Path, ...], targets: Path, output: Path, overwrite: 
     if not paths:
         raise ConfigError("no strip given")
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
-        for target in filter(None, (output, options["report"], options["plot"])):
+        for target in filter(None, (output, options["report"], options["plot"], html_file)):
             refuse_input(target)
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     if options["plot"] is not None:
         check_picture(options["plot"], overwrite=overwrite)
+    shared.check_html(html_file)
     flight = calibrate_flight(paths, load_targets(targets), _read_options(options))
     found = flight.calibration
     write_text(output, format_calibration(found), overwrite=overwrite)
     if options["report"] is not None:
         write_text(options["report"], format_json(_list_report(flight)) + "\n", overwrite=overwrite)
+    if html_file is not None:
+        from wavebatch.tools.html.calibrate_page import write_calibrate_page
+
+        write_calibrate_page(html_file, flight)
     if options["plot"] is not None:
         from wavebatch.tools.plots.draw_flight import draw_flight
 

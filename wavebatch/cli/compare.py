@@ -14,7 +14,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, print_result, row, talk
-from wavebatch.cli.options import common_options, file_option, read_system, system_option, where_option
+from wavebatch.cli.options import (
+    check_html,
+    common_options,
+    file_option,
+    html_option,
+    output_option,
+    read_system,
+    system_option,
+    where_option,
+)
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.text_file import write_text
 from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_truth
 
 if TYPE_CHECKING:
@@ -54,7 +65,9 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
 @click.option("--max-median", **_TIME, help="Largest absolute median of the time differences [ns].")
 @click.option("--max-rmse", **_TIME, help="Largest root mean square of the time differences [ns].")
 @click.option("--max-nmad", **_TIME, help="Largest robust spread of the time differences [ns].")
-@common_options("json", failure=2)
+@html_option
+@output_option("Write all figures as a table, one per row.", "FILE.csv", required=False)
+@common_options("overwrite", "json", failure=2)
 def compare(
     a: Path,
     b: Path | None,
@@ -62,7 +75,10 @@ def compare(
     truth: Path | None,
     angles: bool,
     overlap: bool,
+    html_file: Path | None,
     as_json: bool,
+    output: Path | None,
+    overwrite: bool,
     **options: Any,
 ) -> None:
     """Compare the echoes of cloud A with those of B: another cloud, or the strip with the vendor's returns.
@@ -82,23 +98,44 @@ def compare(
 
     Exit code: 0 done, 1 a threshold (--min-..., --max-...) is not met, 2 wrong usage or a file cannot be read.
     """  # fmt: skip
+    check_html(html_file)
+    if output is not None:
+        if angles or overlap:
+            raise click.UsageError("-o has no meaning with --angles and --overlap; --json writes their figures")
+        check_target(output, overwrite=overwrite)
     if overlap:
         found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
         print_result(as_json, found, _list_overlap(found), "overlap")
+        _write_page(html_file, found, [])
         return
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
         print_result(as_json, agreement, _list_angles(agreement), "angles")
+        _write_page(html_file, agreement, [])
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
     between = result.between if strip else result
+    if output is not None:
+        from wavebatch.tools.compare.table import format_comparison
+
+        write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     lines = [*_list_lines(between), *(_list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
     broken = _check_thresholds(between, options)
+    _write_page(html_file, result, broken)
     for line in broken:
         talk(line)
     if broken:
         sys.exit(EXIT_VIOLATED)
+
+
+def _write_page(target: Path | None, result: Any, broken: list[str]) -> None:
+    """The page of --html."""
+    if target is not None:
+        from wavebatch.tools.html.compare_page import write_compare_page
+
+        write_compare_page(target, result, broken)
+        talk(f"{target}: written")
 
 
 def _tolerance(options: dict) -> dict[str, float]:

@@ -47,7 +47,8 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
         if verbose and facts.get("packets", {}).get("count") and not facts["problems"]:
             facts["pulse"] = _describe_pulse(path, **reading)
         if not as_json:
-            click.echo("\n".join(["", *_list_lines(facts)][path == paths[0] :]))
+            lines = ["", *_list_lines(facts)][path == paths[0] :]
+            click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
         return facts
 
     results, failed = for_each(paths, show, debug=debug)

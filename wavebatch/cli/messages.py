@@ -20,6 +20,7 @@ from typing import IO, Any
 
 import click
 
+from wavebatch.cli.program import log_file
 from wavebatch.core import interrupts
 from wavebatch.core.errors import ConfigError, InputError, StageError
 
@@ -108,8 +109,9 @@ class NearestGroup(click.Group):
 
 
 def talk(message: str) -> None:
-    """One line on stderr."""
+    """One line on stderr, and in the file of --log-file."""
     click.echo(printable(message), err=True)
+    log_file.log(printable(message))
 
 
 def printable(text: str) -> str:
@@ -213,7 +215,9 @@ def report_errors(failure: int = 1) -> Callable:
         def guarded(*args: Any, **options: Any) -> Any:
             try:
                 return function(*args, **options)
-            except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+            except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError) as error:
+                if isinstance(error, click.ClickException):
+                    log_file.log(printable(error.format_message()), "error")
                 raise
             except Exception as error:
                 if interrupts.arrived():  # compiled code may have turned KeyboardInterrupt into this
@@ -287,6 +291,7 @@ class Progress:
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "written":
+            log_file.log(printable(_summary(event, False)))
             # Printed with --quiet too: what is written is less sure, or less, than its inputs promise.
             for line in (*event["serious"], *event["doubts"]):
                 self._say(printable(f"{strip}: warning: {line}"))
@@ -307,6 +312,7 @@ class Progress:
         if self._bar is not None:
             self._bar.clear()
         click.echo(line, err=True)
+        log_file.log(line)
         if self._bar is not None:
             self._bar.refresh()
 

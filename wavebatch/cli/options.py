@@ -19,6 +19,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from wavebatch.cli.messages import one_line, report_errors, talk
+from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
@@ -78,6 +79,20 @@ def where_option(text: str) -> Callable:
     more = "that meet this, e.g. \"number_of_returns == 2 and not (classification == 7 or echo_width >= 8)\"; points"
     more += " without data in a column meet nothing on it."
     return click.option("--where", callback=_read_where, metavar="CONDITION", help=f"{text} {more}")
+
+
+html_option = output_option(
+    "Also write a report page: one HTML file with all pictures in it. An older report of that name is replaced.",
+    "FILE", "--html", "html_file", required=False,
+)  # fmt: skip
+
+
+def check_html(target: Path | None) -> None:
+    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it."""
+    if target is not None:
+        from wavebatch.tools.html.page import check_page
+
+        check_page(target)
 
 
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
@@ -156,6 +171,12 @@ _COMMON = {
     "json": click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout."),
     "quiet": click.option("-q", "--quiet", is_flag=True,
                           help="Print no progress and no messages, only errors and warnings of wrong results."),
+    "log_level": click.option("--log-level", type=click.Choice(LEVELS), default="info", show_default=True,
+                              is_eager=True, expose_value=False, callback=keep_level,
+                              help="Last level that --log-file holds."),
+    "log_file": click.option("--log-file", "log_path", type=OutputPath(dir_okay=False, path_type=Path), metavar="FILE",
+                             expose_value=False, callback=begin_log,
+                             help="Append every message with its time to this file, also with --quiet."),
     "debug": click.option("--debug", is_flag=True, help="Print the traceback of an error."),
 }
 
@@ -167,7 +188,8 @@ def common_options(*names: str, failure: int = 1) -> Callable:
     """
 
     def decorate(command: Callable) -> Callable:
-        return together(*(_COMMON[name] for name in (*names, "debug")))(report_errors(failure)(_protected(command)))
+        shared = (*names, "log_file", "log_level", "debug")
+        return together(*(_COMMON[name] for name in shared))(report_errors(failure)(_protected(command)))
 
     return decorate
 

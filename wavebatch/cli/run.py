@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +33,10 @@ from wavebatch.cli.options import (
     air_options,
     calibration_option,
     chain_options,
+    check_html,
     common_options,
     file_option,
+    html_option,
     output_option,
     parse_floats,
     read_air,
@@ -47,7 +51,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
 EXIT_UNREPORTED, EXIT_SOME_FAILED, EXIT_NOTHING = 1, 3, 4
-"""All strips are written, but --report or stdout could not be; some strips failed; all strips failed."""
+"""All strips are written, but --report, --html or stdout could not be; some strips failed; all strips failed."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
@@ -131,6 +135,7 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
 @click.option("--dry-run", is_flag=True, help="Print what would be done with each strip; write nothing.")
 @click.option("--report", type=OutputPath(dir_okay=False, allow_dash=True), metavar="FILE",
               help="Write a summary of all strips as JSON; - is stdout. An existing FILE is replaced.")
+@html_option
 @click.option("--progress", type=click.Choice(["auto", "bar", "json", "none"]), default="auto", show_default=True,
               help="auto: a bar if stderr is a terminal; json: one line per event on stdout.")
 @click.option("-v", "--verbose", is_flag=True, help="Print more about each strip.")
@@ -144,7 +149,7 @@ def run(**options: Any) -> None:
     \b
     Exit codes:
       0    all strips are written
-      1    all strips are written, but --report or stdout cannot be written
+      1    all strips are written, but --report, --html or stdout cannot be written
       2    wrong usage or chain file, nothing was started; or no chain meets the tolerance
       3    some strips failed, the others are written
       4    all strips failed
@@ -156,6 +161,9 @@ def run(**options: Any) -> None:
     jobs, batch_options = _plan(options)
     if options["report"] not in (None, "-"):
         _check_report(Path(options["report"]), jobs, batch_options)
+    if options["html_file"] is not None:
+        _check_report(options["html_file"], jobs, batch_options, "--html")
+        check_html(options["html_file"])
     if options["dry_run"]:
         sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
     try:
@@ -182,14 +190,14 @@ def _check_options(options: dict[str, Any]) -> None:
         raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
 
 
-def _check_report(report: Path, jobs: list[Any], batch_options: Any) -> None:
+def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
     """Raises ConfigError if the summary would replace a file that is read or written by this run."""
     from wavebatch.batch.preflight import find_outputs
 
     refuse_input(report)
     outputs = {os.path.realpath(path) for job in jobs for path in find_outputs(job, batch_options.folder)}
     if os.path.realpath(report) in outputs:
-        raise ConfigError(f"--report: {report} is an output of a strip; choose another name")
+        raise ConfigError(f"{option}: {report} is an output of a strip; choose another name")
 
 
 _PASSED_ON = (
@@ -246,6 +254,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
             talk(result.advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
+    is_reported = _write_page(result, batch_options.folder, options) and is_reported
     errors = [outcome.error for outcome in result.outcomes]
     if errors and all(isinstance(error, ConfigError) for error in errors):
         return EXIT_USAGE
@@ -264,6 +273,25 @@ def _report(document: dict[str, Any], target: str | None) -> bool:
     except InputError as error:
         talk(f"error: --report: {one_line(error)}")
         return False
+    return True
+
+
+def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
+    """Writes the page of --html; returns whether that worked or was not asked for."""
+    target = options["html_file"]
+    if target is None:
+        return True
+    from wavebatch.tools.html.run_page import write_run_page
+
+    try:
+        write_run_page(target, result, folder, " ".join(map(shlex.quote, sys.argv)))
+    except Exception as error:  # the clouds are written, whatever becomes of the page
+        if options["debug"]:
+            traceback.print_exc()
+        talk(f"error: --html: {one_line(error)}")
+        return False
+    if not options["quiet"]:
+        talk(f"{target}: written")
     return True
 
 
@@ -294,6 +322,8 @@ def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
         )
         if not as_json:
             click.echo(printable(line))
+    for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
+        click.echo(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
     if as_json:
         print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")

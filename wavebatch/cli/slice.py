@@ -7,23 +7,27 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import click
 
+from wavebatch import __version__
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_json, talk
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.figure_file import check_picture
 from wavebatch.files.geojson_crs import GEOJSON_CRS, GeoJsonCrs, find_crs, plan_crs
 from wavebatch.files.inputs import find_files
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import survey_blocks
+from wavebatch.tools.slices.cube import CubeBuilder
 from wavebatch.tools.slices.lines import read_scan_lines
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES, SegmentWriter, draw_slice
-from wavebatch.tools.slices.segments import SliceOptions, cut_slice, find_segments
+from wavebatch.tools.slices.segments import Segment, SliceOptions, cut_slice, find_segments
 
 EXIT_SOME_FAILED = 1
 """Some strips failed."""
@@ -32,11 +36,31 @@ _SURVEYED = 2000
 """Waveforms from which the width of the pulse is measured: enough for 1 % of it."""
 
 
+@dataclass(frozen=True, slots=True)
+class Extras:
+    """What is made of one strip besides its segments."""
+
+    png: Path | None
+    """Picture of the first slice."""
+    overview: Path | None
+    """Picture of all segments."""
+    cube: Path | None
+    """The samples as a cube."""
+
+    @property
+    def targets(self) -> list[Path]:
+        """The files that are wanted."""
+        return [path for path in (self.png, self.overview, self.cube) if path is not None]
+
+
 @click.command(name="slice")
 @shared.strips_argument
 @shared.output_option("Write the segments: .csv or .geojson; or a folder, which gets STEM.csv for each strip.",
                       "FILE|DIR", required=False, folder=None)
 @shared.output_option("Draw the first slice of --lines.", "FILE", "--png", required=False)
+@shared.output_option("Draw all segments of --lines in plan and in 3D.", "FILE", "--overview", required=False)
+@shared.output_option("Write the samples of --lines as a cube of line, pulse and time, for `wavebatch plot cube`.",
+                      "FILE.npz", "--cube", required=False)
 @click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
@@ -54,7 +78,13 @@ _SURVEYED = 2000
 @shared.direction_option
 @shared.common_options("overwrite", "json", "quiet")
 def slice_(
-    strips: tuple[str, ...], output: Path | None, lines: tuple[int, int | None], png: Path | None, **options: Any
+    strips: tuple[str, ...],
+    output: Path | None,
+    lines: tuple[int, int | None],
+    png: Path | None,
+    overview: Path | None,
+    cube: Path | None,
+    **options: Any,
 ) -> None:
     """Find the straight surface lines in the scan lines of each STRIP.
 
@@ -76,16 +106,19 @@ def slice_(
 
     Exit code: 0 done, 1 a strip cannot be read or an output cannot be written (the others are made), 2 wrong usage.
     """  # fmt: skip
-    if output is None and png is None:
-        raise click.UsageError("give -o for the segments, --png for a picture, or both")
-    if png:
-        refuse_existing(png, options["overwrite"])
+    extras = Extras(png, overview, cube)
+    if output is None and not extras.targets:
+        raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
+    for target in extras.targets:
+        refuse_existing(target, options["overwrite"])
+    for picture in filter(None, (png, overview)):
+        check_picture(picture, overwrite=options["overwrite"])
     paths = find_files(strips, recursive=options["recursive"])
-    if png and len(paths) > 1:
-        raise ConfigError(f"{png}: one picture for {len(paths)} strips; draw them one by one")
+    if extras.targets and len(paths) > 1:
+        raise ConfigError(f"{extras.targets[0]}: one file for {len(paths)} strips; make them one by one")
     targets = {} if output is None else shared.name_outputs(paths, output, SEGMENT_SUFFIXES, ".csv")
     found, failed = shared.for_each(
-        paths, lambda strip: _slice(strip, targets.get(strip), lines, png, options), debug=options["debug"]
+        paths, lambda strip: _slice(strip, targets.get(strip), lines, extras, options), debug=options["debug"]
     )
     if options["as_json"]:
         print_json(found[0] if len(paths) == 1 else found)
@@ -93,7 +126,7 @@ def slice_(
 
 
 def _slice(
-    strip: Path, output: Path | None, lines: tuple[int, int | None], png: Path | None, options: dict[str, Any]
+    strip: Path, output: Path | None, lines: tuple[int, int | None], extras: Extras, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Work on one strip; returns its counts and says them."""
     with StripReader(strip, direction=options["direction"]) as reader:
@@ -106,7 +139,7 @@ def _slice(
         if sigma is None:
             sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
         settings = shared.from_options(SliceOptions, options, sigma=sigma)
-        counts = _find(reader, scan, settings, output, lines, png, crs, options["overwrite"])
+        counts = _find(reader, scan, settings, output, lines, extras, crs, options["overwrite"])
     if not counts["lines"]:
         talk(f"{strip}: has no scan line with a number in --lines")
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
@@ -121,7 +154,7 @@ def _find(
     settings: SliceOptions,
     output: Path | None,
     lines: tuple[int, int | None],
-    png: Path | None,
+    extras: Extras,
     crs: GeoJsonCrs | None,
     overwrite: bool,
 ) -> dict[str, Any]:
@@ -129,7 +162,8 @@ def _find(
     first, end = lines
     counts = {"lines": 0, "pulses": 0, "segments": 0, "sigma": settings.sigma}
     with ExitStack() as stack:
-        writer = None
+        writer, every = None, []
+        cube = CubeBuilder(extras.cube) if extras.cube else None
         if output:
             writer = stack.enter_context(SegmentWriter(output, crs=crs, overwrite=overwrite))
         for line in takewhile(lambda one: end is None or one.number < end, read_scan_lines(reader, scan)):
@@ -137,15 +171,35 @@ def _find(
                 continue
             piece = cut_slice(line, settings)
             segments = find_segments(piece, settings)
-            if png and not counts["lines"]:
-                draw_slice(piece, segments, png, overwrite=overwrite)
+            if extras.png and not counts["lines"]:
+                draw_slice(piece, segments, extras.png, strip=reader.facts.path.name, overwrite=overwrite)
+            if extras.overview:
+                every += segments
+            if cube:
+                cube.add(line)
             if writer:
                 writer.write(segments)
             counts["lines"] += 1
             counts["pulses"] += len(line)
             counts["segments"] += len(segments)
-        if png and not counts["lines"]:
-            raise InputError(f"{png}: not drawn, because no scan line has a number in --lines")
+        if extras.targets and not counts["lines"]:
+            raise InputError(f"{extras.targets[0]}: not written, because no scan line has a number in --lines")
+        if extras.overview:
+            _draw_overview(every, extras.overview, reader, counts["lines"], overwrite)
+        if cube:
+            meta = {"version": __version__, "strip": reader.facts.path.name}
+            counts["cube"] = list(cube.write(meta, reader.facts.crs, overwrite=overwrite))
         if writer:
             writer.commit()
     return counts
+
+
+def _draw_overview(segments: list[Segment], target: Path, reader: StripReader, lines: int, overwrite: bool) -> None:
+    """Draws the segments of all lines; InputError without any."""
+    from wavebatch.files.las.crs_name import describe_crs
+    from wavebatch.tools.slices.draw import draw_segments
+
+    if not segments:
+        raise InputError(f"{target}: not drawn, because the scan lines have no segment")
+    path = reader.facts.path
+    draw_segments(segments, target, strip=path.name, lines=lines, crs=describe_crs(path)[0], overwrite=overwrite)

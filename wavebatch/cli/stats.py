@@ -31,7 +31,7 @@ from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
-from wavebatch.tools.return_stats.areas import AreaStats, Grid, PolygonSet
+from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
 EXIT_UNREADABLE = 1
@@ -103,6 +103,9 @@ def _list_lines(found: ReturnStats) -> Iterator[str]:
         yield f"{'separation':<14}  {'pairs':>10}  {'mean m':>10}  {'least m':>10}"
         for name, one in found.separations.items():
             yield f"{name:>14}  {one.pairs:>10}  {one.mean:>10.3f}  {one.least:>10.3f}"
+    if found.several:
+        pulses = count(found.several, "pulse")
+        yield f"depth          {found.depth:.3f} m, mean height of the first above the last return of {pulses}"
     for name, number in (found.flags or {}).items():
         if number:
             yield f"{name:<22}  {number:>10}"
@@ -136,6 +139,9 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
     table = csv.writer(text, lineterminator="\n")
     head = ["cloud", "kind", "area", "x", "y", "points", "pulses", "returns_per_pulse"]
     head += [*(f"return_{k}" for k in numbers), *(f"pulses_with_{k}" for k in counts), "pairs", "mean_m", "least_m"]
+    ranks = [pair.replace("-", "_").rstrip("_") for pair in RANKS]
+    head += [f"{name}_{pair}" for pair in ranks for name in ("pairs", "mean_m", "least_m")]
+    head += ["pulses_with_several", "first_above_last_m"]
     table.writerow(head)
     for cloud, part in rows:
         if isinstance(part, AreaStats):
@@ -145,8 +151,22 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
             place, apart = ["cloud", "", math.nan, math.nan], (alone.pairs, alone.mean, alone.least)
         shares = [part.by_number.get(k, 0.0) for k in numbers] + [part.by_count.get(k, 0.0) for k in counts]
         values = [*place, part.points, part.pulses, part.returns_per_pulse, *shares, *apart]
+        for one in _rank_pairs(part):
+            values += [one.pairs, one.mean, one.least]
+        values += [part.several, part.depth]
         table.writerow([cloud, *(_cell(value) for value in values)])
     return text.getvalue()
+
+
+def _rank_pairs(part: ReturnStats | AreaStats) -> list[Separation]:
+    """Distances per class of RANKS; a cloud has more classes above the third, which are joined here."""
+    found = {}
+    for pair in RANKS[:-1]:
+        found[pair] = part.separations.get(pair, Separation(0, math.nan, math.nan))
+    rest = [one for name, one in part.separations.items() if name not in (*found, "all") and one.pairs]
+    pairs = sum(one.pairs for one in rest)
+    least = min((one.least for one in rest), default=math.nan)
+    return [*found.values(), describe_pairs(pairs, sum(one.pairs * one.mean for one in rest), least)]
 
 
 def _cell(value: Any) -> Any:

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from wavebatch.cli.messages import count, one_line, print_result, talk
-from wavebatch.cli.options import common_options, output_option, strip_options, strips_argument
+from wavebatch.cli.options import (
+    check_html,
+    common_options,
+    html_option,
+    output_option,
+    strip_options,
+    strips_argument,
+)
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
@@ -35,10 +42,19 @@ EXIT_PROBLEMS = 1
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]: adds whether echo widths can give "
               "incidence angles; saved in SYSTEM.toml.")
+@output_option("Write which echo width means which incidence angle on this strip: .csv, or a picture.", "FILE",
+               "--angles", required=False)
+@html_option
 @strip_options
 @common_options("overwrite", "json")
 def survey(
-    strips: tuple[str, ...], output: Path | None, chain_file: Path | None, as_json: bool, **options: Any
+    strips: tuple[str, ...],
+    output: Path | None,
+    chain_file: Path | None,
+    angles: Path | None,
+    html_file: Path | None,
+    as_json: bool,
+    **options: Any,
 ) -> None:
     """Measure noise, pulse and scene of strips, and choose the chain that they need.
 
@@ -63,13 +79,25 @@ def survey(
     for target in (output, chain_file):
         if target is not None:
             check_target(target, overwrite=overwrite)
+    check_html(html_file)
+    if angles is not None:
+        _check_angles(angles, paths, overwrite)
+    options["angles"] = angles
     saved, facts = _survey(paths[0], options) if len(paths) == 1 else _survey_together(paths, options)
     if output is not None:
         write_text(output, format_survey(saved), overwrite=overwrite)
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
-    print_result(as_json, _document(saved, facts), _lines(saved, facts))
-    for target in (output, chain_file):
+    document = _document(saved, facts)
+    if html_file is not None:
+        from wavebatch.tools.html.survey_page import write_survey_page
+
+        reading = {name: options[name] for name in ("direction", "headerless")}
+        failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
+        used = [path for path in paths if str(path) not in failed]
+        write_survey_page(html_file, saved.survey, document, used, **reading)
+    print_result(as_json, document, _lines(saved, facts))
+    for target in (output, chain_file, angles, html_file):
         if target is not None:
             talk(f"{target}: written")
     if facts.get("misfits") or facts.get("failed"):
@@ -95,7 +123,27 @@ def _survey(strip: Path, options: dict[str, Any]) -> tuple[SavedSurvey, dict[str
             "direction": {"sign": scan.vectors.direction, "evidence": scan.vectors.evidence},
         }
         packet_file = opened.facts.packets.file
+        if options["angles"] is not None:
+            _write_angles(options["angles"], opened, found, options["overwrite"])
     return SavedSurvey(found, strip.name, take_fingerprint(strip, packet_file)), facts
+
+
+def _check_angles(target: Path, paths: Sequence[Path], overwrite: bool) -> None:
+    from wavebatch.core.errors import ConfigError
+    from wavebatch.tools.compare.angle_table import check_angles
+
+    if len(paths) > 1:
+        raise ConfigError(f"--angles {target}: is for one strip, because widths depend on the distance of the ground")
+    check_angles(target, overwrite=overwrite)
+
+
+def _write_angles(target: Path, opened: Any, found: Any, overwrite: bool) -> None:
+    from wavebatch.surveying.sensor import SensorRequest, find_sensor
+    from wavebatch.tools.compare.angle_table import write_angles
+
+    distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
+    sizes = {"spacing": found.figures["spacing_ns"], "amplitude": found.figures["amplitude_50"]}
+    write_angles(target, found.system, distance=distance, **sizes, overwrite=overwrite)
 
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:

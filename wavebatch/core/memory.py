@@ -1,6 +1,7 @@
-"""Keeps freed NumPy memory inside the process, because kernels allocate the same few megabytes thousands of times.
+"""Memory and threads of a process.
 
-Called once at the start of each worker process. It changes speed only, never results.
+`keep_freed_memory` is called once at the start of each worker process, because kernels allocate the same few megabytes
+thousands of times. It changes speed only, never results.
 """
 
 from __future__ import annotations
@@ -13,6 +14,10 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
 KEEP = 128 << 20
 """Freed memory that a process may keep [bytes]: the arrays of one block need less."""
+
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
+"""Variables that keep libraries to one thread, in processes that start with them: wavebatch's arrays are too small for
+more, and the last bits of a product depend on how it is shared out."""
 
 
 def keep_freed_memory() -> bool:

@@ -299,14 +299,17 @@ def look_at(blocks: Iterable[WaveformBlock], system: SystemPulse) -> Look | None
     return Look(level, width, steady, float(np.sqrt(max(left, 0.0))))
 
 
-def compare_looks(own: Look, whole: Look, system: SystemPulse) -> str:
-    """Return why a strip does not belong to the flight; empty where it does."""
+def compare_looks(own: Look, whole: Look, system: SystemPulse, wider: float = WIDER) -> str:
+    """Return why a strip does not belong to the flight; empty where it does.
+
+    wider: how much wider than the flight's most echoes may be, as a share of the width.
+    """
     reason = compare_levels(own.level, [whole.level], system.noise_std)
     if reason:
         return reason.strip().replace("the others", "the flight")
     if own.width and whole.width:
         ratio = own.width / whole.width
-        if ratio < 1 - NARROWER or (ratio > 1 + WIDER and own.steady > STEADY):
+        if ratio < 1 - NARROWER or (ratio > 1 + wider and own.steady > STEADY):
             return f"its echoes are {own.width:.2f} ns wide (Gaussian sigma), those of the flight {whole.width:.2f} ns"
         if own.misfit > whole.misfit + SHAPE:
             misfits = f"by {100 * own.misfit:.1f} % of the amplitude, those of the flight by {100 * whole.misfit:.1f} %"

@@ -7,7 +7,7 @@ for its own columns.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,18 +65,25 @@ class ColumnReader(CloudReader):
     """A CloudReader of VALUE_DTYPE for every point of the file; `facts` describes the column.
 
     column: name of an extra dimension or a standard field, or a wavebatch column in the names of any style. If no name
-    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point.
+    fits exactly, case, spaces and underscores are ignored. None: the value is 1 for every point. others: further
+    columns; rows then have a field `others`, f8 (n, number of them), NaN for no data.
     Raises InputError if the file cannot be read, ConfigError if it has no such column.
     """
 
-    def __init__(self, path: Path, column: str | None) -> None:
+    def __init__(self, path: Path, column: str | None, others: Sequence[str] = ()) -> None:
         super().__init__(path)
+        self._dtype = VALUE_DTYPE
+        if others:
+            self._dtype = np.dtype([*VALUE_DTYPE.descr, ("others", "<f8", (len(others),))])
         self.has_flags = "echo_flags" in self._sources
         try:
             self.facts, self._read = self._find(column)
+            found = [self._find(other) for other in others]
         except BaseException:
             self._points.close()
             raise
+        self.other_facts = tuple(facts for facts, _ in found)
+        self._others = tuple(read for _, read in found)
 
     def list_columns(self) -> list[str]:
         """Return the names of all columns of the file."""
@@ -149,9 +156,11 @@ class ColumnReader(CloudReader):
         return values * ANGLE_UNIT if name == "scan_angle" else values
 
     def _convert(self, raw: np.ndarray) -> np.ndarray:
-        rows = np.zeros(len(raw), VALUE_DTYPE)
+        rows = np.zeros(len(raw), self._dtype)
         rows["x"], rows["y"] = self._locate(raw, 0), self._locate(raw, 1)
         rows["value"] = self._read(raw)
+        for place, read in enumerate(self._others):
+            rows["others"][:, place] = read(raw)
         if self.has_flags:
             rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
         return rows

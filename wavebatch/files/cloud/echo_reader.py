@@ -159,6 +159,17 @@ def read_dimension(raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
         return np.where(np.abs(values) <= _LARGEST, values, np.nan)
 
 
+def list_fields(point_format: int) -> tuple[str, ...]:
+    """Return the names of the fields of a point format, with x, y and z in place of their integers."""
+    names = (one.name for one in laspy.PointFormat(point_format).dimensions)
+    return ("x", "y", "z", *(name for name in names if name not in ("X", "Y", "Z")))
+
+
+def read_field(raw: np.ndarray, point_format: int, name: str) -> np.ndarray:
+    """Return the stored values (n,) of a field of raw records, other than x, y and z."""
+    return widen(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
+
+
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
     """Return the extra dimension of each column that the cloud has, by its names alone.
 

@@ -113,6 +113,16 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
     return text, tuple(units)
 
 
+def read_crs_definition(path: Path, header: LasHeader) -> str | None:
+    """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None."""
+    records = _read_records(path, header)
+    text = records.get(WKT_ID, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
+    if text:
+        return text
+    code = _read_code(records.get(GEOTIFF_ID, b""))
+    return None if code is None else code.partition("+")[0]  # heights have no place in a raster
+
+
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}

@@ -23,6 +23,10 @@ from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_dow
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
+from wavebatch.stages.detect.maximum import LEAST_BLUR
+
+INFLECTED = 2.0
+"""Least negative curvature between two inflection points [standard deviations of its noise]."""
 
 
 def _smoothed_width(ref: float) -> float:
@@ -197,7 +201,7 @@ def zero_crossing(
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
     ref = system.sigma_ref / block.spacing
-    blur = max(scale * ref, 0.7)
+    blur = max(scale * ref, LEAST_BLUR)
     if derivative == "first":
         waveform, time = _falls_through_zero(filter_antisymmetric(signal, slope_taps(blur)))
         width = np.full(len(time), ref)
@@ -224,7 +228,7 @@ def _between_inflections(
     curvature: np.ndarray, taps: np.ndarray, noise: Noise, blur: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Waveform, time and width (m,) of the stretches of positive curvature that exceed the noise."""
-    waveform, sample = find_peaks(curvature, np.float32(2.0 * np.sqrt(filter_energy(taps))) * noise.std)
+    waveform, sample = find_peaks(curvature, np.float32(INFLECTED * np.sqrt(filter_energy(taps))) * noise.std)
     zero = np.zeros(len(sample))
     left = walk_down(curvature, waveform, sample, zero, -1)
     right = walk_down(curvature, waveform, sample, zero, 1)

@@ -23,6 +23,9 @@ from wavebatch.stages.detect.candidates import make_table, signal_above
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
 
+LEAST_BLUR = 0.7
+"""Least width of the smoothing before a derivative [samples]."""
+
 BROAD = 4.0
 """Width of the system pulse [samples] from which the smoothing grows with it."""
 
@@ -46,17 +49,8 @@ def maximum(
     ----------
     Wagner et al. (2007), max-detection; smoothing as in docs/algorithms.md 1.1.
     """
-    signal = signal_above(block, noise)
     ref = system.sigma_ref / block.spacing
-    broad = 0.5 * (ref - BROAD) + 1.0 if ref > BROAD else 0.0
-    if broad:
-        taps = gaussian_taps(broad)
-        taps /= taps[0] + 2 * taps[1:].sum()
-        even = smoothed = filter_symmetric(signal, taps)
-        gain = float(np.sqrt(filter_energy(taps)))
-    else:
-        smoothed = smooth_121(signal)
-        even, gain = smooth_121(smoothed), TWICE_SMOOTHED_GAIN
+    smoothed, even, gain, broad = smooth_to_pulse(signal_above(block, noise), ref)
     waveform, sample = find_peaks(even, np.float32(threshold * gain) * noise.std)
     amplitude, time, width = estimate_starts(smoothed, waveform, sample, ref)
     gap = _nearest_gap(waveform, sample)
@@ -67,6 +61,35 @@ def maximum(
         width = np.sqrt(np.maximum(width * width - broad * broad, 0.25 * ref * ref))
         amplitude *= np.hypot(1.0, broad / width)
     return make_table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
+
+
+def smooth_to_pulse(signal: np.ndarray, ref: float) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Smooth waveforms as broadly as the system pulse asks for.
+
+    Parameters
+    ----------
+    signal : float array, shape (s, n)
+        Waveforms above their baselines [count].
+    ref : float
+        Width of the system pulse [samples].
+
+    Returns
+    -------
+    smoothed, even : float array, shape (s, n)
+        Waveforms for the fit of the peak, and those in which maxima are searched.
+    gain : float
+        Standard deviation of unit white noise in `even`.
+    broad : float
+        Width of the Gaussian [samples]; 0 for the short filters.
+    """
+    if ref <= BROAD:
+        smoothed = smooth_121(signal)
+        return smoothed, smooth_121(smoothed), TWICE_SMOOTHED_GAIN, 0.0
+    broad = 0.5 * (ref - BROAD) + 1.0
+    taps = gaussian_taps(broad)
+    taps /= taps[0] + 2 * taps[1:].sum()
+    smoothed = filter_symmetric(signal, taps)
+    return smoothed, smoothed, float(np.sqrt(filter_energy(taps))), broad
 
 
 def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
@@ -137,7 +160,7 @@ def second_derivative(
     signal = signal_above(block, noise)
     smoothed = smooth_121(signal)
     ref = system.sigma_ref / block.spacing
-    taps = curvature_taps(max(scale * ref, 0.7))
+    taps = curvature_taps(max(scale * ref, LEAST_BLUR))
     curvature = filter_symmetric(signal, taps)
     waveform, sample = find_peaks(curvature, np.float32(threshold * np.sqrt(filter_energy(taps))) * noise.std)
     high = smoothed[sample, waveform] > (level * SMOOTH_GAIN) * noise.std[waveform]

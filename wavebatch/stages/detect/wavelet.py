@@ -24,6 +24,9 @@ HAT_WIDTH = 0.75
 COARSEST = 15
 """Level of the B3 transform that spans the longest waveforms."""
 
+BACKGROUND = 3
+"""Added to waveforms for the iteration, which needs positive values [standard deviations of the noise]."""
+
 AT_A_TIME = 1024
 """Waveforms whose arrays stay in the cache together."""
 
@@ -55,18 +58,47 @@ def wavelet(
     """
     ref = system.sigma_ref / block.spacing
     signal = signal_above(block, noise)
-    if wavelet == "b3":
-        level = max(round(scale), 1) if scale > 0 else b3_level(ref)
-        if level > COARSEST:
-            raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
-        detail, gain = b3_detail(signal, level), b3_gain(level)
-    else:
-        taps = curvature_taps(max(scale / block.spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
-        detail, gain = filter_symmetric(signal, taps), float(np.sqrt(filter_energy(taps)))
+    detail, gain = transform(signal, ref, wavelet, scale, block.spacing)
     waveform, sample = find_peaks(detail, np.float32(threshold * gain) * noise.std)
     time, _ = refine_peaks(detail, waveform, sample)
     amplitude = smooth_121(signal)[sample, waveform]
     return candidate_table(block, system, waveform, time, amplitude)
+
+
+def transform(signal: np.ndarray, ref: float, wavelet: str, scale: float, spacing: float) -> tuple[np.ndarray, float]:
+    """Transform waveforms at one scale.
+
+    Parameters
+    ----------
+    signal : float array, shape (s, n)
+        Waveforms above their baselines [count].
+    ref : float
+        Width of the system pulse [samples].
+    wavelet : {"b3", "mexican_hat"}
+    scale : float
+        As for stage detect.wavelet.
+    spacing : float
+        Of the samples [ns].
+
+    Returns
+    -------
+    detail : float array, shape (s, n)
+        Coefficients.
+    gain : float
+        Standard deviation of unit white noise in them.
+
+    Raises
+    ------
+    ConfigError
+        For a level of the B3 transform that is too coarse.
+    """
+    if wavelet != "b3":
+        taps = curvature_taps(max(scale / spacing if scale > 0 else HAT_WIDTH * ref, 0.5))
+        return filter_symmetric(signal, taps), float(np.sqrt(filter_energy(taps)))
+    level = max(round(scale), 1) if scale > 0 else b3_level(ref)
+    if level > COARSEST:
+        raise ConfigError(f"scale is the level of the b3 wavelet, at most {COARSEST}, it is {scale:g}")
+    return b3_detail(signal, level), b3_gain(level)
 
 
 @stage("detect")
@@ -104,15 +136,22 @@ def richardson_lucy(
     signal = signal_above(block, noise)
     busy = np.flatnonzero((smooth_121(signal) > np.float32(2.0 * SMOOTH_GAIN) * noise.std).any(axis=0))
     least = threshold / np.sqrt(np.sum(given.taps**2))
-    half = max(int(round(system.sigma_ref / block.spacing)), 1)
+    half = spike_reach(system.sigma_ref / block.spacing)
     found = [(busy[:0], np.empty(0), np.empty(0))]
     for begin in range(0, len(busy), AT_A_TIME):
         rows = busy[begin : begin + AT_A_TIME]
         std = noise.std[rows]
-        profile = deconvolve_richardson_lucy(np.ascontiguousarray(signal[:, rows]), given.taps, 3 * std, iterations)
+        profile = deconvolve_richardson_lucy(
+            np.ascontiguousarray(signal[:, rows]), given.taps, BACKGROUND * std, iterations
+        )
         waveform, time, amplitude = _find_spikes(profile, half, np.float32(least) * std)
         found.append((rows[waveform], time + (given.peak - given.middle), amplitude))
     return candidate_table(block, system, *(np.concatenate(fields) for fields in zip(*found, strict=True)))
+
+
+def spike_reach(ref: float) -> int:
+    """Return how many samples a spike reaches to each side, for a system pulse of width `ref` [samples]."""
+    return max(int(round(ref)), 1)
 
 
 def _find_spikes(profile: np.ndarray, half: int, least: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

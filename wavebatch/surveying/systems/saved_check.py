@@ -2,7 +2,7 @@
 
 All commands with `--system` call `check_saved`. It measures what `flight` holds strips of a flight against, except the
 level, which the noise stage finds for every waveform. Before you change it: slopes and forest widen echoes, so a strip
-of the same sensor must never be refused for its scene.
+of the same sensor must never be refused for its scene. All echoes of a hillside are wider by the same: that is a doubt.
 """
 
 from __future__ import annotations
@@ -70,15 +70,16 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
     Returns
     -------
     str
-        The contradiction, with `force`; else empty.
+        The contradiction, with `force`, or a doubt: echoes that are wider by less than LARGEST_WIDTH, as on a hillside.
+        Else empty.
 
     Raises
     ------
     InputError
         Where bits, spacing, noise or width of the strip contradict the survey.
     """
-    reason = "" if survey is None else find_contradiction(reader, scan, survey)
-    if reason and not force:
+    reason, sure = ("", False) if survey is None else find_contradiction(reader, scan, survey)
+    if sure and not force:
         raise InputError(
             f"{reader.facts.path}: the survey given by --system is not of this sensor: {reason}; leave --system out to "
             "survey the strip, or use it all the same with --force"
@@ -86,8 +87,8 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
     return reason
 
 
-def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> str:
-    """Return what contradicts the survey in a strip; empty where nothing does, or where too little is there to see.
+def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> tuple[str, bool]:
+    """Return what contradicts the survey in a strip.
 
     Parameters
     ----------
@@ -97,11 +98,14 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
 
     Returns
     -------
-    str
+    reason : str
+        Empty where nothing does, or where too little is there to see.
+    sure : bool
+        No scene of the survey's sensor looks so.
     """
     blocks = tuple(reader.sample_blocks(scan, min(HELD, sample_size(reader, scan))))
     if not blocks:
-        return ""
+        return "", False
     figures = survey.figures
     forms = {(float(block.digitizer.bits), float(block.spacing)) for block in blocks}
     if "flight_width" in figures:
@@ -110,14 +114,17 @@ def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> 
     else:
         known = {(figures["bits"], figures["spacing_ns"])} if {"bits", "spacing_ns"} <= figures.keys() else forms
     if not forms & known:
-        return f"its samples have {_in_words(forms)}, those of the survey {_in_words(known)}"
+        return f"its samples have {_in_words(forms)}, those of the survey {_in_words(known)}", True
     look = look_at(blocks, survey.system)
     if look is None:
-        return ""
+        return "", False
     if "flight_width" not in figures:
-        return _compare_system(look, survey)
+        reason = _compare_system(look, survey)
+        return reason, bool(reason)
     look = replace(look, level=look.level._replace(mean=whole.level.mean))
-    return compare_looks(look, whole, survey.system).replace("the flight", "the survey")
+    surely = compare_looks(look, whole, survey.system, wider=LARGEST_WIDTH - 1)
+    reason = surely or compare_looks(look, whole, survey.system)
+    return reason.replace("the flight", "the survey"), bool(surely)
 
 
 def _in_words(forms: set[Form]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.bench.figures import find_front
+from wavebatch.tools.plots.labels import place_labels
 
 NO_PLOT = "no plot without matplotlib: pip install 'wavebatch[plot]'"
 
@@ -22,12 +23,6 @@ PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),
     ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
 )
-
-PLACES = (
-    *((6, 5), (6, -5), (-6, 5), (-6, -5), (0, 8), (0, -8)),
-    *((6, 16), (6, -16), (-6, 16), (-6, -16), (0, 20), (0, -20)),
-)
-"""Places of a label relative to its point [points], the best first."""
 
 
 def can_plot() -> bool:
@@ -47,7 +42,7 @@ def plot_scene(section: Mapping[str, Any], target: Path) -> None:
         # The panels must have their final size before labels can be placed.
         figure.draw_without_rendering()
         for axes, names in zip(panels, labels, strict=True):
-            _place_labels(axes, names)
+            place_labels(axes, names, keep=True)
 
 
 def _draw_panel(
@@ -84,43 +79,3 @@ def _draw_panel(
     axes.set_ylim(bottom=0)
     axes.legend()
     return labels
-
-
-def _place_labels(axes: Any, labels: list[tuple[str, float, float]]) -> None:
-    """Writes each label next to its point, at the first place where it covers no point and no other label."""
-    from matplotlib.transforms import Bbox
-
-    legend = axes.get_legend()
-    taken = [legend.get_window_extent()] if legend else []
-    dot = 4 * axes.figure.dpi / 72
-    for _, x, y in labels:
-        x, y = axes.transData.transform((x, y))
-        taken.append(Bbox.from_extents(x - dot, y - dot, x + dot, y + dot))
-    frame = axes.get_window_extent()
-    for text, x, y in labels:
-        note = axes.annotate(text, (x, y), textcoords="offset points", xytext=(6, 5))
-        best = None
-        for place in PLACES:
-            _move(note, place)
-            box = note.get_window_extent()
-            covered = sum(_overlap(box, other) for other in taken)
-            covered += box.width * box.height - _overlap(box, frame)
-            if best is None or covered < best[0]:
-                best = covered, place
-            if not covered:
-                break
-        _move(note, best[1])
-        taken.append(note.get_window_extent())
-
-
-def _move(note: Any, place: tuple[float, float]) -> None:
-    """Puts a label at an offset [points] from its point, on the side to which the offset goes."""
-    note.set_position(place)
-    note.set_ha("left" if place[0] > 0 else "right" if place[0] < 0 else "center")
-    note.set_va("bottom" if place[1] > 0 else "top" if place[1] < 0 else "center")
-
-
-def _overlap(a: Any, b: Any) -> float:
-    """Area that two boxes share [pixels]."""
-    both = a.intersection(a, b)
-    return both.width * both.height if both else 0.0

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.core.errors import StageError
+from wavebatch.core.memory import ONE_THREAD
 from wavebatch.files.disk.closing import Closing
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS")
 _START = "from wavebatch.tools.bench.worker import serve; serve()"
 
 

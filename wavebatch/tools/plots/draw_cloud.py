@@ -7,58 +7,88 @@ files are those of `files.figure_file`; the same data give the same bytes.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.histogram import PERCENTILES, FlagCounts, Histogram
+from wavebatch.tools.plots.labels import fit_parts, fit_text
 from wavebatch.tools.plots.raster import Raster
 from wavebatch.tools.plots.values import Tally
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8a8a8a")
 """Colours of Okabe and Ito, which colour-blind readers can distinguish; more than eight series repeat them."""
+
+_NARROW = 4.0
+"""Maps so many times as high as wide have a place of its own for the scale of colours: it would shrink with them."""
 
 _LONG = 8.0
 """Longer side of a map [inches]."""
 
 
-def draw_histogram(found: Histogram, target: Path, *, log: bool = False, overwrite: bool = False) -> None:
-    """Writes a picture of a histogram; log: logarithmic axis of counts. Raises as figure_file.open_picture does."""
-    with open_picture(target, (8.0, 4.8), overwrite=overwrite) as figure:
-        axes = figure.subplots()
-        for series, counts in enumerate(found.counts):
-            _draw_series(axes, found, series, counts)
-        if log:
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter(lambda value, _: _count_text(value))
-        else:
-            axes.yaxis.set_major_formatter(lambda value, _: _count_text(value) if value == round(value) else "")
-            axes.set_ylim(bottom=0)
-        axes.ticklabel_format(axis="x", useOffset=False)
-        axes.set_xlim(found.edges[0], found.edges[-1])
-        axes.set_xlabel(plain_text(found.facts.label, 110))
-        unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
-        axes.set_ylabel(f"values per bin of {found.edges[1] - found.edges[0]:.4g}{unit} [-]")
-        axes.set_title(_title(found.names, found.total, found.facts.name, int(found.below.sum() + found.above.sum())))
-        axes.legend()
+def draw_histograms(
+    every: Sequence[Histogram], target: Path, *, log: bool = False, counts: bool = False, overwrite: bool = False
+) -> None:
+    """Writes a picture of histograms, one below the other, each with an axis of its own unit.
+
+    Several series in one histogram are drawn as shares of their values, so that small and large ones can be compared.
+    counts: as numbers of values all the same. log: logarithmic axis of counts. Raises as figure_file.open_picture does.
+    """
+    lines = sum(len(found.names) + (len(found.names) == 1) for found in every)
+    with open_picture(target, (8.0, 3.9 * len(every) + 0.3 + 0.2 * lines), overwrite=overwrite) as figure:
+        panels = figure.subplots(len(every), 1, squeeze=False)[:, 0]
+        for axes, found in zip(panels, every, strict=True):
+            _draw_histogram(axes, found, log=log, counts=counts or len(found.names) == 1)
 
 
-def _draw_series(axes: Axes, found: Histogram, series: int, counts: np.ndarray) -> None:
+def _draw_histogram(axes: Axes, found: Histogram, *, log: bool, counts: bool) -> None:
+    figure = axes.figure
+    for series in range(len(found.counts)):
+        _draw_series(axes, found, series, counts)
+    text = _count_text if counts else _share_text
+    if log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: text(value))
+    else:
+        whole = counts
+        axes.yaxis.set_major_formatter(lambda value, _: text(value) if not whole or value == round(value) else "")
+        axes.set_ylim(bottom=0)
+    axes.ticklabel_format(axis="x", useOffset=False)
+    axes.set_xlim(found.edges[0], found.edges[-1])
+    axes.set_xlabel(fit_text(figure, plain_text(found.facts.label, 300), 7.0, size=9.5))
+    width = f"{found.edges[1] - found.edges[0]:.4g}{_unit_text(found)}"
+    axes.set_ylabel(f"{'values' if counts else 'share of the series'} per bin of {width} [{'-' if counts else '%'}]")
+    outside = {"below the picture": int(found.below.sum()), "above the picture": int(found.above.sum())}
+    axes.set_title(fit_text(figure, _title(found.clouds, found.total, found.facts.name, outside), 7.1, size=10.5))
+    # Below the axes, where it covers no line.
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), borderaxespad=0.0, fontsize=8.0)
+
+
+def _unit_text(found: Histogram) -> str:
+    return "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
+
+
+def _draw_series(axes: Axes, found: Histogram, series: int, as_counts: bool) -> None:
     color = SERIES[series % len(SERIES)]
+    style = "-" if series < len(SERIES) else (0, (3, 1))
     low_end, middle, high_end = found.percentiles[series]
     alone = len(found.counts) == 1
-    label = f"{plain_text(found.names[series], 40)}: " if not alone else ""
+    number = int(found.values[series])
+    counts = found.counts[series] if as_counts else found.counts[series] * (100.0 / max(number, 1))
     if alone:
         axes.stairs(counts, found.edges, fill=True, color=color, alpha=0.35)
-    unit = "" if found.facts.unit == "-" else f" {plain_text(found.facts.unit)}"
+    unit = _unit_text(found)
     low, median, high = (_value_text(value, found.edges) for value in found.percentiles[series])
-    text = f"{label}{found.tallies[series].values:,} values, median {median}{unit}"
-    axes.stairs(counts, found.edges, color=color, linewidth=1.2, label=text)
+    label = "" if alone else fit_text(axes.figure, f"{plain_text(found.names[series], 200)}: ", 3.6, size=8.0)
+    text = f"{label}{number:,} values, mean {_value_text(found.means[series], found.edges)}, median {median}{unit}"
+    axes.stairs(counts, found.edges, color=color, linewidth=1.2, linestyle=style, label=text)
     if math.isnan(middle):
         return
     axes.axvline(middle, color="#222222" if alone else color, linewidth=1.2, linestyle=(0, (5, 2)))
@@ -96,8 +126,10 @@ def draw_flags(
         axes.set_xlim(0, max(int(counts.max(initial=1)), 1) * (10.0 if log else 1.25))
         axes.xaxis.set_major_formatter(lambda value, _: _count_text(value))
         axes.set_xlabel("points [-]")
-        name = _name_clouds(names)
-        axes.set_title(f"{name}   {found.facts.name}\n{found.total.values:,} points; a point may have several flags")
+        name = name_clouds(names)
+        title = f"{name}   {plain_text(found.facts.name, 40)}\n"
+        title += f"{found.total.values:,} points; a point may have several flags"
+        axes.set_title(fit_text(figure, title, 6.0, size=10.5))
 
 
 def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: bool = False) -> None:
@@ -106,32 +138,57 @@ def draw_map(found: Raster, target: Path, *, names: tuple[str, ...], overwrite: 
     ratio = grid.rows / grid.columns
     width, height = _LONG / max(ratio, 1.0), _LONG * min(ratio, 1.0)
     flat = ratio < 0.5
-    size = (max(width + (1.2 if flat else 2.4), 6.0), max(height + (2.6 if flat else 1.5), 3.0))
+    size = (max(width + (1.2 if flat else 2.4), 5.0), max(height + (2.6 if flat else 1.8), 3.4))
     # At least as many pixels as cells, or the picture would skip some cells.
     dpi = float(np.clip(1.25 * max(grid.columns, grid.rows) / _LONG, 150, 400))
     with open_picture(target, size, overwrite=overwrite, dpi=dpi) as figure:
-        title = _title(names, found.total, found.facts.name, found.outside)
-        figure.suptitle(f"{title}\n{found.statistic} in cells of {grid.size:g} m", x=0.01, ha="left", fontsize=10.5)
-        axes = figure.subplots()
+        narrow = ratio > _NARROW
+        if not narrow:
+            # Axes with equal scales do not fill their places; this layout brings the colour bar next to them.
+            figure.set_layout_engine("compressed")
+        figure.suptitle(_map_title(figure, found, names, size[0] - 0.2), x=0.01, ha="left", fontsize=10.5)
+        axes, place = figure.subplots(1, 2, width_ratios=(1, 0.05)) if narrow else (figure.subplots(), None)
         axes.grid(visible=False)
+        axes.set_anchor("E" if narrow else "C")
         axes.set_facecolor("#f2f2f2")
-        low, high = found.shown if found.shown[1] > found.shown[0] else (found.shown[0] - 0.5, found.shown[0] + 0.5)
         shown = axes.imshow(
-            found.values.astype(np.float32), extent=grid.extent, origin="lower", cmap="viridis", vmin=low, vmax=high,
+            found.values.astype(np.float32), extent=grid.extent, origin="lower", cmap="viridis",
             interpolation="nearest", interpolation_stage="data", aspect="equal",
         )  # fmt: skip
-        known = found.values[np.isfinite(found.values)]
-        ends = (known.min(initial=low) < low) + 2 * (known.max(initial=high) > high)
-        bar = figure.colorbar(
-            shown, ax=axes, extend=("neither", "min", "max", "both")[ends], extendfrac=0.03,
-            orientation="horizontal" if flat else "vertical", **({"aspect": 40} if flat else {"pad": 0.02}),
-        )  # fmt: skip
-        bar.set_label(plain_text(found.label, 90))
-        bar.outline.set_visible(False)
-        _place_ticks(axes, width, height)
+        length = width if flat else height
+        add_colorbar(axes, shown, found.values, found.shown, found.label, length=length, flat=flat, place=place)
+        _place_ticks(axes, width, height, found.unit)
 
 
-def _place_ticks(axes: Axes, width: float, height: float) -> None:
+def _map_title(figure: Figure, found: Raster, names: tuple[str, ...], inches: float) -> str:
+    where = f"{found.statistic} in cells of {found.grid.size:g} {found.unit}"
+    title = _title(names, found.total, found.facts.name, {"outside the map": found.outside})
+    parts = [part for line in (*title.split("\n"), where) for part in line.split("   ")]
+    return fit_parts(figure, [*parts, f"CRS: {plain_text(found.crs, 90) or 'not given'}"], inches, size=10.5)
+
+
+def add_colorbar(
+    axes: Axes, shown: Any, values: np.ndarray, limits: tuple[float, float], label: str, *, length: float, flat: bool,
+    place: Axes | None = None,
+) -> None:  # fmt: skip
+    """Scales the colours to the limits and adds their scale, of a length [inches], below the axes if flat, or in place.
+
+    Arrows at its ends show that some values lie beyond.
+    """
+    low, high = limits if limits[1] > limits[0] else (limits[0] - 0.5, limits[0] + 0.5)
+    shown.set_clim(low, high)
+    known = values[np.isfinite(values)]
+    ends = (known.min(initial=low) < low) + 2 * (known.max(initial=high) > high)
+    shape = {"aspect": 40} if flat else {} if place else {"pad": 0.02}
+    bar = axes.figure.colorbar(
+        shown, ax=None if place else axes, cax=place, extend=("neither", "min", "max", "both")[ends], extendfrac=0.03,
+        orientation="horizontal" if flat else "vertical", **shape,
+    )  # fmt: skip
+    bar.set_label(fit_text(axes.figure, plain_text(label, 300), max(length, 2.0), size=9.5))
+    bar.outline.set_visible(False)
+
+
+def _place_ticks(axes: Axes, width: float, height: float, unit: str) -> None:
     """Places as many coordinates on the axes as fit; width, height: of the map [inches]."""
     narrow = width < 2.0
     for axis, length, each in ((axes.xaxis, width, 0.4 if narrow else 1.2), (axes.yaxis, height, 0.5)):
@@ -142,20 +199,24 @@ def _place_ticks(axes: Axes, width: float, height: float) -> None:
         axis.set_major_formatter(lambda value, _: f"{value:.10g}")
     if narrow:
         axes.tick_params(axis="x", labelrotation=90)
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
+    axes.set_xlabel(f"x [{unit}]")
+    axes.set_ylabel(f"y [{unit}]")
 
 
-def _title(names: tuple[str, ...], total: Tally, column: str, outside: int) -> str:
+def _title(names: tuple[str, ...], total: Tally, column: str, outside: Mapping[str, int]) -> str:
     """Title: clouds, column, number of values, and points that are not shown, with the reason."""
-    rest = {"without data": total.no_data, "left out by flags": total.left_out, "outside the picture": outside}
+    rest = {"without data": total.no_data, "left out": total.left_out, **outside}
     parts = [f"{total.values:,} values", *(f"{number:,} {text}" for text, number in rest.items() if number)]
-    return f"{_name_clouds(names)}   {plain_text(column, 40)}\n{', '.join(parts)}"
+    return f"{name_clouds(names)}   {plain_text(column, 60)}\n{', '.join(parts)}"
 
 
-def _name_clouds(names: tuple[str, ...]) -> str:
+def name_clouds(names: tuple[str, ...]) -> str:
     return plain_text(names[0], 60) if len(names) == 1 else f"{len(names)} clouds"
 
 
 def _count_text(value: float) -> str:
     return f"{value:,.0f}" if value >= 1 or value == 0 else f"{value:g}"
+
+
+def _share_text(value: float) -> str:
+    return f"{value:g}"

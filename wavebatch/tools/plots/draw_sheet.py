@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.draw_waveform import CLIPPED, ECHO, FIT, GREY, INK, PULSE, VENDOR, shade_gaps
+from wavebatch.tools.plots.labels import fit_parts, fit_text
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -27,12 +27,6 @@ SHARE = 0.28
 
 RESIDUAL = 4.0
 """Half the height of every residual panel [noise std]; larger residuals are drawn at its edge in red."""
-
-BEFORE, AFTER = 4.0, 8.0
-"""What is shown before the first and after the last echo [widths of the widest echo]."""
-
-VISIBLE = 5.0
-"""Samples this far above the baseline are always shown [noise std]."""
 
 QUIET_FLAGS = EchoFlag.OVERLAPPED | EchoFlag.WEAK
 """Flags that are too common to be named."""
@@ -58,8 +52,9 @@ def draw_sheet(
     with open_picture(target, size, overwrite=overwrite) as figure:
         # A layout for 200 axes takes a minute; a grid needs none.
         figure.set_layout_engine("none")
-        title = f"{plain_text(strip)}   {plain_text(chain, 40)}   {len(views)} waveforms"
-        figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=11, weight="bold")
+        parts = (plain_text(strip), plain_text(chain, 200), f"{len(views)} waveforms")
+        title = fit_text(figure, "   ".join(parts), size[0] - 0.2, size=10, weight="bold")
+        figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=10, weight="bold")
         for number, view in enumerate(views):
             row, column = divmod(number, columns)
             left = (column * CELL[0] + 0.3) / size[0]
@@ -69,6 +64,7 @@ def draw_sheet(
             "dots: samples (triangles: saturated); dark line: fit; light: single echoes; diamonds: echoes; dashed: "
             f"returns of the file; below: residual, -{RESIDUAL:g} to {RESIDUAL:g} noise std; time in ns"
         )
+        legend = fit_parts(figure, legend.split("; "), size[0] - 0.2, size=7)
         figure.text(0.1 / size[0], 0.06 / size[1], legend, va="bottom", fontsize=7, color=GREY)
 
 
@@ -78,7 +74,7 @@ def _draw_cell(
     left, bottom, width, height = place
     upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
     lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
-    low, high = times or _find_span(view)
+    low, high = times or view.span
     _draw_signal(upper, view, low, high)
     _draw_residual(lower, view)
     upper.set_xlim(low, high)
@@ -87,19 +83,8 @@ def _draw_cell(
         axes.grid(False)
     upper.tick_params(labelbottom=False)
     lower.set_yticks([])
-    upper.set_title(_title(view), fontsize=6.5, pad=2)
-
-
-def _find_span(view: WaveformView) -> tuple[float, float]:
-    """The part that holds all echoes, returns and visible samples."""
-    seen = view.time[view.samples > view.baseline + VISIBLE * view.std]
-    marks = np.concatenate([view.echoes.time, view.returns, seen])
-    end = float(view.time[-1])
-    if not len(marks):
-        return 0.0, max(end, 1.0)
-    sigma = float(view.echoes.sigma.max()) if len(view.echoes) else 2 * view.spacing
-    low = max(float(marks.min()) - BEFORE * FWHM_PER_SIGMA * sigma, -0.5 * view.spacing)
-    return low, max(min(float(marks.max()) + AFTER * sigma, end + 0.5 * view.spacing), low + 1.0)
+    title = fit_text(figure, _title(view), CELL[0] - 0.45, size=6.5)
+    upper.set_title(title, fontsize=6.5, pad=2)
 
 
 def _draw_signal(axes: Axes, view: WaveformView, low: float, high: float) -> None:
@@ -137,4 +122,4 @@ def _title(view: WaveformView) -> str:
     strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
     flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
     names = ", ".join(flag.name for flag in flags)
-    return f"{name}   {strongest}" + (f"\n{names[:38]}" if names else "")
+    return f"{name}   {strongest}" + (f"\n{names}" if names else "")

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.kernels.signal.runs import find_stretches
+from wavebatch.tools.plots.detector_signals import DetectorSignal
+from wavebatch.tools.plots.echo_table import list_echoes, name_flags
+from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels
 from wavebatch.tools.plots.waveform import WaveformView
 
 if TYPE_CHECKING:
@@ -29,12 +30,12 @@ INK, GREY = "#222222", "#8a8a8a"
 FIT, PULSE, ECHO, VENDOR, CLIPPED = "#0072b2", "#56b4e9", "#d55e00", "#009e73", "#e69f00"
 """Colours of Okabe and Ito, which colour-blind readers can distinguish."""
 
-_MOST_LISTED = 12
-"""Most echoes in the table below a single waveform."""
 _MANY = 150
 """Waveforms with more samples get smaller dots."""
 _LEAST_SCALE = 5.0
 """Least half height of a residual panel [noise std]: pure noise then looks small."""
+_ERROR_ROOM = 0.5
+"""Error bars may widen the signal panel by this share of the signal on each side; longer ones are cut."""
 _DASHED = (0, (4, 2))
 
 
@@ -45,67 +46,90 @@ def draw_waveforms(
     strip: str,
     chain: str,
     times: tuple[float, float] | None = None,
+    table: bool = False,
     overwrite: bool = False,
 ) -> None:
     """Writes a picture of one waveform, or of several as small multiples.
 
-    strip, chain: names for the title. times: part to show [ns]. Raises as figure_file.open_picture does.
+    strip, chain: for the title. times: part to show [ns]; None: each waveform's part with signal. table: list the
+    echoes below; those of a single waveform always are. Raises as figure_file.open_picture does.
     """
     columns = len(views) if len(views) <= 3 else math.ceil(math.sqrt(len(views)))
     rows = -(-len(views) // columns)
-    table = _list_echoes(views[0]) if len(views) == 1 else ""
-    # The table of a single waveform gets a row as high as its lines.
-    below = 0.15 * (table.count("\n") + 1) if table else 0.0
-    size = (9.0, 5.4 + below) if table else (max(4.3 * columns, 7.5), 3.3 * rows + 0.8)
-    with open_picture(target, size, overwrite=overwrite) as figure:
-        figure.suptitle(f"{plain_text(strip)}   {plain_text(chain, 40)}", x=0.01, ha="left", fontsize=11, weight="bold")
-        heights = [size[1] - below - 0.9, below] if table else [1.0] * rows
-        outer = figure.add_gridspec(len(heights), columns, height_ratios=heights)
+    small = len(views) > 1
+    text = list_echoes(views) if table or not small else ""
+    seen = any(view.seen is not None for view in views)
+    width = max(4.3 * columns, 7.5) if small else 9.0
+    height = (3.3 + 1.2 * seen) * rows + 0.8 if small else 5.4 + 1.4 * seen
+    # The table gets a row as high as its lines.
+    below = 0.155 * (text.count("\n") + 1) if text else 0.0
+    width = max(width, 0.0665 * max(map(len, text.split("\n"))) + 0.4) if text else width
+    with open_picture(target, (width, height + below), overwrite=overwrite) as figure:
+        title = fit_parts(figure, (plain_text(strip), plain_text(chain, 300)), width - 0.2, size=11, weight="bold")
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+        outer = figure.add_gridspec(2, 1, height_ratios=(height - 0.9, below)) if text else figure.add_gridspec(1, 1)
+        inner = outer[0].subgridspec(rows, columns)
+        panels = []
         for number, view in enumerate(views):
-            upper, lower = _draw_panels(figure, outer[number], view, times, small=not table)
-            if number % columns == 0:
-                upper.set_ylabel("signal [DN]")
-                lower.set_ylabel("residual\n[noise std]")
-            if number + columns >= len(views):
-                lower.set_xlabel("time after the first sample [ns]")
-        if table:
+            room = (width - 0.8) / columns - 0.5
+            panel = _draw_panels(figure, inner[number], view, times or view.span, small=small, room=room)
+            _label_axes(panel, view, left=number % columns == 0, bottom=number + columns >= len(views))
+            panels.append(panel[0])
+        if text:
             axes = figure.add_subplot(outer[1])
             axes.set_axis_off()
-            text = axes.text(0.0, 1.0, table, va="top", family="monospace", fontsize=8, linespacing=1.3)
-            text.set_in_layout(False)
-        _place_legend(figure, views)
+            note = axes.text(0.0, 1.0, text, va="top", family="monospace", fontsize=8, linespacing=1.3)
+            note.set_in_layout(False)
+        _place_legend(figure, views, width)
+        # The panels must have their final size before labels can be placed.
+        figure.draw_without_rendering()
+        for axes, view in zip(panels, views, strict=True):
+            _number_echoes(axes, view, small=small)
+
+
+def _label_axes(panel: Sequence[Axes], view: WaveformView, *, left: bool, bottom: bool) -> None:
+    if left:
+        panel[0].set_ylabel("signal [DN]")
+        panel[-1].set_ylabel("residual\n[noise std]")
+        if view.seen is not None:
+            panel[1].set_ylabel(view.seen.label.replace(" [", "\n["))
+    if bottom:
+        panel[-1].set_xlabel("time after the first sample [ns]")
 
 
 def _draw_panels(
-    figure: Figure, place: SubplotSpec, view: WaveformView, times: tuple[float, float] | None, *, small: bool
-) -> tuple[Axes, Axes]:
-    """Draws signal and residual, one above the other."""
-    inner = place.subgridspec(2, 1, height_ratios=(3, 1), hspace=0.04)
-    upper = figure.add_subplot(inner[0])
-    lower = figure.add_subplot(inner[1], sharex=upper)
-    _draw_signal(upper, view, small=small)
-    _draw_residual(lower, view)
-    upper.set_title(_title(view, short=small))
-    lower.set_xlim(times or (-0.5 * view.spacing, view.time[-1] + 0.5 * view.spacing))
-    _fit_height(upper, view, times or (-math.inf, math.inf))
-    return upper, lower
+    figure: Figure, place: SubplotSpec, view: WaveformView, times: tuple[float, float], *, small: bool, room: float
+) -> list[Axes]:
+    """Draws signal, what the detector saw, and residual, one below the other; room: for the title [inches]."""
+    heights = (3, 1) if view.seen is None else (3, 1.5, 1)
+    inner = place.subgridspec(len(heights), 1, height_ratios=heights, hspace=0.04)
+    panels = [figure.add_subplot(inner[0])]
+    panels += [figure.add_subplot(inner[row], sharex=panels[0]) for row in range(1, len(heights))]
+    _draw_signal(panels[0], view, times, small=small)
+    if view.seen is not None:
+        draw_detector(panels[1], view.seen, times, small=small)
+    _draw_residual(panels[-1], view, times)
+    panels[0].set_title(fit_text(figure, _title(view, times, short=small), room, size=9 if small else 10.5),
+                        fontsize=9 if small else 10.5)  # fmt: skip
+    panels[-1].set_xlim(times)
+    return panels
 
 
-def _title(view: WaveformView, *, short: bool) -> str:
+def _title(view: WaveformView, times: tuple[float, float], *, short: bool) -> str:
+    """Which waveform it is, which part of it is shown, what the detector is, and the flags of each echo."""
     parts = [f"packet {view.packet}"] if view.packet >= 0 else []
-    parts += [f"point {view.point}", f"GPS time {view.gps_time:.6f} s"]
-    names = _name_flags(int(np.bitwise_or.reduce(view.echoes.flags, initial=0)))
-    lines = textwrap.wrap(names or "no flags", 46 if short else 100)
-    if short and len(lines) > 1:
-        lines = [lines[0] + " ..."]
-    return "\n".join(["   ".join(parts[:2] if short else parts), *lines])
+    parts += [f"point {view.point}"] + ([] if short else [f"GPS time {view.gps_time:.6f} s"])
+    if view.span_is_cut(times):
+        parts.append(f"{max(times[0], 0):.0f} to {min(times[1], view.time[-1]):.0f} of {view.time[-1]:.0f} ns")
+    lines = ["   ".join(parts)]
+    if view.seen is not None:
+        lines.append(view.seen.stage)
+    flags = [(row, name_flags(int(bits))) for row, bits in enumerate(view.echoes.flags, 1) if bits]
+    lines.append("   ".join(f"{row}: {names}" for row, names in flags) or "no flags")
+    return "\n".join(lines)
 
 
-def _name_flags(flags: int) -> str:
-    return ", ".join(flag.name for flag in EchoFlag(flags))
-
-
-def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
+def _draw_signal(axes: Axes, view: WaveformView, times: tuple[float, float], *, small: bool) -> None:
     axes.tick_params(labelbottom=False)
     axes.axhspan(view.baseline - view.std, view.baseline + view.std, color="#e6e6e6", zorder=0)
     axes.axhline(view.baseline, color=GREY, linewidth=0.8, zorder=1)
@@ -125,7 +149,8 @@ def _draw_signal(axes: Axes, view: WaveformView, *, small: bool) -> None:
     )  # fmt: skip
     for place in view.returns:
         axes.axvline(place, color=VENDOR, linewidth=1.0, linestyle=_DASHED, zorder=1)
-    _draw_echoes(axes, view, small=small)
+    low, high = _fit_height(axes, view, times)
+    _draw_errors(axes, view, times, (low, high))
 
 
 def shade_gaps(axes: Axes, view: WaveformView) -> None:
@@ -136,24 +161,68 @@ def shade_gaps(axes: Axes, view: WaveformView) -> None:
         axes.axvspan(low, high, facecolor="none", edgecolor="#cccccc", hatch="//", linewidth=0.0, zorder=0)
 
 
-def _draw_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
-    echoes = view.echoes
-    if not len(echoes):
-        return
-    peak = np.interp(echoes.time, view.time, view.level) + echoes.amplitude.astype(np.float64)
-    across, up = (np.nan_to_num(error.astype(np.float64)) for error in (echoes.time_err, echoes.amplitude_err))
-    axes.errorbar(
-        echoes.time, peak, xerr=across, yerr=up, fmt="D", markersize=4, markerfacecolor="none", color=ECHO,
-        elinewidth=1.2, capsize=2, zorder=4,
-    )  # fmt: skip
-    for number, (time, height) in enumerate(zip(echoes.time, peak, strict=True), 1):
-        axes.annotate(
-            str(number), (time, height), xytext=(6, 2), textcoords="offset points", ha="left", va="bottom",
-            color=ECHO, fontsize=7.5 if small else 9, weight="bold", annotation_clip=True,
-        )  # fmt: skip
+def _peaks(view: WaveformView) -> np.ndarray:
+    """Heights of the echoes in the signal panel [DN], f8 (k,)."""
+    level = np.interp(view.echoes.time, view.time, view.level)
+    return level + view.echoes.amplitude.astype(np.float64)
 
 
-def _draw_residual(axes: Axes, view: WaveformView) -> None:
+def _draw_errors(
+    axes: Axes, view: WaveformView, times: tuple[float, float], heights: tuple[float, float]
+) -> None:
+    """Draws the echoes with error bars; a bar that would leave the panel ends at its edge with an arrowhead."""
+    time, peak = view.echoes.time.astype(np.float64), _peaks(view)
+    shown = (time >= times[0]) & (time <= times[1])
+    axes.plot(time[shown], peak[shown], "D", markersize=4, markerfacecolor="none", color=ECHO, zorder=4)
+    errors = [np.nan_to_num(error.astype(np.float64)) for error in (view.echoes.time_err, view.echoes.amplitude_err)]
+    for place, fixed, error, (low, high), heads in (
+        (time, peak, errors[0], times, ("<", ">")), (peak, time, errors[1], heights, ("v", "^")),
+    ):  # fmt: skip
+        for row in np.flatnonzero(shown & (error > 0)):
+            ends = np.clip([place[row] - error[row], place[row] + error[row]], low, high)
+            along, across = ends, np.full(2, fixed[row])
+            flat = heads[0] == "<"
+            axes.plot(*((along, across) if flat else (across, along)), color=ECHO, linewidth=1.2, zorder=4)
+            for end, sign, head in zip(ends, (-1, 1), heads, strict=True):
+                cut = sign * (place[row] + sign * error[row] - end) > 1e-9 * max(abs(end), 1.0)
+                mark = head if cut else "|" if flat else "_"
+                at = (end, fixed[row]) if flat else (fixed[row], end)
+                axes.plot(*at, marker=mark, color=ECHO, markersize=4, zorder=4, clip_on=False)
+
+
+def _number_echoes(axes: Axes, view: WaveformView, *, small: bool) -> None:
+    low, high = axes.get_xlim()
+    peaks = zip(view.echoes.time.tolist(), _peaks(view).tolist(), strict=True)
+    labels = [(str(row), time, height) for row, (time, height) in enumerate(peaks, 1) if low <= time <= high]
+    place_labels(axes, labels, color=ECHO, fontsize=7.5 if small else 9, weight="bold")
+
+
+def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], *, small: bool) -> None:
+    """Draws what a detector saw, its threshold, and where it found echoes."""
+    axes.tick_params(labelbottom=False)
+    axes.plot(seen.time, seen.values, color=INK, linewidth=1.0)
+    tested = seen.values if seen.second is None else seen.second
+    if seen.second is not None:
+        axes.plot(seen.time, seen.second, color=PULSE, linewidth=0.9)
+    found = seen.found.time.astype(np.float64)
+    height = np.interp(found, seen.time, tested)
+    if seen.deep:
+        axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0)
+    elif np.isfinite(seen.least):
+        axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED)
+    axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4)
+    rule = seen.rule + (f"; blue: {seen.second_label}" if seen.second_label else "")
+    wrapped = textwrap.fill(rule, 52 if small else 110)
+    inside = (seen.time >= times[0]) & (seen.time <= times[1])
+    lines = [line[inside] for line in (seen.values, tested)] + [np.atleast_1d(0.0 if seen.deep else seen.least)]
+    low, high = np.nanmin(np.concatenate(lines)), np.nanmax(np.concatenate(lines))
+    span = float(high - low) or 1.0
+    # Room above for the rule, which must not lie on the line.
+    axes.set_ylim(low - 0.08 * span, high + (0.3 + 0.22 * wrapped.count("\n")) * span)
+    axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
+
+
+def _draw_residual(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
     axes.axhspan(-1, 1, color="#e6e6e6", zorder=0)
     axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
     if view.residual is None:
@@ -163,54 +232,34 @@ def _draw_residual(axes: Axes, view: WaveformView) -> None:
     axes.vlines(view.time, 0, view.residual, color=FIT, linewidth=0.8)
     axes.plot(view.time, view.residual, "o", color=FIT, markersize=2.0 if len(view.time) <= _MANY else 1.2)
     axes.yaxis.get_major_locator().set_params(nbins=4, integer=True, symmetric=True)
-    known = np.abs(view.residual[np.isfinite(view.residual)])
+    known = np.abs(view.residual[np.isfinite(view.residual) & (view.time >= times[0]) & (view.time <= times[1])])
     height = max(_LEAST_SCALE, 1.1 * float(known.max(initial=0.0)))
     axes.set_ylim(-height, height)
 
 
-def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> None:
-    """Scales the signal panel to the samples and the fit that are shown; long error bars may leave it."""
+def _fit_height(axes: Axes, view: WaveformView, times: tuple[float, float]) -> tuple[float, float]:
+    """Scales the signal panel to what is shown, with error bars up to half of its height; returns its limits."""
 
     def inside(time: np.ndarray) -> np.ndarray:
         return (time >= times[0]) & (time <= times[1])
 
-    values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std]]
-    values.append(view.baseline + view.echoes.amplitude[inside(view.echoes.time)].astype(np.float64))
+    echoes = inside(view.echoes.time)
+    peak, error = _peaks(view)[echoes], np.nan_to_num(view.echoes.amplitude_err[echoes].astype(np.float64))
+    values = [view.samples[inside(view.time)], [view.baseline - view.std, view.baseline + view.std], peak]
     if view.fit is not None:
         values.append(view.fit[inside(view.fine)])
     shown = np.concatenate(values)
     low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
-    axes.set_ylim(low - 0.05 * (high - low), high + 0.17 * (high - low))
+    room = _ERROR_ROOM * (high - low)
+    low = min([low, *(peak - np.minimum(error, room)).tolist()])
+    high = max([high, *(peak + np.minimum(error, room)).tolist()])
+    limits = low - 0.05 * (high - low), high + 0.17 * (high - low)
+    axes.set_ylim(limits)
+    return limits
 
 
-def _list_echoes(view: WaveformView) -> str:
-    """A table of the echoes, for a monospaced font."""
-    echoes = view.echoes
-    if not len(echoes):
-        return "no echo"
-    lines = [f"{'echo':>4}  {'time [ns]':>15}  {'amplitude [DN]':>15}  {'width [ns]':>15}  flags"]
-    for row in range(min(len(echoes), _MOST_LISTED)):
-        values = ((echoes.time, echoes.time_err, 1.0), (echoes.amplitude, echoes.amplitude_err, 1.0))
-        values += ((echoes.sigma, echoes.sigma_err, FWHM_PER_SIGMA),)
-        texts = [_measure(factor * value[row], factor * error[row]) for value, error, factor in values]
-        front = f"{row + 1:>4}  " + "  ".join(f"{text:>15}" for text in texts) + "  "
-        flags = textwrap.wrap(_name_flags(int(echoes.flags[row])) or "-", 58)
-        lines += [(front if first is flags[0] else " " * len(front)) + first for first in flags]
-    if len(echoes) > _MOST_LISTED:
-        lines.append(f"and {len(echoes) - _MOST_LISTED} more")
-    return "\n".join(lines)
-
-
-def _measure(value: float, error: float) -> str:
-    """`12.34 +- 0.05`, with two digits of the error."""
-    if not (math.isfinite(error) and error > 0):
-        return f"{value:.4g}"
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
-    return f"{value:.{digits}f} \N{PLUS-MINUS SIGN} {error:.{digits}f}"
-
-
-def _place_legend(figure: Figure, views: Sequence[WaveformView]) -> None:
-    """One legend for all panels, with the items that occur in them."""
+def _place_legend(figure: Figure, views: Sequence[WaveformView], width: float) -> None:
+    """One legend for all panels, with the items that occur in them; width: of the picture [inches]."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -229,4 +278,9 @@ def _place_legend(figure: Figure, views: Sequence[WaveformView]) -> None:
     if any(view.clipped.any() for view in views):
         look = {"marker": "^", "color": CLIPPED, "markeredgecolor": INK, "linestyle": ""}
         handles.append(Line2D([], [], **look, label="saturated samples"))
-    figure.legend(handles=handles, loc="outside lower left", ncols=len(handles))
+    if any(view.seen is not None for view in views):
+        handles.append(Line2D([], [], color=CLIPPED, linestyle=_DASHED, label="detector's threshold"))
+        look = {"marker": "v", "color": ECHO, "markerfacecolor": "none", "linestyle": ""}
+        handles.append(Line2D([], [], **look, label="found by the detector"))
+    rows = -(-len(handles) * 1.35 // width)
+    figure.legend(handles=handles, loc="outside lower left", ncols=-(-len(handles) // max(int(rows), 1)))

@@ -7,8 +7,8 @@ twice: for the limits, then for the counts.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,22 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
+from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, shown_limits
 
 FEWEST, MOST_CHOSEN = 20, 120
 """Least and largest number of bins that are chosen if the user gives none."""
+
+MOST_GROUPS = 12
+"""Most series of --by: more cannot be told apart in a picture."""
+
+FEW_STEPS = 64
+"""A column with at most so many possible values is shown whole: a rare class is no outlier."""
+
+CLASSES = {
+    0: "never classified", 1: "unclassified", 2: "ground", 3: "low vegetation", 4: "medium vegetation",
+    5: "high vegetation", 6: "building", 7: "low point", 9: "water", 17: "bridge deck", 18: "high noise",
+}  # fmt: skip
+"""Names of classes in the LAS standard that all versions share."""
 
 _MOST_STEPS = 1e15
 """Most steps from zero for which a float64 still holds half a step."""
@@ -38,7 +50,9 @@ class Histogram:
 
     facts: ColumnFacts
     names: tuple[str, ...]
-    """Names of the series: clouds, or one name for all clouds."""
+    """Names of the series: columns, clouds and groups, as far as there are several."""
+    clouds: tuple[str, ...]
+    """Names of the clouds."""
     edges: np.ndarray
     """Edges of the bins, f8 (b + 1,); the last bin includes its upper edge."""
     counts: np.ndarray
@@ -47,15 +61,15 @@ class Histogram:
     """Values below the first edge, i8 (series,)."""
     above: np.ndarray
     """Values above the last edge, i8 (series,)."""
-    tallies: tuple[Tally, ...]
+    values: np.ndarray
+    """Values of each series, inside and outside the edges, i8 (series,)."""
+    total: Tally
+    """Counts of all series."""
     percentiles: np.ndarray
     """PERCENTILES of each series (series, 3), of all values inside and outside the edges; NaN without values. For more
     than a million values, those of an even sample."""
-
-    @property
-    def total(self) -> Tally:
-        """Counts of all series."""
-        return sum(self.tallies, Tally())
+    means: np.ndarray
+    """Mean of each series, of all values inside and outside the edges, f8 (series,); NaN without values."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,55 +88,170 @@ class FlagCounts:
 
 def count_values(
     paths: Sequence[Path],
-    selection: Selection,
+    selection: Selection | Sequence[Selection],
     *,
     bins: int | None = None,
     limits: tuple[float, float] | None = None,
     each: bool = False,
+    by: str | None = None,
 ) -> Histogram:
-    """The histogram of a column of clouds, in bounded memory.
+    """The histogram of a column of clouds, or of several columns of one unit, in bounded memory.
 
     bins: number of bins, by default from the rule of Freedman and Diaconis; a column with a fixed step gets at most as
-    many, each a whole number of steps wide. limits: lowest and highest edge, by default all values but far outliers.
-    each: one series per cloud instead of one for all.
-    Raises InputError without any value, ConfigError for a column of flags.
+    many, each a whole number of steps wide. limits: lowest and highest edge, by default those of `values.shown_limits`.
+    each: one series per cloud instead of one for all. by: one series per value of this column.
+    Raises InputError without any value, ConfigError for a column of flags, columns of several units, and more than
+    MOST_GROUPS groups.
     """
-    clouds = Clouds(paths, selection)
-    if clouds.facts.is_flags:
-        raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits: there is no histogram of their values")
-    number = len(paths) if each else 1
-    tallies, samples = [Tally()] * number, [EvenSample() for _ in range(number)]
-    least, largest = math.inf, -math.inf
-    for cloud, rows, tally in clouds.read():
-        series = cloud if each else 0
-        tallies[series] += tally
-        if len(rows):
-            samples[series].add({"value": rows["value"]})
-            least, largest = min(least, float(rows["value"].min())), max(largest, float(rows["value"].max()))
-    total = sum(tallies, Tally())
+    selections = [selection] if isinstance(selection, Selection) else list(selection)
+    if by is not None:
+        selections = [replace(one, others=(by,)) for one in selections]
+    columns = [Clouds(paths, one) for one in selections]
+    facts = _check_columns(str(paths[0]), columns)
+    series, total = _survey(columns, each, by)
     if not total.values:
-        raise clouds.complain(total)
-    kept = [sample.read().get("value", np.empty(0)) for sample in samples]
+        raise columns[0].complain(total)
+    keys = sorted(series, key=lambda key: (key[0], key[1], key[2]))
+    kept = [series[key].sample.read().get("value", np.empty(0)) for key in keys]
+    least, largest = min(one.least for one in series.values()), max(one.largest for one in series.values())
     everything = np.concatenate(kept)
-    low, high = limits or robust_limits(everything, least, largest)
-    edges = place_edges(everything, low, high, clouds.facts.step, bins, exact=limits is not None)
-    counts, below, above = _count(clouds, edges, number, each)
+    low, high = limits or _choose_limits(kept, least, largest, facts.step)
+    edges = place_edges(everything, low, high, facts.step, bins, exact=limits is not None)
+    counts, below, above = _count(columns, edges, keys, each, by)
     percentiles = [np.percentile(values, PERCENTILES) if len(values) else np.full(3, np.nan) for values in kept]
-    names = tuple(path.name for path in paths) if each or len(paths) == 1 else (f"{len(paths)} clouds",)
-    return Histogram(clouds.facts, names, edges, counts, below, above, tuple(tallies), np.stack(percentiles))
+    means = [one.total / one.values if one.values else math.nan for one in map(series.get, keys)]
+    names = tuple(_name_series(key, columns, paths, each, by) for key in keys)
+    clouds = tuple(path.name for path in paths)
+    values = np.array([series[key].values for key in keys])
+    return Histogram(
+        facts, names, clouds, edges, counts, below, above, values, total, np.stack(percentiles), np.array(means)
+    )
 
 
-def _count(clouds: Clouds, edges: np.ndarray, number: int, each: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    counts = np.zeros((number, len(edges) - 1), np.int64)
-    below, above = np.zeros(number, np.int64), np.zeros(number, np.int64)
-    for cloud, rows, _ in clouds.read():
-        series, value = cloud if each else 0, rows["value"]
-        at = np.searchsorted(edges, value, side="right") - 1
-        at[value == edges[-1]] = len(edges) - 2
-        below[series] += np.count_nonzero(at < 0)
-        above[series] += np.count_nonzero(at > len(edges) - 2)
-        inside = at[(at >= 0) & (at <= len(edges) - 2)]
-        counts[series] += np.bincount(inside, minlength=len(edges) - 1)
+_Key = tuple[int, int, float]
+"""Number of the column, of the cloud (0 if all are one), and value of the group (0 without groups)."""
+
+
+@dataclass(slots=True, eq=False)
+class _Series:
+    """What the first pass finds in a series."""
+
+    values: int = 0
+    sample: EvenSample = field(default_factory=EvenSample)
+    least: float = math.inf
+    largest: float = -math.inf
+    total: float = 0.0
+
+    def add(self, values: np.ndarray) -> None:
+        if len(values):
+            self.values += len(values)
+            self.sample.add({"value": values})
+            self.least, self.largest = min(self.least, float(values.min())), max(self.largest, float(values.max()))
+            self.total += float(values.sum())
+
+
+def _check_columns(where: str, columns: Sequence[Clouds]) -> ColumnFacts:
+    """Facts for all columns together; the step is 0 where columns differ in it."""
+    first = columns[0].facts
+    for clouds in columns:
+        if clouds.facts.is_flags:
+            raise ConfigError(f"{where}: {clouds.facts.name} are bits: there is no histogram of their values")
+        if clouds.facts.unit != first.unit:
+            raise ConfigError(
+                f"{where}: {clouds.facts.name} is in [{clouds.facts.unit}], {first.name} in [{first.unit}]: one axis "
+                "cannot show both"
+            )
+    if len(columns) == 1:
+        return first
+    same = len({clouds.facts.step for clouds in columns}) == 1
+    names = ", ".join(clouds.facts.name for clouds in columns)
+    return ColumnFacts(names, first.unit, "", first.step if same else 0.0)
+
+
+def _split(rows: np.ndarray, by: str | None) -> Iterator[tuple[float, np.ndarray]]:
+    """The groups of some rows: value, and the rows' values."""
+    if by is None:
+        yield 0.0, rows["value"]
+        return
+    group = rows["others"][:, 0]
+    for value in np.unique(group[~np.isnan(group)]).tolist():
+        yield value, rows["value"][group == value]
+    if np.isnan(group).any():
+        yield math.nan, rows["value"][np.isnan(group)]
+
+
+_UNKNOWN = -math.inf
+"""Group of points without data in the column of --by: NaN is not equal to itself, so it is no key."""
+
+
+def _survey(columns: Sequence[Clouds], each: bool, by: str | None) -> tuple[dict[_Key, _Series], Tally]:
+    """The first pass: counts, limits and samples of every series, and the counts of all points."""
+    found: dict[_Key, _Series] = {}
+    total = Tally()
+    for column, clouds in enumerate(columns):
+        if by is not None and clouds.other_facts[0].is_flags:
+            raise ConfigError(f"{clouds.paths[0]}: {by} are bits and form no groups; --flags-with selects them")
+        for cloud, rows, tally in clouds.read():
+            total += tally
+            if by is None:
+                found.setdefault((column, cloud if each else 0, 0.0), _Series())
+            for value, values in _split(rows, by):
+                found.setdefault((column, cloud if each else 0, _group(value)), _Series()).add(values)
+            if len({key[2] for key in found}) > MOST_GROUPS:
+                raise ConfigError(
+                    f"{clouds.paths[cloud]}: {by} has more than {MOST_GROUPS} different values; --by is for columns "
+                    "with few, like number_of_returns or classification"
+                )
+    return found, total
+
+
+def _group(value: float) -> float:
+    return _UNKNOWN if math.isnan(value) else value
+
+
+def _choose_limits(samples: Sequence[np.ndarray], least: float, largest: float, step: float) -> tuple[float, float]:
+    """All values of a column with few steps, like classes; else without the rare far ones."""
+    if step > 0 and (largest - least) / step <= FEW_STEPS:
+        return least, largest
+    return shown_limits(samples, least, largest)
+
+
+def _name_series(key: _Key, columns: Sequence[Clouds], paths: Sequence[Path], each: bool, by: str | None) -> str:
+    column, cloud, group = key
+    parts = [columns[column].facts.name] if len(columns) > 1 else []
+    if each and len(paths) > 1:
+        parts.append(name_paths(paths)[cloud])
+    if by is not None:
+        parts.append(_name_group(columns[0].other_facts[0].name, group))
+    return " ".join(parts) or (paths[0].name if len(paths) == 1 else f"{len(paths)} clouds")
+
+
+def _name_group(column: str, value: float) -> str:
+    if value == _UNKNOWN:
+        return f"no {column}"
+    meaning = CLASSES.get(int(value), "") if column in ("classification", "raw_classification") else ""
+    return f"{column} {value:g}" + (f" ({meaning})" if meaning else "")
+
+
+def _count(
+    columns: Sequence[Clouds], edges: np.ndarray, keys: Sequence[_Key], each: bool, by: str | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The second pass: counts per series and bin, and values below and above."""
+    place = {key: row for row, key in enumerate(keys)}
+    counts = np.zeros((len(keys), len(edges) - 1), np.int64)
+    below, above = np.zeros(len(keys), np.int64), np.zeros(len(keys), np.int64)
+    for column, clouds in enumerate(columns):
+        for cloud, rows, _ in clouds.read():
+            for group, value in _split(rows, by):
+                if not len(value):
+                    continue
+                series = place[column, cloud if each else 0, _group(group)]
+                at = np.searchsorted(edges, value, side="right") - 1
+                at[value == edges[-1]] = len(edges) - 2
+                below[series] += np.count_nonzero(at < 0)
+                above[series] += np.count_nonzero(at > len(edges) - 2)
+                inside = at[(at >= 0) & (at <= len(edges) - 2)]
+                counts[series] += np.bincount(inside, minlength=len(edges) - 1)
     return counts, below, above
 
 

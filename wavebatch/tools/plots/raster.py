@@ -17,6 +17,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.disk.buckets import Buckets, count_buckets
+from wavebatch.files.las.crs_name import describe_crs
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
 
 STATISTICS = ("mean", "median", "min", "max", "count", "density")
@@ -33,6 +34,9 @@ LARGEST_EXTENT = 1e12
 
 CHOSEN_SIDE = 1500
 """Most cells along a side if the size of cells is not given: about the pixels of a picture."""
+
+FAR = 20.0
+"""Clouds may lie so many times the length of the longest one apart in one map: about three pixels per cloud remain."""
 
 POINTS_PER_CELL = 6
 """Mean number of points in a filled cell if the size of cells is not given."""
@@ -84,6 +88,10 @@ class Raster:
     """Points with a value outside the grid."""
     shown: tuple[float, float]
     """The percentiles SHOWN of the cells."""
+    crs: str = ""
+    """Name of the CRS of the clouds; empty if they give none."""
+    unit: str = "m"
+    """Unit of x and y."""
 
     @property
     def label(self) -> str:
@@ -91,7 +99,7 @@ class Raster:
         if self.statistic == "count":
             return "points per cell [-]"
         if self.statistic == "density":
-            return "points per area [1/m2]"
+            return f"points per area [1/{self.unit}2]"
         return f"{self.statistic} of {self.facts.label}"
 
 
@@ -107,7 +115,8 @@ def grid_values(
 
     size: side of a cell [m], by default for about POINTS_PER_CELL points per cell. bounds: west, south, east, north
     [m], by default all points but far outliers.
-    Raises InputError if there is nothing to draw, ConfigError for wrong options and for more than MOST_CELLS cells.
+    Raises InputError if there is nothing to draw, ConfigError for wrong options, more than MOST_CELLS cells, and clouds
+    that are far apart or differ in their CRS.
     """
     _check(statistic, size, bounds)
     clouds = Clouds(paths, selection)
@@ -116,6 +125,7 @@ def grid_values(
             f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}; count the points with a flag: "
             "--statistic count --flags-with NAME"
         )
+    crs, unit = check_crs(paths)
     total, sample, box = _survey(clouds, bounds)
     if not total.values:
         raise clouds.complain(total)
@@ -126,7 +136,7 @@ def grid_values(
     values, placed = _Cells(grid, statistic, total.values).fill(clouds)
     known = values[np.isfinite(values)]
     shown = tuple(np.percentile(known, SHOWN).tolist()) if len(known) else (0.0, 1.0)
-    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, shown)
+    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, shown, crs, unit)
 
 
 def _check(statistic: str, size: float | None, bounds: tuple[float, float, float, float] | None) -> None:
@@ -146,7 +156,8 @@ def _survey(
     """Counts of the points, an even sample of positions (n, 2), and the box of all positions."""
     total, sample = Tally(), EvenSample()
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for _, rows, tally in clouds.read():
+    each = [EvenSample() for _ in clouds.paths]
+    for cloud, rows, tally in clouds.read():
         total += tally
         places = np.stack([rows["x"], rows["y"]], axis=1)
         keep = np.isfinite(places).all(axis=1)
@@ -155,8 +166,48 @@ def _survey(
         places = places[keep]
         if len(places):
             sample.add({"place": places})
+            if len(clouds.paths) > 1 and bounds is None:
+                each[cloud].add({"place": places})
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+    _refuse_far(clouds.paths, [one.read().get("place", np.empty((0, 2))) for one in each])
     return total, sample, bounds or (*low.tolist(), *high.tolist())
+
+
+def _refuse_far(paths: Sequence[Path], places: Sequence[np.ndarray]) -> None:
+    """Raises ConfigError for clouds so far apart that a map would show them as dots."""
+    known = [number for number, place in enumerate(places) if len(place)]
+    # Percentiles, so that a single damaged point moves no cloud.
+    boxes = {number: np.percentile(places[number], (1, 99), axis=0) for number in known}
+    reach = FAR * max((float(np.hypot(*(box[1] - box[0]))) for box in boxes.values()), default=0.0)
+    near = known[:1]
+    for number in near:
+        for other in known:
+            gap = np.maximum(boxes[number][0] - boxes[other][1], boxes[other][0] - boxes[number][1])
+            if other not in near and float(np.hypot(*np.maximum(gap, 0.0))) <= max(reach, 1.0):
+                near.append(other)
+    away = [number for number in known if number not in near]
+    if away:
+        middle = [boxes[number].mean(axis=0) for number in (known[0], away[0])]
+        raise ConfigError(
+            f"{paths[away[0]]}: lies {float(np.hypot(*(middle[1] - middle[0]))):.6g} from {paths[known[0]]}, and the "
+            f"largest cloud is {reach / FAR:.4g} long: a map of both would show neither; draw them one by one, or give "
+            "--bounds"
+        )
+
+
+def check_crs(paths: Sequence[Path]) -> tuple[str, str]:
+    """The CRS and the unit of x and y that all clouds have; ConfigError where they differ.
+
+    A cloud without a CRS is taken to have that of the others.
+    """
+    found = {path: describe_crs(path) for path in paths}
+    first = next((path for path in paths if found[path][0]), paths[0])
+    for path in paths:
+        if found[path][0] and found[path] != found[first]:
+            raise ConfigError(
+                f"{path}: its CRS is {found[path][0]}, that of {first} is {found[first][0]}; one map cannot show both"
+            )
+    return found[first]
 
 
 def _choose_grid(

@@ -13,10 +13,7 @@ import numpy as np
 
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.flag_names import read_flags
 from wavebatch.files.cloud.column_reader import ColumnFacts, ColumnReader, check_alike, select_points
-
-__all__ = ["Clouds", "Selection", "Tally", "read_flags", "robust_limits"]
 
 OUTER = (0.1, 99.9)
 """Percentiles that a picture must show; values far outside are damage or very rare."""
@@ -35,6 +32,8 @@ class Selection:
     """Points must have one of these EchoFlag bits; 0: any point."""
     flags_without: int = 0
     """Points must have none of these EchoFlag bits."""
+    others: tuple[str, ...] = ()
+    """Further columns that are read with it."""
     where: Condition | None = None
     """Points must meet this."""
 
@@ -64,6 +63,12 @@ class Tally:
         return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__slots__))
 
 
+def name_paths(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of files for legends and titles, with their folders where names are equal."""
+    names = [path.name for path in paths]
+    return tuple(str(path) if names.count(path.name) > 1 else path.name for path in paths)
+
+
 class Clouds:
     """Several clouds that are read as one, as often as needed; only one is open at a time.
 
@@ -74,8 +79,9 @@ class Clouds:
         self.paths, self.selection = tuple(paths), selection
         found: list[tuple[Path, ColumnFacts]] = []
         for path in self.paths:
-            with ColumnReader(path, selection.column) as reader:
+            with ColumnReader(path, selection.column, selection.others) as reader:
                 found.append((path, reader.facts))
+                self.other_facts = reader.other_facts
                 select_points(reader, selection.where)  # its columns exist
                 if (selection.flags_with or selection.flags_without) and not reader.has_flags:
                     raise ConfigError(f"{path}: has no column echo_flags to select points by")
@@ -84,7 +90,7 @@ class Clouds:
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
         """Pieces of all clouds: number of the cloud, selected points with a value, and counts of the piece."""
         for number, path in enumerate(self.paths):
-            with ColumnReader(path, self.selection.column) as reader:
+            with ColumnReader(path, self.selection.column, self.selection.others) as reader:
                 select_points(reader, self.selection.where)
                 seen = 0
                 for rows in reader.read_pieces():
@@ -106,6 +112,17 @@ class Clouds:
         if tally.no_data:
             reasons.append(f"{tally.no_data} have no data in {self.facts.name}")
         return InputError(f"{where}: nothing to draw: {' and '.join(reasons)}")
+
+
+def shown_limits(samples: Sequence[np.ndarray], least: float, largest: float) -> tuple[float, float]:
+    """Limits that show at least the percentiles OUTER of every sample: rare far values would compress the rest.
+
+    Below a thousand values these are all of a sample. Samples of one value only are shown from `least` to `largest`.
+    """
+    ends = [np.percentile(sample, end, method=side) for sample in samples if len(sample)
+            for end, side in zip(OUTER, ("lower", "higher"), strict=True)]  # fmt: skip
+    low, high = float(min(ends)), float(max(ends))
+    return (low, high) if low < high else (least, largest)
 
 
 def robust_limits(sample: np.ndarray, least: float, largest: float) -> tuple[float, float]:

@@ -6,17 +6,21 @@ run`; only the curves of the fitted pulses are computed again here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.stages.chain import Chain
+from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.decompose.rebuild import echo_pulses, fitted_pulse
 from wavebatch.stages.pulse_tables import clip_level
+from wavebatch.surveying.sensor import SensorRequest, find_sensor
+from wavebatch.tools.plots.detector_signals import DetectorSignal, choose_step, describe_step, see_block
 from wavebatch.tools.plots.packets import Place
 
 FINE = 8
@@ -24,6 +28,12 @@ FINE = 8
 
 MOST_POINTS = 20_000
 """Most points of a curve: more than any picture resolves."""
+
+BEFORE, AFTER = 4.0, 8.0
+"""What is shown before the first [full widths] and after the last echo [sigma] of the widest echo."""
+
+VISIBLE = 5.0
+"""Samples this far above the baseline, and residuals this large, are always shown [noise std]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +68,8 @@ class WaveformView:
     """The k echoes of this waveform."""
     returns: np.ndarray
     """Times of the returns of the input [ns], f8 (r,)."""
+    seen: DetectorSignal | None = None
+    """What the detector saw, if it was asked for."""
 
     @property
     def spacing(self) -> float:
@@ -76,28 +88,86 @@ class WaveformView:
         return np.where(np.isnan(self.samples), np.nan, self.level)[nearest]
 
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """The part that holds all that can be seen [ns]: echoes, returns, and samples or residuals above the noise."""
+        seen = (self.samples > self.level + VISIBLE * self.std) | self.clipped
+        if self.residual is not None:
+            seen |= np.abs(np.nan_to_num(self.residual)) > VISIBLE
+        marks = np.concatenate([self.echoes.time, self.returns, self.time[seen]])
+        end, edge = float(self.time[-1]), 0.5 * self.spacing
+        if not len(marks):
+            return -edge, max(end + edge, 1.0)
+        sigma = float(self.echoes.sigma.max()) if len(self.echoes) else 2 * self.spacing
+        low = max(float(marks.min()) - BEFORE * FWHM_PER_SIGMA * sigma, -edge)
+        return low, max(min(float(marks.max()) + AFTER * sigma, end + edge), low + 1.0)
+
+    def span_is_cut(self, times: tuple[float, float]) -> bool:
+        """Whether some samples lie outside of the times that are shown."""
+        return times[0] > 0.0 or times[1] < float(self.time[-1])
+
+
 def read_views(
-    reader: StripReader, scan: StripScan, places: Sequence[Place], chain: Chain, system: SystemPulse
+    reader: StripReader,
+    scan: StripScan,
+    places: Sequence[Place],
+    chain: Chain,
+    system: SystemPulse,
+    show: str | None = None,
+    fill: Callable[[WaveformBlock], WaveformBlock] | None = None,
 ) -> list[WaveformView]:
-    """The waveforms at `places`, in this order, with the result of the chain."""
+    """The waveforms at `places`, in this order, with the result of the chain.
+
+    show: also what the detector saw, as `detector_signals.choose_step` takes it. fill: adds the sensor's positions.
+    """
     views: dict[tuple[int, int], WaveformView] = {}
     for number in sorted({place.unit for place in places}):
         unit = reader.read_unit(number, scan)
         packet = {place.row: place.packet for place in places if place.unit == number}
         for block, rows in reader.read_rows(unit, np.array(sorted(packet)), len(packet)):
-            parts = build_views(block, chain, system, [packet[int(row)] for row in rows])
+            block = block if fill is None else fill(block)
+            parts = build_views(block, chain, system, [packet[int(row)] for row in rows], show)
             views |= {(number, int(row)): view for row, view in zip(rows, parts, strict=True)}
     return [views[place.unit, place.row] for place in places]
 
 
-def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int]) -> list[WaveformView]:
-    """One view per waveform of the block; packets: their numbers in the strip."""
+def add_ranges(
+    chain: Chain, reader: StripReader, scan: StripScan
+) -> tuple[Chain, Callable[[WaveformBlock], WaveformBlock] | None]:
+    """The chain with the distances of echoes from the sensor, and the function that gives blocks their sensor.
+
+    The chain as it is, and None, where it computes no positions or those of the sensor are not known.
+    """
+    if not {"x", "y", "z"} <= {*chain.makes}:
+        return chain, None
+    try:
+        source = find_sensor(reader, scan, SensorRequest())
+    except InputError:  # coordinates in feet or degrees
+        return chain, None
+    step = () if "range" in chain.makes else (Step(STAGES["attribute.range"]),)
+    return Chain((*chain.steps, *step), chain.name), source.fill
+
+
+def describe_chain(chain: Chain) -> str:
+    """Name, detector and decomposer of a chain, with the parameters that it sets."""
+    detector, decomposer = (describe_step(step) for step in chain.steps[1:3])
+    return f"{chain.name.removeprefix('profile ') or 'chain'}: {detector}, {decomposer}"
+
+
+def build_views(
+    block: WaveformBlock, chain: Chain, system: SystemPulse, packets: Sequence[int], show: str | None = None
+) -> list[WaveformView]:
+    """One view per waveform of the block; packets: their numbers in the strip; show: as for `read_views`."""
     system = system.of(block)
     first, decomposer = chain.steps[0], chain.steps[2]
     noise = first.stage.function(block, system, **first.parameters)
     echoes = chain.run(block, system)
     shape = fitted_pulse(decomposer, system, block.spacing)
     level = clip_level(block, system)
+    seen: Sequence[DetectorSignal | None] = [None] * len(block)
+    if show is not None:
+        step = choose_step(chain, show)
+        seen = see_block(block, noise, system, step, own=step is chain.steps[1])
     views = []
     for row, number in enumerate(packets):
         table = echoes.take(np.flatnonzero(echoes.waveform == row))
@@ -118,7 +188,7 @@ def build_views(block: WaveformBlock, chain: Chain, system: SystemPulse, packets
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
                 np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table,
-                returns,
+                returns, seen[row],
             )  # fmt: skip
         )
     return views

@@ -97,6 +97,27 @@ class PolygonSet:
         return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
 
 
+RANKS = ("1-2", "2-3", "3-4", "4-")
+"""Classes of pairs of consecutive returns by the number of the first one; the last class holds all higher numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """Distances between two consecutive returns of a pulse [m]."""
+
+    pairs: int
+    mean: float
+    least: float
+    """NaN, as the mean, without a pair."""
+
+
+def describe_pairs(pairs: int, total: float, least: float) -> Separation:
+    """The distances of pairs from their number, sum and least distance."""
+    if not pairs:
+        return Separation(0, math.nan, math.nan)
+    return Separation(int(pairs), float(total) / int(pairs), float(least))
+
+
 @dataclass(frozen=True, slots=True)
 class AreaStats:
     """Statistics of the returns of one area."""
@@ -118,6 +139,12 @@ class AreaStats:
     mean: float
     least: float
     """Mean and least distance of the pairs [m]; NaN without a pair."""
+    separations: dict[str, Separation]
+    """The same by return number: `1-2`, `2-3`, `3-4` and `4-`, as far as there are pairs."""
+    several: int
+    """Pulses with two or more returns."""
+    depth: float
+    """Mean height of the first above the last return of these pulses [m]: how deep they reach into the vegetation."""
 
 
 class AreaTally:
@@ -126,8 +153,9 @@ class AreaTally:
     def __init__(self, division: Division) -> None:
         self.division = division
         self._areas = np.empty(0, np.int64)
-        self._counts = np.zeros((0, MOST_NUMBER + 1 + MOST_COUNT + 1 + 1), np.int64)
-        self._sums = np.zeros((0, 2))
+        self._counts = np.zeros((0, MOST_NUMBER + 1 + MOST_COUNT + 1 + len(RANKS) + 1), np.int64)
+        self._sums = np.zeros((0, len(RANKS) + 1))
+        self._least = np.zeros((0, len(RANKS)))
 
     def __len__(self) -> int:
         return len(self._areas)
@@ -145,31 +173,38 @@ class AreaTally:
         by_number = np.bincount(of_row * (MOST_NUMBER + 1) + rows["number"], minlength=n * (MOST_NUMBER + 1))
         classes = area * (MOST_COUNT + 1) + np.minimum(number, MOST_COUNT)
         by_count = np.bincount(classes, minlength=n * (MOST_COUNT + 1))
-        of_pair = of_row[before]
-        pairs = np.bincount(of_pair, minlength=n)[:, None]
-        least = np.full(n, np.inf)
+        rank = np.minimum(rows["number"][before].astype(np.int64), len(RANKS)) - 1
+        of_pair, cells = of_row[before] * len(RANKS) + rank, n * len(RANKS)
+        pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
+        least = np.full(cells, np.inf)
         np.minimum.at(least, of_pair, distance)
-        counts = np.concatenate([by_number.reshape(n, -1), by_count.reshape(n, -1), pairs], axis=1)
-        self._join(areas, counts, np.stack([np.bincount(of_pair, distance, n), least], axis=1))
+        pulses, depth = measure_depths(rows, first)
+        several = np.bincount(area[pulses], minlength=n)[:, None]
+        tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), pairs, several)
+        apart = np.bincount(of_pair, distance, cells).reshape(n, -1)
+        sums = np.concatenate([apart, np.bincount(area[pulses], depth, n)[:, None]], axis=1)
+        self._join(areas, np.concatenate(tables, axis=1), sums, least.reshape(n, -1))
 
     def merge(self, other: AreaTally) -> None:
         """Adds the sums of another cloud."""
-        self._join(other._areas, other._counts, other._sums)
+        self._join(other._areas, other._counts, other._sums, other._least)
 
-    def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray) -> None:
+    def _join(self, areas: np.ndarray, counts: np.ndarray, sums: np.ndarray, least: np.ndarray) -> None:
         """Adds sums of areas, which are ascending and unique."""
         known = np.union1d(self._areas, areas)
         if len(known) > MOST_AREAS:
             raise ConfigError(f"more than {MOST_AREAS} areas hold pulses; give a larger --area, or fewer clouds")
         old, new = np.searchsorted(known, self._areas), np.searchsorted(known, areas)
         if len(known) > len(self._areas):
-            kept_counts, kept_sums = self._counts, self._sums
+            kept = self._counts, self._sums, self._least
             self._counts = np.zeros((len(known), counts.shape[1]), np.int64)
-            self._sums = np.tile([0.0, np.inf], (len(known), 1))
-            self._counts[old], self._sums[old], self._areas = kept_counts, kept_sums, known
+            self._sums = np.zeros((len(known), sums.shape[1]))
+            self._least = np.full((len(known), least.shape[1]), np.inf)
+            self._counts[old], self._sums[old], self._least[old] = kept
+            self._areas = known
         self._counts[new] += counts
-        self._sums[new, 0] += sums[:, 0]
-        self._sums[new, 1] = np.minimum(self._sums[new, 1], sums[:, 1])
+        self._sums[new] += sums
+        self._least[new] = np.minimum(self._least[new], least)
 
     def finish(self) -> list[AreaStats]:
         """The statistics: cells by column and row, polygons in the order of their file, `outside` last."""
@@ -177,9 +212,12 @@ class AreaTally:
         return [self._describe(row) for row in order.tolist()]
 
     def _describe(self, row: int) -> AreaStats:
-        by_number, by_count, pairs = np.split(self._counts[row], [MOST_NUMBER + 1, MOST_NUMBER + 2 + MOST_COUNT])
-        points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(pairs[0])
-        total, least = self._sums[row].tolist()
+        edge = MOST_NUMBER + 2 + MOST_COUNT
+        by_number, by_count, pairs, several = np.split(self._counts[row], [MOST_NUMBER + 1, edge, edge + len(RANKS)])
+        points, pulses, number = int(by_number.sum()), int(by_count.sum()), int(several[0])
+        apart, depth = self._sums[row, :-1], float(self._sums[row, -1])
+        every = describe_pairs(pairs.sum(), apart.sum(), self._least[row].min())
+        ranks = zip(RANKS, pairs, apart, self._least[row], strict=True)
         return AreaStats(
             *self.division.describe(int(self._areas[row])),
             points=points,
@@ -187,10 +225,25 @@ class AreaTally:
             returns_per_pulse=points / pulses,
             by_number=share_counts(by_number),
             by_count=share_counts(by_count),
-            pairs=number,
-            mean=total / number if number else math.nan,
-            least=least if number else math.nan,
+            pairs=every.pairs,
+            mean=every.mean,
+            least=every.least,
+            separations={name: describe_pairs(*values) for name, *values in ranks if values[0]},
+            several=number,
+            depth=depth / number if number else math.nan,
         )
+
+
+def measure_depths(rows: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pulses with several returns, and the height of their first above their last return [m].
+
+    rows: returns sorted by pulse, then number; first: row of the first return of each pulse.
+    """
+    last = np.append(first[1:], len(rows)) - 1
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = rows["xyz"][first, 2] - rows["xyz"][last, 2]
+    pulses = np.flatnonzero((last > first) & np.isfinite(depth))
+    return pulses, depth[pulses]
 
 
 def share_counts(counts: np.ndarray) -> dict[int, float]:

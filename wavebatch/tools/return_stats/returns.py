@@ -21,7 +21,17 @@ from wavebatch.files.cloud.column_reader import select_points
 from wavebatch.files.cloud.echo_reader import CloudReader
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.buckets import Buckets, count_buckets, spread_keys, tell_pulses_apart, time_keys
-from wavebatch.tools.return_stats.areas import MOST_AREAS, MOST_COUNT, AreaStats, AreaTally, Division, share_counts
+from wavebatch.tools.return_stats.areas import (
+    MOST_AREAS,
+    MOST_COUNT,
+    AreaStats,
+    AreaTally,
+    Division,
+    Separation,
+    describe_pairs,
+    measure_depths,
+    share_counts,
+)
 
 _BIN, _BINS = 0.01, 10_000
 """Width [m] and number of the bins of distances from which the dead zone is found: to 1 cm, up to 100 m."""
@@ -42,16 +52,6 @@ deviations; without a limit, counts fall with the number of returns."""
 
 
 @dataclass(frozen=True, slots=True)
-class Separation:
-    """Distances between two consecutive returns of a pulse [m]."""
-
-    pairs: int
-    mean: float
-    least: float
-    """NaN, as the mean, without a pair."""
-
-
-@dataclass(frozen=True, slots=True)
 class ReturnStats:
     """Statistics of the returns of one cloud, or of several together."""
 
@@ -68,6 +68,10 @@ class ReturnStats:
     """Share of the pulses with exactly this many returns in the cloud."""
     separations: dict[str, Separation]
     """`all`, and `1-2`, `2-3` ... by return number, without points passed through without an echo."""
+    several: int
+    """Pulses with two or more returns."""
+    depth: float
+    """Mean height of the first above the last return of these pulses [m]; NaN without any."""
     dead_zone: float
     """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs."""
     hidden: float
@@ -181,6 +185,8 @@ class _Tally:
     points: int = 0
     left_out: int = 0
     incomplete: int = 0
+    several: int = 0
+    depth: float = 0.0
     methods: set[str] = field(default_factory=set)
     by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
     by_count: np.ndarray = field(default_factory=lambda: np.zeros(MOST_COUNT + 1, np.int64))
@@ -207,6 +213,9 @@ class _Tally:
         counts = np.diff(np.append(first, len(rows)))
         self.by_count += np.bincount(np.minimum(counts, MOST_COUNT), minlength=MOST_COUNT + 1)
         self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
+        pulses, depth = measure_depths(rows, first)
+        self.several += len(pulses)
+        self.depth += float(depth.sum())
         pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
         before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
         with np.errstate(over="ignore", invalid="ignore"):
@@ -224,7 +233,8 @@ class _Tally:
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
         self.methods |= other.methods
-        for name in ("points", "left_out", "incomplete", "by_number", "by_count", "bins", "pairs", "sums"):
+        for name in ("points", "left_out", "incomplete", "several", "depth", "by_number", "by_count", "bins", "pairs",
+                     "sums"):  # fmt: skip
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.least = np.minimum(self.least, other.least)
         for area, more in zip(self.areas, other.areas, strict=True):
@@ -248,6 +258,8 @@ class _Tally:
             by_number=share_counts(self.by_number),
             by_count=share_counts(self.by_count),
             separations=self._list_separations(),
+            several=self.several,
+            depth=self.depth / self.several if self.several else math.nan,
             dead_zone=zone,
             hidden=hidden,
             flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
@@ -257,10 +269,10 @@ class _Tally:
         )
 
     def _list_separations(self) -> dict[str, Separation]:
-        table = {"all": _separation(self.pairs.sum(), self.sums.sum(), self.least.min())}
+        table = {"all": describe_pairs(self.pairs.sum(), self.sums.sum(), self.least.min())}
         for rank in np.flatnonzero(self.pairs).tolist():
             name = f"{rank + 1}-{rank + 2}" if rank + 1 < _MOST_PAIR else f"{rank + 1}-"
-            table[name] = _separation(self.pairs[rank], self.sums[rank], self.least[rank])
+            table[name] = describe_pairs(self.pairs[rank], self.sums[rank], self.least[rank])
         return table
 
     def _find_dead_zone(self) -> float:
@@ -296,9 +308,3 @@ class _Tally:
                 "tiles and thinned clouds give fewer returns per pulse than the sensor recorded"
             )
         return lines
-
-
-def _separation(pairs: int, total: float, least: float) -> Separation:
-    if not pairs:
-        return Separation(0, math.nan, math.nan)
-    return Separation(int(pairs), float(total) / int(pairs), float(least))

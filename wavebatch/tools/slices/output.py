@@ -13,14 +13,17 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
-from wavebatch.files.figure_file import open_picture
+from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.files.geojson_crs import GeoJsonCrs
+from wavebatch.tools.plots.labels import fit_parts, space_ticks
 from wavebatch.tools.slices.segments import Segment, Slice
 
 SEGMENT_SUFFIXES = (".csv", ".geojson")
 _PLACE = ("pulses", "first_pulse", "last_pulse", "first_point")
 _FIGURES = ("length", "slope", "residual", *_PLACE, "theta", "rho", "weight")
 _HEAD = ("line", "segment", "x1", "y1", "z1", "x2", "y2", "z2", *_FIGURES)
+_TALLEST = 8.0
+"""Largest height of the axes of a slice [inches]."""
 _MOST_PIXELS = 40_000_000
 """Most pixels of a picture (160 MB): more come from damaged coordinates."""
 
@@ -86,21 +89,36 @@ def _row(segment: Segment) -> str:
     return ",".join([str(segment.line), str(segment.segment), *ends, *texts]) + "\n"
 
 
-def draw_slice(piece: Slice, segments: Sequence[Segment], target: Path, *, overwrite: bool = False) -> None:
-    """Writes a picture of a slice with its segments; raises as figure_file.open_picture does."""
-    with open_picture(target, (12, 5), overwrite=overwrite, dpi=120) as figure:
+def draw_slice(
+    piece: Slice, segments: Sequence[Segment], target: Path, *, strip: str = "", overwrite: bool = False
+) -> None:
+    """Writes a picture of a slice with its segments; scales are equal where both axes are metres.
+
+    Raises as figure_file.open_picture does.
+    """
+    image, extent = _paint(piece)
+    plane = piece.geometry == "plane"
+    tall = (extent[3] - extent[2]) / (extent[1] - extent[0]) if plane else 0.4
+    width = min(11.0, _TALLEST / tall)
+    with open_picture(target, (max(width + 1.0, 6.0), max(width * tall, 0.6) + 2.2), overwrite=overwrite) as figure:
+        figure.set_layout_engine("compressed")
         axes = figure.subplots()
-        image, extent = _paint(piece)
         axes.grid(visible=False)
-        shown = axes.imshow(image, extent=extent, origin="lower", aspect="auto", cmap="gray_r", interpolation="nearest")
-        figure.colorbar(shown, label="DN above the level without signal")
+        shown = axes.imshow(image, extent=extent, origin="lower", aspect="equal" if plane else "auto", cmap="gray_r",
+                            interpolation="nearest")  # fmt: skip
+        figure.colorbar(shown, ax=axes, label="DN above the level without signal", orientation="horizontal", aspect=40)
         for segment in segments:
             ends = np.array(segment.ends)
             axes.plot(ends[:, 0], ends[:, 1], color="tab:red", linewidth=1.2)
-        plane = piece.geometry == "plane"
+        axes.set_xlim(extent[:2])
+        axes.set_ylim(extent[2:])
+        space_ticks(axes.yaxis, width * tall, 0.3)
         axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")
-        axes.set_title(f"scan line {piece.line.number}: {len(piece.line)} pulses, {len(segments)} segments")
+        parts = [plain_text(strip), f"scan line {piece.line.number}", f"{len(piece.line)} pulses"]
+        parts.append(f"{len(segments)} segment" + "s" * (len(segments) != 1))
+        title = fit_parts(figure, [part for part in parts if part], figure.get_figwidth() - 0.2, size=10.5)
+        figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
 
 
 def _paint(piece: Slice) -> tuple[np.ndarray, tuple[float, float, float, float]]:

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.memory import ONE_THREAD
 from wavebatch.tools.bench.scenes import find_bench_scene
-from wavebatch.tools.bench.worker import ONE_THREAD
 from wavebatch.tools.simulate import simulate_strip
 
 WHERE = "import wavebatch, sys; sys.stdout.write(wavebatch.__file__)"

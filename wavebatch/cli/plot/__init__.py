@@ -1,4 +1,4 @@
-"""`wavebatch plot`: pictures of waveforms, histograms and maps.
+"""`wavebatch plot`: pictures of waveforms, histograms and maps; sections and profiles are in `sections`.
 
 Reads options, calls `wavebatch.tools.plots` and prints one line. The modules that draw are imported only after all
 else has succeeded: matplotlib takes long to import and may be missing.
@@ -14,18 +14,15 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, print_json, talk
+from wavebatch.cli.plot.sections import cube, flag_options, profile, section, select
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
+from wavebatch.files.text_file import write_text
 
+_SHOWN = ("detector", "asdf", "wavelet", "correlation", "deconvolved", "derivative")
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
-_flags = shared.together(
-    click.option("--flags-with", multiple=True, metavar="NAMES",
-                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
-    click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
-    shared.where_option("Use only points"),
-)  # fmt: skip
-
 
 def _read_range(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
     if text is None:
@@ -36,13 +33,17 @@ def _read_range(context: click.Context, parameter: click.Parameter, text: str | 
     return low, high
 
 
+def _read_times(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | str | None:
+    return "all" if text == "all" else _read_range(context, parameter, text)
+
+
 def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
     return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
 
 
 @click.group(cls=NearestGroup)
 def plot() -> None:
-    """Draw waveforms, histograms and maps as .png, .svg or .pdf.
+    """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
 
     Needs matplotlib: pip install 'wavebatch[plot]'. No screen is needed; the same input gives the same bytes.
     """
@@ -66,36 +67,43 @@ def plot() -> None:
 @click.option("--random", type=click.IntRange(1, 100), metavar="N", help="Draw N random packets.")
 @shared.seed_option("Seed of the random packets.")
 @click.option("--sheet", is_flag=True, help="Draw a contact sheet: up to 100 small pictures, cut to their echoes.")
-@click.option("--times", "shown", callback=_read_range, metavar="LOW:HIGH",
-              help="Part of the waveforms to show [ns].  [default: all]")
+@click.option("--times", "shown", callback=_read_times, metavar="LOW:HIGH|all",
+              help="Part of the waveforms to show [ns].  [default: the part with signal, of each waveform]")
+@click.option("--show", metavar="|".join(_SHOWN), help="Also draw the signal in which the detector searches, with its "
+              "threshold; detector: that of the chain's own detector.")
+@click.option("--echoes", "table", is_flag=True,
+              help="List amplitude, time, width, range and errors of all echoes below; -o FILE.csv writes only them.")
 @shared.chain_options
 @shared.system_option
 @shared.strip_options
 @shared.common_options("overwrite", "json", "quiet")
 def waveform(strip: Path, output: Path, **options: Any) -> None:
-    """Draw waveforms of STRIP with their fit, residual and echoes.
+    """Draw waveforms of STRIP with their fit, residual and echoes; or write the echoes as a table.
 
     Shows samples, baseline and noise, the fitted sum, the pulse of each echo, the residual in standard deviations of
     the noise, echoes with their errors, and the returns of the file. The chain is chosen and run as by `wavebatch run`.
 
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
+    from wavebatch.core.flag_names import read_flags
     from wavebatch.tools.plots.packets import Wanted
-    from wavebatch.tools.plots.values import read_flags
 
     if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
     if options["random"] and any(options[name] for name in ("packets", "points", "times", "flags_with")):
         raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
-    check_picture(output, overwrite=options["overwrite"])
+    if options["sheet"] and (options["show"] or options["table"]):
+        raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
+    tabular = output.suffix.lower() == ".csv"
+    check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
     wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
-    views, chain = _view(strip, wanted, options)
-    from wavebatch.tools.plots.draw_sheet import draw_sheet
-    from wavebatch.tools.plots.draw_waveform import draw_waveforms
+    views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
+    if tabular:
+        from wavebatch.tools.plots.echo_table import format_echoes
 
-    shown, overwrite = options["shown"], options["overwrite"]
-    draw = draw_sheet if options["sheet"] else draw_waveforms
-    draw(views, output, strip=strip.name, chain=chain, times=shown, overwrite=overwrite)
+        write_text(output, format_echoes(views), overwrite=options["overwrite"])
+    else:
+        _draw_waveforms(views, output, strip.name, chain, options)
     if not options["quiet"]:
         echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
@@ -104,14 +112,37 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
-def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any], str]:
-    """The waveforms that are wanted, and the name of the chain that they were run through."""
+def _check(output: Path, options: dict[str, Any]) -> None:
+    check_picture(output, overwrite=options["overwrite"])
+
+
+def _draw_waveforms(views: list[Any], output: Path, strip: str, chain: str, options: dict[str, Any]) -> None:
+    """Draws the waveforms as small multiples or as a contact sheet."""
+    shown, more = options["shown"], {"strip": strip, "chain": chain, "overwrite": options["overwrite"]}
+    if shown == "all":
+        last = max(float(view.time[-1] + 0.5 * view.spacing) for view in views)
+        shown = (min(-0.5 * view.spacing for view in views), last)
+    if options["sheet"]:
+        from wavebatch.tools.plots.draw_sheet import draw_sheet
+
+        draw_sheet(views, output, times=shown, **more)
+        return
+    from wavebatch.tools.plots.draw_waveform import draw_waveforms
+
+    draw_waveforms(views, output, times=shown, table=options["table"], **more)
+
+
+def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) -> tuple[list[Any], str]:
+    """The waveforms that are wanted, and the chain that they were run through, in words.
+
+    ranges: compute the distances of the echoes from the sensor, too, if its position is known.
+    """
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
     from wavebatch.surveying.systems.saved_check import check_saved
     from wavebatch.tools.api.run import find_request
     from wavebatch.tools.plots.packets import find_places
-    from wavebatch.tools.plots.waveform import read_views
+    from wavebatch.tools.plots.waveform import add_ranges, describe_chain, read_views
 
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
@@ -120,72 +151,116 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any]) -> tuple[list[Any],
         choice = make_choice(reader, scan, chain, request)
         system = choice.survey.system
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
-        return read_views(reader, scan, places, choice.chain, system), choice.chain.name
+        run, fill = choice.chain, None
+        if ranges:
+            run, fill = add_ranges(choice.chain, reader, scan)
+        views = read_views(reader, scan, places, run, system, options["show"], fill)
+        return views, describe_chain(choice.chain)
 
 
 @plot.command()
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", required=True, help="Extra dimension or standard field; echo_flags counts flags.")
+@click.option("--column", "columns", required=True, multiple=True,
+              help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
+              "share an axis, others get one of their own.")
+@click.option("--by", metavar="COLUMN", help="Draw one line per value of this column, e.g. number_of_returns or "
+              "classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
-              help="Values to show.  [default: all but far outliers]")
+              help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
-@_flags
+@click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
+@flag_options
 @shared.common_options("overwrite", "json", "quiet")
-def histogram(clouds: Sequence[Path], column: str, output: Path, **options: Any) -> None:
-    """Draw a histogram of a column of CLOUDs of any size.
+def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
+    """Draw histograms of columns of CLOUDs of any size.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. Points without data are left
     out and counted. For a column with discrete values, each bin holds the same number of possible values.
 
+    Several lines (of --column, --by or --each) are drawn as shares of their values, so that they can be compared.
+
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.tools.plots.histogram import count_flags, count_values, is_flags
+    from wavebatch.tools.plots.histogram import is_flags
 
     clouds = find_files(map(str, clouds), recursive=options["recursive"])
-    check_picture(output, overwrite=options["overwrite"])
-    selection = _select(column, options)
-    how = {"log": options["log"], "overwrite": options["overwrite"]}
-    if is_flags(clouds[0], column):
-        _refuse_for_flags(options)
-        counted = count_flags(clouds, selection)
-        from wavebatch.tools.plots.draw_cloud import draw_flags
-
-        draw_flags(counted, output, names=tuple(path.name for path in clouds), **how)
-        text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
-        text += f", {counted.total.left_out} left out" * bool(options["where"])
+    _check(output, options)
+    columns = tuple(dict.fromkeys(columns))
+    if any(is_flags(clouds[0], column) for column in columns):
+        text, tallies = _draw_flags(clouds, columns, output, options)
     else:
-        found = count_values(clouds, selection, **{name: options[name] for name in ("bins", "limits", "each")})
-        from wavebatch.tools.plots.draw_cloud import draw_histogram
-
-        draw_histogram(found, output, **how)
-        total = found.total
-        text = f"{count(total.values, 'value')}, {total.no_data} without data, {total.left_out} left out"
+        text, tallies = _draw_histograms(clouds, columns, output, options)
     if not options["quiet"]:
         talk(f"{output}: {text}")
     if options["as_json"]:
-        tally = counted.total if is_flags(clouds[0], column) else total
-        print_json(_describe(output, column, clouds, tally))
+        drawn = [{"columns": list(names), **_list_tally(tally)} for names, tally in tallies.items()]
+        print_json({**_describe(output, clouds), "drawn": drawn})
 
 
-def _describe(output: Path, column: str | None, clouds: Sequence[Path], tally: Any) -> dict[str, Any]:
-    """What was drawn, and how many points were not, for --json."""
-    head = {"output": str(output), "column": column, "clouds": [str(path) for path in clouds]}
-    return {**head, **{name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}}
+def _describe(output: Path, clouds: Sequence[Path]) -> dict[str, Any]:
+    return {"output": str(output), "clouds": [str(path) for path in clouds]}
 
 
-def _select(column: str | None, options: dict[str, Any]) -> Any:
-    from wavebatch.tools.plots.values import Selection, read_flags
+def _list_tally(tally: Any) -> dict[str, int]:
+    """How many points were drawn, and how many were not, for --json."""
+    return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
 
-    flags = read_flags(options["flags_with"]), read_flags(options["flags_without"])
-    return Selection(column, *flags, where=options["where"])
+
+def _draw_flags(
+    clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]
+) -> tuple[str, dict[tuple[str, ...], Any]]:
+    """Draws the counts of flags; returns a summary, and the counts by columns."""
+    from wavebatch.tools.plots.histogram import count_flags
+
+    if len(columns) > 1:
+        raise ConfigError(f"flags are counted by name, not by value: draw {', '.join(columns)} one by one")
+    _refuse_for_flags(options)
+    counted = count_flags(clouds, select(columns[0], options))
+    from wavebatch.tools.plots.draw_cloud import draw_flags
+
+    names = tuple(path.name for path in clouds)
+    draw_flags(counted, output, names=names, log=options["log"], overwrite=options["overwrite"])
+    text = f"{count(counted.total.values, 'point')}, {counted.clean} without a flag"
+    text += f", {counted.total.left_out} left out" * bool(counted.total.left_out)
+    return text, {columns: counted.total}
+
+
+def _draw_histograms(
+    clouds: Sequence[Path], columns: tuple[str, ...], output: Path, options: dict[str, Any]
+) -> tuple[str, dict[tuple[str, ...], Any]]:
+    """Draws histograms, those of one unit in one axis; returns a summary, and the counts by columns."""
+    from wavebatch.tools.plots.histogram import count_values
+    from wavebatch.tools.plots.values import Clouds
+
+    panels: dict[str, list[Any]] = {}
+    for column in columns:
+        selection = select(column, options)
+        panels.setdefault(Clouds(clouds, selection).facts.unit, []).append(selection)
+    how = {name: options[name] for name in ("bins", "limits", "each", "by")}
+    if len(panels) > 1 and options["limits"]:
+        raise ConfigError(f"--range is for one unit; {', '.join(columns)} are in {', '.join(panels)}")
+    every = [count_values(clouds, selections, **how) for selections in panels.values()]
+    from wavebatch.tools.plots.draw_cloud import draw_histograms
+
+    how = {name: options[name] for name in ("log", "counts", "overwrite")}
+    draw_histograms(every, output, **how)
+    texts = []
+    for found in every:
+        total, outside = found.total, int(found.below.sum() + found.above.sum())
+        parts = f"{total.no_data} without data, {total.left_out} left out, {outside} outside the picture"
+        texts.append(f"{count(total.values, 'value')}, {parts}")
+    names = [tuple(one.column for one in selections) for selections in panels.values()]
+    return "; ".join(texts), {columns: found.total for columns, found in zip(names, every, strict=True)}
 
 
 def _refuse_for_flags(options: dict[str, Any]) -> None:
-    for name, option in (("bins", "--bins"), ("limits", "--range"), ("each", "--each")):
+    for name, option in (
+        ("bins", "--bins"), ("limits", "--range"), ("each", "--each"), ("by", "--by"), ("counts", "--counts"),
+    ):  # fmt: skip
         if options[name]:
             raise ConfigError(f"{option} is of no use for flags, which are counted by name")
 
@@ -200,7 +275,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
-@_flags
+@flag_options
 @shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
@@ -217,7 +292,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     statistic = options["statistic"]
     if column is None and statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {statistic} needs a --column; only count and density need none")
-    selection = _select(column, options)
+    selection = select(column, options)
     found = grid_values(clouds, selection, statistic, size=options["size"], bounds=options["bounds"])
     from wavebatch.tools.plots.draw_cloud import draw_map
 
@@ -230,4 +305,9 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     if options["as_json"]:
         cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size}
         more = {"statistic": statistic, "outside": found.outside, **cells}
-        print_json({**_describe(output, column, clouds, found.total), **more})
+        print_json({**_describe(output, clouds), "column": column, **_list_tally(found.total), **more})
+
+
+plot.add_command(section)
+plot.add_command(profile)
+plot.add_command(cube)

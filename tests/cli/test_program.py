@@ -1,0 +1,169 @@
+"""The program as a whole: help with examples, manual pages, version, settings from outside, log files."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import COMMANDS, main
+from wavebatch.cli.program import log_file
+from wavebatch.cli.program.about import roff
+from wavebatch.cli.program.command import ProgramCommand
+from wavebatch.cli.program.examples import EXAMPLES, GROUPS
+from wavebatch.cli.program.settings import EXCLUSIVE, NEVER
+
+
+def invoke(*arguments, **environment):
+    return CliRunner().invoke(main, list(map(str, arguments)), prog_name="wavebatch", env=environment)
+
+
+def _commands():
+    for name in COMMANDS:
+        command = main.get_command(None, name)
+        yield name, command
+        for inner, one in getattr(command, "commands", {}).items():
+            yield f"{name} {inner}", one
+
+
+@pytest.mark.parametrize("title", [title for title, _ in _commands()])
+def test_every_page_of_help_has_examples_and_every_option_once(title):
+    command = dict(_commands())[title]
+    shown = invoke(*title.split(), "--help").stdout
+    if not isinstance(command, click.Group):
+        assert isinstance(command, ProgramCommand) and "Examples:" in shown and EXAMPLES[title]
+    shown = shown[re.search(r"(?m)^[A-Z][\w ]+:\n  -", shown).start() :]
+    for option in command.params:
+        if isinstance(option, click.Option):
+            name = max(option.opts, key=len)
+            assert len(re.findall(rf"(?m)^  (?:-\w, )?{name}(?![\w-])", shown)) == 1, name
+
+
+@pytest.mark.parametrize(
+    ("title", "line"), [(title, line) for title, lines in EXAMPLES.items() for line, _ in lines], ids=str
+)
+def test_examples_are_right_usage(title, line):
+    program, *words = shlex.split(line)
+    assert program == "wavebatch" and words[: len(title.split())] == title.split()
+    dict(_commands())[title].make_context(title, words[len(title.split()) :], parent=click.Context(main))
+
+
+def test_groups_name_options_that_exist_and_each_once():
+    known = {option.name for _, command in _commands() for option in command.params} | {"help"}
+    named = [name for names in GROUPS.values() for name in names]
+    assert len(named) == len(set(named))
+    rivals = {name for group in EXCLUSIVE for name in group}
+    assert [name for name in {*rivals, *NEVER} if name not in {*known, "force"}] == []
+    assert len(set(named) - known) <= len({"where", "drop_flags", "bbox", "polygon", "classes", "las_version", "strict",
+                                           "recursive", "force", "points_"})  # fmt: skip
+
+
+def test_options_that_take_a_number_name_its_unit():
+    for title, command in _commands():
+        for option in command.params:
+            if isinstance(option, click.Option) and isinstance(option.type, click.types.FloatParamType):
+                unit = option.metavar and option.metavar not in ("FLOAT", None)
+                none = option.help.startswith(("Correlation", "Share"))
+                assert unit or none or re.search(r"\[[^\]]+\]", option.help), (title, option.name)
+
+
+def test_version_names_python_and_the_libraries():
+    lines = invoke("--version").stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["wavebatch", "Python", "numpy", "scipy", "laspy", "lazrs"]
+    assert lines[1].split()[1] == sys.version.split()[0]
+
+
+def test_manual_pages_have_the_text_of_help(tmp_path):
+    result = invoke("--man-pages", tmp_path / "man")
+    assert result.exit_code == 0 and result.stdout == ""
+    pages = {path.name: path.read_text() for path in (tmp_path / "man").iterdir()}
+    assert len(pages) == 1 + sum(1 for _ in _commands()) and "wavebatch-plot-map.1" in pages
+    assert ".SH EXAMPLES" in pages["wavebatch-run.1"] and roff("--tolerance LENGTH") in pages["wavebatch-run.1"]
+    assert not any(re.search(r"(?m)^'", text) for text in pages.values())
+    if shutil.which("groff"):
+        for path in (tmp_path / "man").iterdir():
+            shown = subprocess.run(["groff", "-man", "-Tutf8", "-ww", path], capture_output=True, text=True)
+            assert shown.returncode == 0 and not shown.stderr, (path, shown.stderr)
+
+
+@pytest.fixture
+def folder(tiny_strip, tmp_path):
+    (tmp_path / "in").mkdir()
+    shutil.copy(tiny_strip, tmp_path / "in" / "tiny.las")
+    return tmp_path / "in"
+
+
+def _dry(folder, *arguments, **environment):
+    return invoke("run", folder / "tiny.las", "-o", folder / "out", "--dry-run", *arguments, **environment)
+
+
+def test_the_order_is_command_line_variable_file(folder):
+    (folder / "wavebatch.toml").write_text('[run]\nprofile = "fast"\nformat = "las"\n[survey]\nwaveforms = 9\n')
+    shown = _dry(folder)
+    assert shown.exit_code == 0 and "out/tiny.las" in shown.stdout
+    source = str(folder / "wavebatch.toml")
+    assert f"settings: --profile fast ({source}), --format las ({source})" in shown.stderr
+    assert f"# setting: --format las ({source})" in shown.stdout
+    shown = _dry(folder, WAVEBATCH_FORMAT="laz", WAVEBATCH_RUN_PROFILE="balanced", WAVEBATCH_PROFILE="accurate")
+    assert "--format laz (WAVEBATCH_FORMAT)" in shown.stderr
+    assert "--profile balanced (WAVEBATCH_RUN_PROFILE)" in shown.stderr
+    shown = _dry(folder, "--tolerance", "5m", "--format", "las", WAVEBATCH_PROFILE="fast")
+    assert shown.exit_code == 0 and shown.stderr == ""  # what excludes others takes their place
+
+
+def test_settings_change_the_result_as_options_do(folder):
+    (folder / "wavebatch.toml").write_text('[run]\nprofile = "fast"\nformat = "las"\noutput = "there"\n')
+    result = invoke("run", folder, "--quiet")
+    assert result.exit_code == 0 and (folder / "there" / "tiny.las").exists()
+    assert result.stderr.count("settings: ") == 1  # a file beside the strips is never silent
+    assert "settings" not in invoke("run", folder, "-q", "--resume", "-o", folder / "other", "--profile", "fast",
+                                    "--format", "las", WAVEBATCH_JOBS="1").stderr  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[run]\njbos = 3\n", "has no option 'jbos'; did you mean 'jobs'?"),
+        ("[run]\noverwrite = true\n", "overwrite can be given on the command line only"),
+        ("[run\n", "wavebatch.toml"), ("run = 3\n", "must be a table"),
+        ('[run]\njobs = "many"\n', "invalid value for '--jobs'"),
+    ],
+)  # fmt: skip
+def test_wrong_settings_are_one_line(folder, text, words):
+    (folder / "wavebatch.toml").write_text(text)
+    result = _dry(folder)
+    assert result.exit_code == 2 and words in result.stderr and result.stderr.count("\n") == 1, result.stderr
+
+
+def test_strips_of_folders_with_different_settings_are_not_mixed(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "two")
+    for name in ("in", "two"):
+        (tmp_path / name / "wavebatch.toml").write_text("[stats]\njson = true\n")
+    result = invoke("stats", tmp_path / "in", tmp_path / "two" / "*.las")
+    assert result.exit_code == 2 and "different settings" in result.stderr
+    assert invoke("stats", tmp_path / "two" / "*.las").stdout.startswith("{")
+
+
+def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
+    log = tmp_path / "night.log"
+    (folder / "broken.las").write_bytes((folder / "tiny.las").read_bytes()[:300])
+    arguments = ["run", folder, "-o", tmp_path / "out", "-q", "--profile", "fast", "--log-file", log]
+    assert invoke(*arguments).exit_code == 3
+    lines = log.read_text().splitlines()
+    assert all(re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ (INFO|WARNING|ERROR) ", line) for line in lines)
+    assert any("INFO" in line and "tiny.las" in line and "waveforms" in line for line in lines)
+    assert any("ERROR" in line and "broken.las" in line for line in lines)
+    assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
+    assert log.read_text().count("broken.las") == 2 and log_file._log is None
+
+
+def test_a_log_never_grows_into_another_file(folder):
+    before = (folder / "tiny.las").read_bytes()
+    result = invoke("info", folder / "tiny.las", "--log-file", folder / "tiny.las")
+    assert result.exit_code == 2 and "is no log" in result.stderr and (folder / "tiny.las").read_bytes() == before
+    result = invoke("info", folder / "tiny.las", "--log-file", folder / "no" / "x.log")
+    assert result.exit_code == 2 and "cannot be written" in result.stderr

@@ -1,0 +1,72 @@
+"""docs/recipes.md: every block runs where its programs are installed; all of wavebatch's commands run everywhere."""
+
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "recipes.md").read_text("utf-8")
+BLOCKS = dict(re.findall(r'(?ms)^```\w+ title="([^"]+)"\n(.*?)^```$', PAGE))
+RECIPES = {title: text for title, text in BLOCKS.items() if "." not in title}
+PROGRAMS = {"wavebatch", "python"}
+
+
+def _programs(text: str) -> list[str]:
+    """The program of each command; lines that go on with a backslash are one command."""
+    return [line.split()[0] for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+@pytest.fixture(scope="module")
+def folder(tiny_strip, tmp_path_factory):
+    """A strip, the files of the page, and programs `wavebatch` and `python` of this checkout."""
+    folder = tmp_path_factory.mktemp("recipes")
+    shutil.copy(tiny_strip, folder / "strip.las")
+    for title, text in BLOCKS.items():
+        if "." in title:
+            (folder / title).write_text(text)
+    (folder / "bin").mkdir()
+    for name, words in (("wavebatch", f"{sys.executable} -m wavebatch"), ("python", sys.executable)):
+        path = folder / "bin" / name
+        path.write_text(f'#!/bin/sh\nexec {words} "$@"\n')
+        path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return folder
+
+
+def _run(folder, text):
+    paths = os.pathsep.join([str(Path(__file__).resolve().parent.parent), *filter(None, sys.path)])
+    environment = {**os.environ, "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": paths}
+    done = subprocess.run(["bash", "-euo", "pipefail", "-c", text], cwd=folder, env=environment, capture_output=True,
+                          text=True, timeout=300)  # fmt: skip
+    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def test_the_page_has_the_programs_of_the_field():
+    named = {program for text in RECIPES.values() for program in _programs(text)}
+    assert {"gdalinfo", "pdal", "untwine", "Rscript", "CloudCompare", "qgis_process"} <= named
+
+
+@pytest.mark.parametrize("title", list(RECIPES))
+def test_recipe(folder, title):
+    text = RECIPES[title]
+    missing = sorted({name for name in _programs(text) if name not in PROGRAMS and shutil.which(name) is None})
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}")
+    if "wavebatch grid" in text:
+        pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    for name in ("clouds", *(path.name for path in folder.glob("*.tif"))):
+        path = folder / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+    shown = _run(folder, text)
+    if title == "gdal-raster":
+        assert "Description = median of echo_width" in shown and "NoData Value=-9999" in shown
+        assert "Unit Type: ns" in shown and "STATISTICS_MEAN=" in shown
+    if title == "laspy":
+        assert 2 < float(shown) < 20
+    if title == "lidr":
+        assert "Median" in shown

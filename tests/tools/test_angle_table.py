@@ -1,0 +1,74 @@
+"""`wavebatch survey --angles`: the table says what the stage would write, and what the survey predicts."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.core.units import FWHM_PER_SIGMA, C
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.surveying.angle_limits import SLOPE, predict_angles
+from wavebatch.tools.compare.angle_table import ANGLES, format_angles, tabulate_angles
+
+GAUSSIAN = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0, width_scatter=0.01)
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["survey", *map(str, words)])
+
+
+def test_widths_are_the_pulse_and_the_spread_of_a_plane():
+    found = tabulate_angles(GAUSSIAN, 1.0, 700.0, 0.5, 80.0)
+    spread = 700.0 * 0.5e-3 / 2 * np.tan(np.radians(ANGLES)) / C
+    assert found.spread == pytest.approx(spread, rel=1e-9)
+    assert found.width == pytest.approx(FWHM_PER_SIGMA * np.hypot(2.0, spread), rel=1e-3)
+    assert (np.diff(found.width) >= 0).all() and (np.diff(found.error[40:]) < 0).all()
+
+
+def test_errors_are_those_that_the_survey_predicts():
+    for amplitude in (30.0, 300.0):
+        found = tabulate_angles(GAUSSIAN, 1.0, 700.0, 0.5, amplitude)
+        predicted = predict_angles(GAUSSIAN, 1.0, 700.0, 0.5, amplitude).error
+        assert found.error[int(SLOPE)] == pytest.approx(predicted, rel=0.02)
+
+
+def test_level_ground_that_is_wider_than_the_pulse_shifts_the_table():
+    wide = replace(GAUSSIAN, level_variance=0.5)
+    found = tabulate_angles(wide, 1.0, 700.0, 0.5, 80.0)
+    assert found.width[0] == pytest.approx(FWHM_PER_SIGMA * np.sqrt(4.5), rel=1e-3)
+
+
+def test_angles_that_no_width_means_are_empty():
+    found = tabulate_angles(replace(GAUSSIAN, level_variance=-3.999), 1.0, 700.0, 0.5, 80.0)
+    text = format_angles(found).splitlines()
+    assert np.isnan(found.width[0]) and text[1].split(",")[2:4] == ["", ""]
+
+
+def test_command_writes_and_draws(riegl, tmp_path):
+    target = tmp_path / "a.csv"
+    result = run(riegl, "--divergence", 0.5, "--angles", target)
+    assert result.exit_code == 0 and f"{target}: written" in result.stderr, result.output
+    rows = list(csv.DictReader(target.read_text().splitlines()))
+    assert [float(row["angle_deg"]) for row in rows] == ANGLES.tolist()
+    assert {row["divergence_mrad"] for row in rows} == {"0.5"} and 100 < float(rows[0]["distance_m"]) < 5000
+    refused = run(riegl, "--divergence", 0.5, "--angles", target)
+    assert refused.exit_code in (1, 2) and "--overwrite" in refused.stderr
+    pytest.importorskip("matplotlib")
+    assert run(riegl, "--divergence", 0.5, "--angles", tmp_path / "a.svg").exit_code == 0
+    assert "incidence angle [deg]" in (tmp_path / "a.svg").read_text("utf-8")
+
+
+def test_a_strip_without_level_ground_has_no_table(tiny_strip, tmp_path):
+    result = run(tiny_strip, "--divergence", 0.5, "--angles", tmp_path / "a.csv")
+    assert result.exit_code == 1 and "which width a surface has that faces the sensor" in result.stderr
+    assert not (tmp_path / "a.csv").exists()
+
+
+def test_two_strips_have_no_common_table(tiny_strip, tmp_path):
+    other = tmp_path / "other.las"
+    other.write_bytes(tiny_strip.read_bytes())
+    result = run(tiny_strip, other, "--divergence", 0.5, "--angles", tmp_path / "b.csv")
+    assert result.exit_code == 2 and "is for one strip" in result.stderr and not (tmp_path / "b.csv").exists()

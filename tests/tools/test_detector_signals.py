@@ -1,0 +1,115 @@
+"""`plot waveform --show`: the signal that is drawn is the one in which the stage finds its echoes."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from plot_tools import PULSE, make_chain, simulate
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
+from wavebatch.kernels.fit.pulse_shape import PulseShape
+from wavebatch.kernels.signal.square_differences import find_minima, keep_prominent
+from wavebatch.stages.chain import STAGES, Step
+from wavebatch.stages.noise import pooled
+from wavebatch.tools.plots.detector_signals import _SIGNALS, KINDS, choose_step, see_block
+from wavebatch.tools.plots.waveform import build_views
+
+
+def run(*words):
+    return CliRunner().invoke(main, ["plot", "waveform", *map(str, words)])
+
+
+BLOCK = simulate(PulseShape(), [(60.0, 25.3, 2.0), (6.0, 45.0, 2.0)], n=60)
+
+
+def see(name, **parameters):
+    return see_block(BLOCK, pooled(BLOCK, PULSE), PULSE, Step(STAGES[name], parameters))
+
+
+def test_every_detector_has_a_signal():
+    assert set(_SIGNALS) == {name for name in STAGES if name.startswith("detect.")}
+    assert {name for names in KINDS.values() for name in names} <= set(_SIGNALS)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters"),
+    [
+        ("detect.maximum", {}), ("detect.maximum", {"threshold": 8.0}), ("detect.matched_filter", {}),
+        ("detect.wavelet", {}), ("detect.wavelet", {"wavelet": "mexican_hat"}),
+        ("detect.correlation", {"similarity": 0.0}),
+        ("detect.correlation", {"reference": "gaussian", "similarity": 0.0}),
+    ],
+)  # fmt: skip
+def test_echoes_are_the_maxima_above_the_threshold(name, parameters):
+    for signal in see(name, **parameters):
+        values = signal.values
+        inner = values[1:-1]
+        peak = 1 + np.flatnonzero((inner > values[:-2]) & (inner >= values[2:]) & (inner > signal.least))
+        found = signal.found.time / BLOCK.spacing
+        assert len(found) == len(peak)
+        assert np.abs(found - signal.time[peak] / BLOCK.spacing).max(initial=0) < 1.01
+
+
+@pytest.mark.parametrize("rule", ["paper", "absolute"])
+def test_asdf_has_minima_as_deep_as_the_bars(rule):
+    for signal in see("detect.asdf", rule=rule):
+        minima = find_minima(np.ascontiguousarray(signal.values[None]))
+        kept = minima.row[keep_prominent(minima, np.array([signal.least]))]
+        at = np.interp(signal.found.time, signal.time, np.arange(len(signal.time)))
+        near = np.abs(at[:, None] - kept[None])
+        assert (near.min(axis=1) < 1.6).all(), "every echo lies at a minimum that is deep enough"
+        if rule == "paper":
+            assert len(kept) == len(at)
+
+
+def test_spikes_have_sums_above_the_threshold():
+    for signal in see("detect.richardson_lucy"):
+        assert np.interp(signal.found.time, signal.time, signal.second).min(initial=np.inf) > 0.95 * signal.least
+        assert signal.values.sum() == pytest.approx(66, rel=0.25)
+        assert (signal.second >= signal.values - 1e-3).all()
+
+
+@pytest.mark.parametrize("derivative", ["first", "second"])
+def test_zero_crossings_are_those_of_the_derivative(derivative):
+    for signal in see("detect.zero_crossing", derivative=derivative):
+        for time in signal.found.time.tolist():
+            here = np.interp([time - 1.0, time, time + 1.0], signal.time, signal.values)
+            if derivative == "first":
+                assert here[0] > 0 > here[2] and abs(here[1]) < 0.2 * (here[0] - here[2])
+            else:
+                assert here[1] > 0
+
+
+def test_second_derivative_peaks_pass_its_threshold():
+    for signal in see("detect.second_derivative"):
+        assert len(signal.found) >= 1
+        assert (np.interp(signal.found.time, signal.time, signal.values) > 0.9 * signal.least).all()
+
+
+def test_the_chains_own_detector_keeps_its_parameters():
+    chain = make_chain("decompose.gaussian")
+    assert choose_step(chain, "detector") is chain.steps[1]
+    assert choose_step(chain, "asdf").stage.name == "detect.asdf"
+    with pytest.raises(ConfigError, match="must be one of detector, asdf"):
+        choose_step(chain, "spline")
+    (view,) = build_views(BLOCK.rows(slice(0, 1)), chain, PULSE, [0], "wavelet")
+    assert view.seen.stage == "detect.wavelet, which the chain does not use"
+    (view,) = build_views(BLOCK.rows(slice(0, 1)), chain, PULSE, [0], "detector")
+    assert view.seen.stage == "detect.maximum"
+
+
+@pytest.mark.parametrize("show", ["detector", *KINDS])
+def test_pictures_have_the_signal_and_its_rule(tiny_strip, tmp_path, show):
+    pytest.importorskip("matplotlib")
+    result = run(tiny_strip, "-o", tmp_path / "p.svg", "--packet", 3, "--show", show, "--profile", "fast")
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "p.svg").read_text("utf-8")
+    assert "found by the detector" in text and "std" in text
+    assert ("which the chain does not use" in text) == (show != "detector")
+
+
+def test_an_unknown_signal_is_one_line(tiny_strip, tmp_path):
+    pytest.importorskip("matplotlib")
+    result = run(tiny_strip, "-o", tmp_path / "p.svg", "--show", "asdff")
+    assert result.exit_code == 2 and "must be one of" in result.stderr and result.stderr.count("\n") == 1
+    assert run(tiny_strip, "-o", tmp_path / "p.svg", "--sheet", "--show", "asdf").exit_code == 2

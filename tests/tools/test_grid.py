@@ -1,0 +1,178 @@
+"""`wavebatch grid`: every cell equals a plain count, in bounded memory; GDAL reads place, CRS, units and no-data."""
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.files.las.crs import read_crs_definition
+from wavebatch.files.las.header import read_header
+from wavebatch.tools.rasters import grid as module
+from wavebatch.tools.rasters.cells import STATISTICS, compute_cells
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # inside rasterio
+
+UTM = (
+    'PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",15],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["metre",1],AUTHORITY["EPSG","32633"]]'
+)
+
+
+def _cloud(path, rng, n=4000, *, wkt=UTM, west=500_000.0, epsg=None):
+    """A cloud over 700 m x 300 m; a tenth of the heights have no data."""
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = (0.001,) * 3, (west, 5_400_000.0, 0.0)
+    header.add_extra_dim(laspy.ExtraBytesParams("height", "f4", "over ground [m]", no_data=np.array([-9999.0])))
+    if wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    if epsg:
+        keys = np.array([1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, epsg], "<u2").tobytes()
+        header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
+    las = laspy.LasData(header)
+    las.points = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+    las.x, las.y = west + rng.uniform(0, 700, n), 5_400_000 + rng.uniform(0, 300, n)
+    las.gps_time = 1e9 + np.arange(n) * 1e-5
+    values = rng.normal(10, 3, n).astype(np.float32)
+    values[::10] = -9999
+    las["height"] = values
+    las.write(path)
+    return np.asarray(las.x), np.asarray(las.y), np.where(values == -9999, np.nan, values.astype(np.float64))
+
+
+def _run(*arguments, code=0):
+    result = CliRunner().invoke(main, ["grid", *map(str, arguments)])
+    assert result.exit_code == code, (result.stderr, result.exception)
+    return result
+
+
+def _naive(statistic, values, area):
+    values = values[~np.isnan(values)]
+    if not len(values) or statistic == "std" and len(values) < 2:
+        return np.nan
+    if statistic in ("count", "density"):
+        return len(values) / (area if statistic == "density" else 1)
+    return np.std(values, ddof=1) if statistic == "std" else getattr(np, statistic)(values)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_every_statistic_equals_its_definition(rng, statistic):
+    cell, values = rng.integers(0, 50, 300), rng.normal(1e6, 1, 300)
+    values[rng.random(300) < 0.2] = np.nan
+    found = compute_cells(statistic, cell, values, 60, 4.0)
+    np.testing.assert_allclose(found, [_naive(statistic, values[cell == n], 4.0) for n in range(60)], rtol=1e-9)
+
+
+def test_the_epsg_code_of_geotiff_keys_and_wkt_is_found(rng, tmp_path):
+    for name, given, wanted in (("k.las", {"wkt": None, "epsg": 25832}, "EPSG:25832"), ("w.las", {}, UTM),
+                                ("n.las", {"wkt": None}, None)):  # fmt: skip
+        _cloud(tmp_path / name, rng, 10, **given)
+        assert read_crs_definition(tmp_path / name, read_header(tmp_path / name)) == wanted
+
+
+def test_without_rasterio_one_line_says_what_to_install(rng, tmp_path, monkeypatch):
+    _cloud(tmp_path / "a.las", rng, 10)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
+    assert "pip install rasterio" in result.stderr and result.stderr.count("\n") == 1
+
+
+@pytest.fixture
+def rasterio():
+    return pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+
+
+@pytest.mark.parametrize("statistic", ["median", "mean", "max", "count"])
+@pytest.mark.parametrize("held", [2_000_000, 64])
+def test_cells_are_those_of_a_plain_count(rasterio, rng, tmp_path, monkeypatch, statistic, held):
+    monkeypatch.setattr(module, "HELD", held)  # 64: buckets that do not fit, tile by tile in groups of cells
+    monkeypatch.setattr(module, "MOST_BUCKETS", 2 if held == 64 else 4096)
+    x, y, height = _cloud(tmp_path / "a.las", rng)
+    result = _run(tmp_path / "a.las", "--column", "height", "--column", "gps_time", "--statistic", statistic,
+                  "--size", 2, "-o", tmp_path / "x.tif")  # fmt: skip
+    assert "4000 points" in result.stderr and "height 3600 values, 400 without data" in result.stderr
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.crs.to_epsg() == 32633 and found.nodata == -9999
+        assert found.block_shapes == [(256, 256)] * 2
+        assert found.descriptions == (f"{statistic} of height", f"{statistic} of gps_time")
+        assert found.units == (("", "") if statistic == "count" else ("m", "s")) or found.units == (None, None)
+        raster = found.read(1, masked=True).filled(np.nan)
+        rows, columns = rasterio.transform.rowcol(found.transform, x, y)
+        if statistic != "count":
+            assert found.dtypes[1] == "float64" and abs(found.read(2, masked=True).max() - 1e9) < 1
+    rows, columns = np.array(rows, int), np.array(columns, int)
+    for place in {*zip(rows[:300].tolist(), columns[:300].tolist(), strict=True)}:
+        inside = (rows == place[0]) & (columns == place[1])
+        np.testing.assert_allclose(raster[place], _naive(statistic, height[inside], 4), rtol=1e-6)
+    filled = {*zip(rows[~np.isnan(height)].tolist(), columns[~np.isnan(height)].tolist(), strict=True)}
+    assert np.isfinite(raster).sum() == len(filled)
+
+
+def test_more_buckets_than_tiles_are_fine(rasterio, rng, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "HELD", 100)
+    _, _, height = _cloud(tmp_path / "a.las", rng)
+    _run(tmp_path / "a.las", "--column", "height", "--statistic", "max", "--size", 5000, "-o", tmp_path / "x.tif")
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.read(1, masked=True).max() == np.nanmax(height).astype(np.float32)
+
+
+def test_rasters_of_neighbours_and_bounds_fit_the_same_grid(rasterio, rng, tmp_path):
+    x, _, _ = _cloud(tmp_path / "a.las", rng)
+    _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "--bounds", "500100,5400100,500200.5,5400150", "-o",
+         tmp_path / "x.tif")  # fmt: skip
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert all(abs(edge / 7 - round(edge / 7)) < 1e-9 for edge in found.bounds)
+        assert found.bounds.left <= 500_100 and found.bounds.right >= 500_200.5
+        west, east = found.bounds.left, found.bounds.right
+        part = found.read(1, masked=True).sum()
+    _run(tmp_path / "a.las", "--statistic", "count", "--size", 7, "-o", tmp_path / "y.tif")
+    with rasterio.open(tmp_path / "y.tif") as found:
+        whole = found.read(1, masked=True)
+        assert whole.sum() == len(x)
+        window = rasterio.windows.from_bounds(west, 5_400_094, east, 5_400_150, found.transform).round()
+        assert found.read(1, window=window, masked=True).sum() >= part > 0
+
+
+def test_clouds_far_apart_take_little_room_and_a_damaged_coordinate_is_refused(rasterio, rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng, 500)
+    _cloud(tmp_path / "b.las", rng, 500, west=600_000.0)
+    _run(tmp_path / "*.las", "--statistic", "density", "-o", tmp_path / "x.tif")
+    assert (tmp_path / "x.tif").stat().st_size < 1_000_000
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.width > 100_000 and found.units == ("1/m2",)
+    result = _run(tmp_path / "*.las", "--statistic", "count", "--size", 1e-4, "-o", tmp_path / "y.tif", code=2)
+    assert "are too many" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["-o", "x.tif"], "needs a --column"), (["--column", "heigt", "-o", "x.tif"], "did you mean 'height'"),
+        (["--column", "height", "-o", "x.png"], "use .tif"),
+        (["--column", "height", "--size", "0", "-o", "x.tif"], "must be more than 0"),
+        (["--column", "height", "--crs", "EPSG:4978", "-o", "x.tif"], "geocentric"),
+        (["--column", "height", "--crs", "EPSG:0", "-o", "x.tif"], "give it with --crs"),
+        (["--column", "height", "--no-data", "1e39", "-o", "x.tif"], "float32"),
+        (["--statistic", "count", "--no-data", "1", "-o", "x.tif"], "choose another with --no-data"),
+        (["--statistic", "count", "--flags-with", "WEAK", "-o", "x.tif"], "has no column echo_flags"),
+    ],
+)  # fmt: skip
+def test_wrong_use_is_one_line_and_writes_nothing(rasterio, rng, tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    _cloud(tmp_path / "a.las", rng, 100)
+    result = _run("a.las", *arguments, code=2)
+    assert words in result.stderr and result.stderr.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.las"]
+
+
+def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, rng, tmp_path):
+    _cloud(tmp_path / "a.las", rng, 50)
+    _cloud(tmp_path / "b.las", rng, 50, wkt=None, epsg=25832)
+    result = _run(tmp_path / "*.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
+    assert "has another CRS than" in result.stderr
+    _cloud(tmp_path / "c.las", rng, 50, wkt=None)
+    assert "have no CRS" in _run(tmp_path / "c.las", "--statistic", "count", "-q", "-o", tmp_path / "x.tif").stderr
+
+

@@ -1,0 +1,239 @@
+"""Report pages of --html: whole, closed to the network, numbers equal to the JSON, and shown by a real browser."""
+
+import json
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import zlib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from html_tools import Page
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError
+from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
+from wavebatch.surveying.calibration import Calibration, StripConstant, TargetResult
+from wavebatch.tools.html import markup, page
+from wavebatch.tools.html.calibrate_page import write_calibrate_page
+from wavebatch.tools.html.drawing.charts import draw_histogram, draw_values
+from wavebatch.tools.html.drawing.png import color_cells, encode_png
+from wavebatch.tools.html.drawing.svg import Axis, Chart, log_ticks, round_ticks
+from wavebatch.tools.html.outliers import FIGURES, find_outliers
+from wavebatch.tools.html.strip_part import list_sums
+
+
+def _run(*arguments, code=0):
+    result = CliRunner().invoke(main, list(map(str, arguments)), catch_exceptions=False)
+    assert result.exit_code == code, result.stderr
+    return result
+
+
+@pytest.fixture(scope="module")
+def flight(tiny_strip, tmp_path_factory):
+    """A folder with the page of a run over two good strips and a broken one, and its summary."""
+    folder = tmp_path_factory.mktemp("html")
+    (folder / "in").mkdir()
+    for name in ("a <b>&\"1'.las", "second.las"):
+        shutil.copy(tiny_strip, folder / "in" / name)
+    (folder / "in" / "broken.las").write_bytes(tiny_strip.read_bytes()[:300])
+    _run("run", folder / "in", "-o", folder / "out", "--html", folder / "run.html", "--report", folder / "run.json",
+         code=3)  # fmt: skip
+    return folder
+
+
+def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report(flight):
+    shown, report = Page(flight / "run.html").check(), json.loads((flight / "run.json").read_text())
+    wanted = ["Summary", "Failed strips", "Strips", "Counts", "Survey", "Decisions", "Echoes", "Random waveforms",
+              "Worst fits", "Columns of the cloud", "Maps", "Flags", "Provenance"]  # fmt: skip
+    assert [name for name in wanted if name not in shown.headings] == []
+    for name in ("points_in", "waveforms", "echoes", "matched_returns", "added_echoes", "points_out"):
+        assert shown.row(name)[1] == f"{report['counts'][name]:,}"
+    assert "does not add up" not in shown.text and shown.text.count("adds up") == 4 * 3
+    assert shown.text.count("broken.las") >= 2
+    assert 'a <b>&"1\'.las' in shown.text  # shown as it is, never as markup
+    assert "<b>&" not in shown.source
+
+
+def test_a_page_is_the_same_for_the_same_result(flight, tmp_path):
+    again = tmp_path / "again.html"
+    _run("run", flight / "in", "-o", flight / "out", "--resume", "--html", again, code=3)
+    times = (
+        r"(?s)<h4>Seconds of the processes.*?</section>|<section>\n<h2>Run<.*?</section>|\n<p>2 of the strips[^<]*</p>"
+    )
+    first, second = (
+        re.sub(times, "", path.read_text()).replace("skipped", "written") for path in (flight / "run.html", again)
+    )
+    assert first.splitlines() == second.splitlines()
+
+
+def test_pages_of_survey_and_compare(flight, tiny_strip, tmp_path):
+    cloud = flight / "out" / "second.laz"
+    found = _run("survey", tiny_strip, "--html", tmp_path / "s.html", "--json")
+    shown, document = Page(tmp_path / "s.html").check(), json.loads(found.stdout)
+    assert shown.row("noise")[1] == f"{document['system']['noise_std_dn']:.3f} DN"
+    assert all(one["reason"] in shown.text for one in document["decisions"])
+    assert 'aria-label="System pulse"' in shown.source
+    found = _run("compare", cloud, tiny_strip, "--html", tmp_path / "c.html", "--json")
+    shown, document = Page(tmp_path / "c.html").check(), json.loads(found.stdout)
+    assert shown.row("identical")[1] == f"{document['matched']:,}" and "does not add up" not in shown.text
+    _run("compare", "--strip", tiny_strip, "fast", "accurate", "--html", tmp_path / "m.html")
+    assert "Goodness of fit" in Page(tmp_path / "m.html").check().headings
+
+
+def test_the_page_of_a_flight_names_strips_that_do_not_belong(tiny_strip, tmp_path):
+    shutil.copy(tiny_strip, tmp_path / "a.las")
+    shutil.copy(tiny_strip, tmp_path / "b.las")
+    _run("survey", tmp_path, "--html", tmp_path / "s.html")
+    shown = Page(tmp_path / "s.html").check()
+    assert "Strips" in shown.headings and shown.text.count("belongs to the others") == 2
+
+
+def test_the_page_of_a_benchmark(timed_here, tmp_path):
+    found = _run("bench", "--scene", "open", "--waveforms", 600, "--pulses", 0, "--no-peers", "--no-stability",
+                 "--repeat", 1, "--json", "--html", tmp_path / "b.html")  # fmt: skip
+    shown, document = Page(tmp_path / "b.html").check(), json.loads(found.stdout)
+    for row in document["scenes"][0]["rows"]:
+        share = 100 * row["figures"]["completeness"]["value"]
+        name = f"{row['name']} (is {row['same_as']})" if row.get("same_as") else row["name"]
+        assert f"{share:.2f}" in shown.row(name)[2]
+
+
+def test_the_page_of_a_calibration(tmp_path):
+    targets = (TargetResult("roof <i>", 0.3, 50, 2e-9, 0.1, 12.0), TargetResult("lake", 0.02, 1, refused="too few"))
+    strips = tuple(StripConstant(f"{n}.las", "", 1, 0, 2e-9, 0.05, 0.01 * n, 0.02, 9) for n in range(3))
+    found = Calibration(2e-9, 0.05, strip="s.las", targets=targets, strips=strips, notes=("constants differ",))
+    pairs = (PairOverlap("0.las", "1.las", 40, 1.1, 1.01, 0.02, 0.003, 0.01),)
+    write_calibrate_page(tmp_path / "c.html", FlightCalibration(found, pairs))
+    shown = Page(tmp_path / "c.html").check()
+    assert shown.row("roof <i>")[2] == "50" and shown.row("lake")[-1] == "too few"
+    assert "constants differ" in shown.text
+
+
+def test_counts_that_do_not_add_up_are_marked(flight):
+    counts = json.loads((flight / "run.json").read_text())["counts"]
+    assert "does not add up" not in list_sums(counts)
+    assert list_sums({**counts, "echoes": counts["echoes"] + 1}).count("does not add up") == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("no/such/r.html", "does not exist; make it first"), ("out/second.laz", "choose another name"),
+     ("in/second.las", "input"), ("notes.txt", "is no report of wavebatch")],
+)  # fmt: skip
+def test_a_page_replaces_only_a_page(flight, name, words):
+    (flight / "notes.txt").write_text("mine")
+    result = _run("run", flight / "in" / "second.las", "-o", flight / "out", "--resume", "--html", flight / name,
+                  code=2)  # fmt: skip
+    assert words in result.stderr and result.stderr.count("\n") == 1
+    assert (flight / "notes.txt").read_text() == "mine"
+
+
+def test_a_page_that_cannot_be_written_does_not_hide_the_clouds(tiny_strip, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.tools.html.run_page.write_page", lambda *_: 1 / 0)
+    result = _run("run", tiny_strip, "-o", tmp_path / "out", "--html", tmp_path / "r.html", code=1)
+    assert "error: --html: ZeroDivisionError" in result.stderr and (tmp_path / "out" / "tiny.laz").exists()
+
+
+def test_without_the_option_nothing_of_it_is_imported(tiny_strip, tmp_path):
+    code = (
+        "import sys; from wavebatch.cli import main\n"
+        "from click.testing import CliRunner\n"
+        "result = CliRunner().invoke(main, sys.argv[1:]); assert result.exit_code == 0, result.output\n"
+        "names = ('wavebatch.tools.html', 'wavebatch.tools.plots', 'matplotlib')\n"
+        "bad = [name for name in sys.modules if name.startswith(names)]\n"
+        "assert not bad, bad"
+    )
+    for arguments in (["run", tiny_strip, "-o", tmp_path / "o"], ["survey", tiny_strip]):
+        subprocess.run([sys.executable, "-c", code, *map(str, arguments)], check=True)
+
+
+def test_outliers_are_far_from_the_others_and_few_strips_have_none():
+    usual = [{"noise": 1.0 + 0.01 * n, "echoes": 1.2, "pulse": 4.0} for n in range(8)]
+    assert not any(find_outliers(usual)) and set(usual[0]) < set(FIGURES)
+    marked = find_outliers([*usual, {"noise": 2.0, "echoes": float("nan"), "pulse": 4.01}])
+    assert [sorted(one) for one in marked] == [[]] * 8 + [["noise"]]
+    assert "median" in marked[-1]["noise"]
+    assert not any(find_outliers([{"noise": 1.0}, {"noise": 50.0}]))
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 1), (-3.2, 17), (548342.7, 548370.1), (1e-9, 3e-9), (0, 3e12), (5, 5)])
+def test_ticks_are_round_inside_and_few(low, high):
+    ticks = round_ticks(low, high)
+    assert 1 <= len(ticks) <= 7 and all(low - 1e-9 * abs(low) <= tick <= high * (1 + 1e-9) for tick in ticks)
+    assert ticks == sorted(set(ticks))
+
+
+def test_logarithmic_ticks():
+    assert log_ticks(3, 250) == [5, 10, 20, 50, 100, 200]
+    assert log_ticks(1e-3, 1e9) == [1e-3, 1e-1, 1e1, 1e3, 1e5, 1e7, 1e9]
+
+
+def test_a_chart_keeps_its_marks_finite_and_its_words_escaped():
+    chart = Chart(Axis(0, 1), Axis(2, 2), title="<x>", labels=("&", '"'))
+    chart.line(np.array([0, np.nan, 1, np.inf]), np.array([1, 2, 1e300, 3]), 0, name="<n>")
+    chart.points(np.array([np.nan, 0.5]), np.array([1.0, 2.0]), 1, names=["a", "<b>"])
+    drawn = chart.render()
+    assert not re.search("nan|inf|<x>|<b>|<n>", drawn) and drawn.count("<circle") == 1
+
+
+def test_a_histogram_counts_what_it_leaves_out(rng):
+    values = np.append(rng.normal(0, 1, 9990), np.full(10, 90.0))
+    edges = np.linspace(-100, 100, 20_001)
+    drawn = draw_histogram(edges, np.histogram(values, edges)[0], title="t", label="m", beyond=7)
+    inside = sum(int(number.replace(",", "")) for number in re.findall(r"<title>[^<]*: ([\d,]+)</title>", drawn))
+    left = int(re.search(r"([\d,]+) of them outside", drawn)[1])
+    assert inside + left == 10_007 and left <= 10 + 7 + 10
+    assert "no values" in draw_histogram(edges, np.zeros(20_000, np.int64), title="t", label="m")
+    assert "nan" not in draw_values(["a"], [0.0], [float("nan")], title="t", label="l")
+
+
+def test_a_png_holds_its_pixels(rng):
+    pixels = color_cells(np.array([[0.0, 1.0, np.nan], [0.5, -9, 9]]), 0, 1)
+    assert pixels[0, 2, 3] == 0 and (pixels[1, 1] == pixels[0, 0]).all() and (pixels[1, 2] == pixels[0, 1]).all()
+    data = encode_png(pixels)
+    assert struct.unpack(">II", data[16:24]) == (3, 2)
+    length = struct.unpack(">I", data[33:37])[0]
+    lines = np.frombuffer(zlib.decompress(data[41 : 41 + length]), np.uint8).reshape(2, 13)
+    assert (lines[:, 1:].reshape(2, 3, 4) == pixels).all() and not lines[:, 0].any()
+
+
+def test_text_of_any_kind_is_escaped(tmp_path):
+    words = "</script><script>alert(1)</script>\x00\x1b[31m\udcff\n\"'"
+    page.write_page(tmp_path / "p.html", words, [markup.table([words], [[words]]), markup.code(words)])
+    shown = Page(tmp_path / "p.html").check()
+    assert sum(tag == "script" for tag, _ in shown.elements) == 1 and "\x1b" not in shown.source
+    with pytest.raises(ConfigError, match="is no report"):
+        (tmp_path / "x").write_text("<html>")
+        page.write_page(tmp_path / "x", "t", [])
+
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no headless browser is installed")
+def test_a_real_browser_shows_the_page_sorts_its_table_and_complains_about_nothing(flight, tmp_path):
+    source = (flight / "run.html").read_text()
+    # The page's rules allow its own script only; the test's script needs a door.
+    probe = (
+        "<script>const t = document.querySelector('table.sortable'); t.tHead.rows[0].cells[2].click();"
+        "const v = () => [...t.tBodies[0].rows].map((r) => r.cells[2].textContent).join('|');"
+        "const up = v(); t.tHead.rows[0].cells[2].click();"
+        "document.title = 'SORTED ' + up + ' THEN ' + v() + ' WIDTH ' +"
+        " [...document.querySelectorAll('svg.chart')].every((s) => s.getBoundingClientRect().height > 50);</script>"
+    )
+    opened = re.sub(r"script-src '[^']+'", "script-src 'unsafe-inline'", source).replace("</body>", f"{probe}</body>")
+    (tmp_path / "run.html").write_text(opened)
+    command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+               f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
+    for path in (flight / "run.html", tmp_path / "run.html"):
+        shown = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=90)
+        assert shown.returncode == 0 and "CONSOLE" not in shown.stderr, shown.stderr
+    sums = json.loads((flight / "run.json").read_text())["strips"]
+    points = f"{sums[0]['counts']['points_in'] or sums[1]['counts']['points_in']:,}"
+    title = re.search(r"<title>(.*?)</title>", shown.stdout)[1]
+    assert title == f"SORTED {points}|{points}|\u2013 THEN {points}|{points}|\u2013 WIDTH true"

@@ -1,0 +1,183 @@
+"""`plot section`, `plot profile`, `slice --cube` and `plot cube`: what is drawn equals a plain count."""
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from plot_tools import write_cloud
+
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.tools.plots import section_data
+from wavebatch.tools.plots.section_data import cut_section, measure_profile
+from wavebatch.tools.plots.values import Selection
+from wavebatch.tools.slices.cube import build_cube, cut_cube
+from wavebatch.tools.slices.lines import read_scan_lines
+from wavebatch.tools.voxels.grid import COLUMNS
+
+LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
+
+
+def run(*words):
+    return CliRunner().invoke(main, [str(word) for word in words])
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    value = np.random.default_rng(4).normal(50, 10, 5000).astype("f4")
+    value[:100] = -1
+    return write_cloud(tmp_path / "c.las", amplitude=(value, np.array([-1.0]), None, "peak [DN]"))
+
+
+@pytest.fixture
+def voxels(tmp_path):
+    rng = np.random.default_rng(5)
+    index = rng.integers(0, 40, (3000, 3)).astype(np.int32)
+    energy = rng.uniform(0, 100, 3000).astype("f4")
+    np.savez(tmp_path / "v.npz", index=index, energy=energy, origin=np.array([10.0, 20.0, 100.0]), size=0.5, crs="",
+             meta="{}")  # fmt: skip
+    return tmp_path / "v.npz", np.array([10.0, 20.0, 100.0]) + 0.5 * (index + 0.5), energy
+
+
+def test_a_section_has_the_points_beside_its_line(cloud):
+    found = cut_section([cloud], Selection("amplitude"), line=LINE, width=3.0)
+    las = laspy.read(cloud)
+    places = np.stack([las.x, las.y], axis=1) - LINE[:2]
+    value = np.array(las["amplitude"])
+    step = np.subtract(LINE[2:], LINE[:2])
+    length = np.hypot(*step)
+    along, across = places @ step / length, (step[0] * places[:, 1] - step[1] * places[:, 0]) / length
+    keep = (along >= 0) & (along <= length) & (np.abs(across) <= 1.5) & (value != -1)
+    assert 100 < keep.sum() == found.inside == len(found.value)
+    assert found.along == pytest.approx(along[keep], abs=1e-6)
+    assert found.height == pytest.approx(np.array(las.z)[keep]) and np.array_equal(found.value, value[keep])
+    assert found.total.no_data == 100 and (found.crs, found.unit) == ("", "m")
+
+
+def test_a_section_of_many_points_is_an_even_sample_that_says_so(cloud, tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(section_data, "MOST_POINTS", 300)
+    found = cut_section([cloud], Selection("z"), line=LINE, width=10.0)
+    assert len(found.value) <= 300 < found.inside
+    assert run("plot", "section", cloud, "--width", 10, "-o", tmp_path / "s.svg", "--aspect", 2).exit_code == 0
+    text = (tmp_path / "s.svg").read_text("utf-8")
+    assert "are drawn" in text and "heights 2 times exaggerated" in text
+
+
+def test_without_a_line_the_longer_extent_is_cut(cloud):
+    found = cut_section([cloud], Selection("z"))
+    x0, y0, x1, y1 = found.line
+    assert abs(y1 - y0) < 0.2 * (x1 - x0) and 38 < found.along.max() - found.along.min() <= 45
+    assert found.width == pytest.approx(np.hypot(x1 - x0, y1 - y0) / 50)
+
+
+def test_sections_of_voxels(voxels):
+    path, place, energy = voxels
+    found = cut_section([path], Selection("energy"), line=(10.0, 30.0, 30.0, 30.0), width=2.0)
+    keep = np.abs(place[:, 1] - 30.0) <= 1.0
+    assert found.voxel == 0.5 and found.inside == keep.sum() > 100
+    assert found.along == pytest.approx(place[keep, 0] - 10.0) and found.value == pytest.approx(energy[keep])
+    assert found.facts.unit == next(column.unit for column in COLUMNS if column.name == "energy")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("section {cloud} --line 1,2,3", 2, "X0,Y0,X1,Y1"),
+        ("section {cloud} --line 1,2,1,2", 2, "two different points"),
+        ("section {cloud} --line 0,0,1,1", 1, "of 5000 points lies within"),
+        ("section {cloud} --width 0", 2, "above 0"),
+        ("section {voxels} --column reflectance", 2, "has no column"), ("section {voxels} {cloud}", 2, "drawn alone"),
+        ("section {voxels} --flags-with WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
+        ("profile {cloud} --size 1e-9", 2, "more than 5000 bins"),
+        ("profile {cloud} --statistic sum", 2, "needs a --column"),
+        ("section {cube}", 1, "holds no voxels"), ("cube {voxels}", 1, "holds no cube"),
+    ],
+)  # fmt: skip
+def test_wrong_usage_is_one_line(cloud, voxels, tmp_path, words, code, message):
+    pytest.importorskip("matplotlib")
+    np.savez(tmp_path / "cube.npz", values=np.zeros((2, 2, 2)))
+    words = words.format(cloud=cloud, voxels=voxels[0], cube=tmp_path / "cube.npz").split()
+    result = run("plot", *words, "-o", tmp_path / "p.png")
+    assert result.exit_code == code and message in result.stderr, result.output
+    assert result.stderr.count("\n") == 1 and not (tmp_path / "p.png").exists()
+
+
+def test_profiles_count_sum_and_average(cloud, voxels):
+    las = laspy.read(cloud)
+    height, value = np.array(las.z), np.array(las["amplitude"], np.float64)
+    count = measure_profile([cloud], Selection(None), "count", size=2.0)
+    assert count.values[0].tolist() == np.histogram(height, count.edges)[0].tolist()
+    assert count.values.sum() + count.outside == 5000 and np.all(count.edges % 2.0 == 0)
+    known = value != -1
+    both = measure_profile([cloud, cloud], Selection("amplitude"), "mean", size=2.0, each=True)
+    sums = np.histogram(height[known], both.edges, weights=value[known])[0]
+    number = np.histogram(height[known], both.edges)[0]
+    full = number > 0
+    for row in both.values:
+        assert row[full] == pytest.approx(sums[full] / number[full]) and np.isnan(row[~full]).all()
+    path, place, energy = voxels
+    found = measure_profile([path], Selection("energy"), "sum")
+    expected = [energy[place[:, 2] == level].sum() for level in 100.25 + 0.5 * np.arange(40)]
+    assert np.diff(found.edges) == pytest.approx(0.5), "a layer of voxels is a bin"
+    assert found.values[0][: len(expected)] == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_cube_has_every_sample_on_one_axis_of_time(riegl):
+    with StripReader(riegl) as reader, reader.scan() as scan:
+        lines = list(read_scan_lines(reader, scan))[:6]
+    cube = build_cube(lines, "c.npz")
+    values, time, spacing = cube["values"], cube["time"], lines[0].spacing
+    assert values.shape == (6, max(map(len, lines)), len(time)) and np.diff(time) == pytest.approx(spacing)
+    assert np.isfinite(values).sum() == sum(len(line.row) for line in lines)
+    for i, line in enumerate(lines):
+        for pulse in (0, len(line) // 2, len(line) - 1):
+            mine = line.row == pulse
+            there = np.flatnonzero(np.isfinite(values[i, pulse]))
+            assert np.array_equal(values[i, pulse, there], line.value[mine])
+            # Where a sample lies in space follows from its time alone: all pulses start at one plane.
+            at = time[there] + cube["offset"][i, pulse] - line.time[mine]
+            assert np.ptp(at) < 1e-4 and abs(cube["offset"][i, pulse]) <= 0.51 * spacing
+    starts = [line.origin[0] - at for line, at in zip(lines, _starts(cube, lines), strict=True)]
+    mean = np.mean(
+        [line.direction.mean(axis=0) / np.linalg.norm(line.direction.mean(axis=0)) for line in lines], axis=0
+    )
+    assert np.ptp([start @ mean for start in starts]) < 0.02, "windows that open at other heights keep the relief"
+
+
+def _starts(cube, lines):
+    """Way from the common plane to sample 0 of the first pulse of each line [m]."""
+    for i, line in enumerate(lines):
+        first = np.flatnonzero(np.isfinite(cube["values"][i, 0]))[0]
+        yield (cube["time"][first] + cube["offset"][i, 0] - line.time[0]) * line.direction[0]
+
+
+def test_slices_of_the_cube(tmp_path):
+    values = np.arange(2 * 3 * 4, dtype=np.float32).reshape(2, 3, 4)
+    path = tmp_path / "c.npz"
+    np.savez(path, values=values, time=np.arange(4) * 0.5, line=np.array([7, 9]))
+    x, y, t = cut_cube(path, {"x": 2, "y": 9, "t": 1.01})
+    assert np.array_equal(x.image, values[:, 2].T) and np.array_equal(y.image, values[1].T)
+    assert np.array_equal(t.image, values[:, :, 2]) and t.title == "t = 1 ns" and (x.down, t.down) == (True, False)
+    assert len(cut_cube(path, dict.fromkeys("xyt"))) == 3
+    for wrong, message in (({"y": 8}, "scan lines 7 to 9"), ({"x": 3}, "0 to 2"), ({"t": 9.0}, "0 to 1.5 ns")):
+        with pytest.raises(ConfigError, match=message):
+            cut_cube(path, {"x": None, "y": None, "t": None, **wrong})
+    with pytest.raises(InputError, match="no scan line"):
+        build_cube([], "c.npz")
+
+
+def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
+    pytest.importorskip("matplotlib")
+    words = ("slice", riegl, "--lines", "0:5", "--shortest", 10, "--cube", tmp_path / "c.npz", "--overview")
+    assert run(*words, tmp_path / "o.png").exit_code == 0
+    first = (tmp_path / "c.npz").read_bytes()
+    refused = run(*words, tmp_path / "o.png")
+    assert refused.exit_code == 1 and "--overwrite" in refused.stderr
+    assert run(*words, tmp_path / "o.png", "--overwrite").exit_code == 0
+    assert (tmp_path / "c.npz").read_bytes() == first, "the same input gives the same bytes"
+    assert run("slice", riegl, "--cube", tmp_path / "c.txt").exit_code == 2
+    assert sorted(path.name for path in Path(tmp_path).iterdir()) == ["c.npz", "o.png"]

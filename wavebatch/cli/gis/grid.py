@@ -1,0 +1,73 @@
+"""`wavebatch grid`: columns of clouds as a GeoTIFF.
+
+Reads options, calls `wavebatch.tools.rasters` once and prints a line. rasterio (extra `gis`) is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wavebatch.cli import options as shared
+from wavebatch.cli.messages import count, talk
+from wavebatch.files.inputs import find_files
+
+
+def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
+
+
+@click.command()
+@shared.clouds_argument
+@click.option("--column", "columns", multiple=True, metavar="NAME",
+              help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
+@click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "std", "count", "density"]),
+              default="mean", show_default=True,
+              help="Statistic of the values in a cell; density is points per area.")
+@click.option("--size", type=float, default=1.0, show_default=True, metavar="M",
+              help="Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
+              "rasters fit together.")
+@shared.output_option("Raster to write: .tif.", "X.tif")
+@click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
+              help="Part to write: west, south, east, north [m].  [default: all]")
+@click.option("--flags-with", multiple=True, metavar="NAMES",
+              help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK.")
+@click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags.")
+@click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
+@click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
+              help="Value of cells without data; nan is possible.")
+@shared.common_options("overwrite", "quiet")
+def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
+    """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line. The raster is tiled,
+    compressed and has the CRS of the clouds, a no-data value, and name and unit of every band. Memory does not grow;
+    large clouds need room in TMPDIR. Needs rasterio: pip install rasterio.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the raster cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.core.flag_names import read_flags
+    from wavebatch.files.geotiff_file import check_raster
+    from wavebatch.tools.rasters.grid import GridOptions, write_grid
+
+    paths = find_files(map(str, clouds))
+    check_raster(output, overwrite=options["overwrite"])
+    flags = {name: read_flags(options[name]) for name in ("flags_with", "flags_without")}
+    given = {name: options[name] for name in ("statistic", "size", "bounds", "crs", "no_data")}
+    found = write_grid(paths, output, GridOptions(columns, **given, **flags), overwrite=options["overwrite"])
+    layout = found.layout
+    if layout.crs is None:
+        talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
+    if options["quiet"]:
+        return
+    used = found.points - found.left_out - found.outside
+    parts = [f"{name or 'points'} {values} values, {used - values} without data"
+             for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
+    talk(
+        f"{output}: {count(found.points, 'point')}, {found.left_out} left out by flags, {found.outside} outside; "
+        f"{'; '.join(parts)}; {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, {found.filled} "
+        "with a value"
+    )

@@ -1,0 +1,145 @@
+"""`wavebatch plot section`, `plot profile` and `plot cube`: side views, heights, and slices of a data cube.
+
+Reads options, calls `wavebatch.tools.plots` and `wavebatch.tools.slices`, and prints one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wavebatch.cli import options as shared
+from wavebatch.cli.messages import count, talk
+from wavebatch.core.errors import ConfigError
+from wavebatch.files.figure_file import check_picture
+from wavebatch.files.inputs import find_files
+
+_output = shared.output_option("Picture to write: .png, .svg or .pdf.")
+flag_options = shared.together(
+    click.option("--flags-with", multiple=True, metavar="NAMES",
+                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
+    click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
+    shared.where_option("Use only points"),
+)  # fmt: skip
+"""Options that select points by their flags and columns."""
+
+
+def select(column: str | None, options: dict[str, Any]) -> Any:
+    """The selection of a column and of the flags in the options."""
+    from wavebatch.core.flag_names import read_flags
+    from wavebatch.tools.plots.values import Selection
+
+    flags = read_flags(options["flags_with"]), read_flags(options["flags_without"])
+    return Selection(column, *flags, where=options["where"])
+
+
+def _read_line(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
+    return None if text is None else shared.parse_floats(text, "X0,Y0,X1,Y1")
+
+
+def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
+    """Clouds, or one file of voxels."""
+    voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
+    if voxels and len(clouds) > 1:
+        raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
+    if voxels and options["where"] is not None:
+        raise ConfigError(f"{voxels[0]}: --where is for points; give it to `wavebatch voxelize`")
+    return list(clouds) if voxels else find_files(map(str, clouds), recursive=options["recursive"])
+
+
+@click.command()
+@shared.clouds_argument
+@shared.recursive_option
+@_output
+@click.option("--line", callback=_read_line, metavar="X0,Y0,X1,Y1",
+              help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
+@click.option("--width", type=float, metavar="W",
+              help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")
+@click.option("--column", help="Column for the colours.  [default: z; energy for voxels]")
+@click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
+              help="Exaggerate heights F times.")
+@flag_options
+@shared.common_options("overwrite", "quiet")
+def section(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
+    """Draw a side view of CLOUDs or voxels along a line.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
+    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.section_data import cut_section
+
+    paths = _find(clouds, options)
+    check_picture(output, overwrite=options["overwrite"])
+    column = column or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
+    found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
+    from wavebatch.tools.plots.draw_section import draw_section
+
+    draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
+    if not options["quiet"]:
+        kind = count(found.inside, "voxel" if found.voxel else "point")
+        talk(f"{output}: {kind} of {found.total.values}, {found.total.no_data} without data")
+
+
+@click.command()
+@shared.clouds_argument
+@shared.recursive_option
+@_output
+@click.option("--column", help="Column for --statistic sum and mean, e.g. energy.")
+@click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
+              help="Of the points or voxels of a height.  [default: sum with --column, else count]")
+@click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]")
+@click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all.")
+@click.option("--log", is_flag=True, help="Use a logarithmic axis of values.")
+@flag_options
+@shared.common_options("overwrite", "quiet")
+def profile(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
+    """Draw how many points, or how much of a column, of CLOUDs or voxels lie at each height.
+
+    CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
+    voxelize`. Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
+
+    Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.plots.section_data import measure_profile
+
+    paths = _find(clouds, options)
+    check_picture(output, overwrite=options["overwrite"])
+    statistic = options["statistic"] or ("count" if column is None else "sum")
+    how = {"size": options["size"], "each": options["each"]}
+    found = measure_profile(paths, select(column, options), statistic, **how)
+    from wavebatch.tools.plots.draw_section import draw_profile
+
+    draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
+    if not options["quiet"]:
+        total = found.total
+        talk(f"{output}: {count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside")
+
+
+@click.command()
+@click.argument("cube_file", type=click.Path(path_type=Path), metavar="CUBE.npz")
+@_output
+@click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
+@click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
+@click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
+@shared.common_options("overwrite", "quiet")
+def cube(cube_file: Path, output: Path, **options: Any) -> None:
+    """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
+
+    Each given option adds a slice; without any, the middle ones are drawn, and the time with the most signal.
+
+    Exit code: 0 done, 1 the cube cannot be read or the picture cannot be written, 2 wrong usage.
+    """  # fmt: skip
+    from wavebatch.tools.slices.cube import cut_cube
+
+    check_picture(output, overwrite=options["overwrite"])
+    slices = cut_cube(cube_file, {name: options[name] for name in "xyt"})
+    from wavebatch.tools.slices.draw import draw_cube
+
+    draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
+    if not options["quiet"]:
+        talk(f"{output}: {', '.join(one.title for one in slices)}")

@@ -1,0 +1,98 @@
+"""Examples of every command, and the groups of options: for --help, the manual pages and the page Commands.
+
+`tests/cli/test_program.py` parses every example, and checks that every command has one.
+"""
+
+from __future__ import annotations
+
+EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
+    "run": (
+        ("wavebatch run strip.las -o clouds", "one strip; the chain is chosen by a survey of it"),
+        ("wavebatch run strips/ -o clouds --survey flight --jobs 0 --html run.html",
+         "a flight on all processors, with a report page"),
+        ("wavebatch run strips/ -o clouds --resume", "go on after an interruption"),
+        ("wavebatch run strip.las -o clouds --trajectory flight.txt --columns +range",
+         "with a trajectory, and the range as a column"),
+        ("wavebatch run strip.las -o clouds --dry-run", "show chain, columns and sizes; write nothing"),
+    ),
+    "info": (("wavebatch info strip.las", "points, packets, descriptors and samples"),),
+    "check": (
+        ("wavebatch check strip.las mychain.toml", "one line per problem; exit code 1 if there is any"),
+    ),
+    "survey": (
+        ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
+        ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
+    ),
+    "stages": (
+        ("wavebatch stages", "list all algorithms"),
+        ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),
+    ),
+    "simulate": (
+        ("wavebatch simulate forest -o forest.laz --pulses 50000 --truth truth.npz", "a strip with known echoes"),
+    ),
+    "compare": (
+        ("wavebatch compare clouds/strip.laz strip.las", "a cloud with the vendor's returns"),
+        ("wavebatch compare --strip strip.las fast accurate", "two chains on the waveforms of a strip"),
+        ("wavebatch compare clouds/strip.laz --truth truth.npz --min-completeness 0.95",
+         "with the truth; exit code 1 below 95 %"),
+    ),
+    "stats": (("wavebatch stats clouds/*.laz", "return numbers, separations and flags of clouds"),),
+    "synthesize": (("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),),
+    "slice": (("wavebatch slice strip.las -o lines.csv", "straight surface lines in the scan lines"),),
+    "voxelize": (("wavebatch voxelize strip.las --size 1 -o voxels.npz", "cross sections in voxels of 1 m"),),
+    "plot": (),
+    "plot waveform": (
+        ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
+        ("wavebatch plot waveform strip.las -o bad.svg --flags-with NOT_CONVERGED,AT_BOUND", "fits to look at"),
+        ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
+    ),
+    "plot histogram": (
+        ("wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png", "widths of all clouds"),
+    ),
+    "plot map": (
+        ("wavebatch plot map clouds/ --column amplitude --size 1 -o map.png", "mean amplitude in cells of 1 m"),
+    ),
+    "grid": (
+        ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
+         "two bands for GIS"),
+        ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
+    ),
+    "calibrate": (
+        ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
+         "for `run --calibration cal.toml`"),
+    ),
+    "bench": (
+        ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
+        ("wavebatch bench --scene open --tolerance 0.02m", "the cheapest chain with 2 cm of range error"),
+    ),
+}  # fmt: skip
+"""Per command: a line to type, and what it is for."""
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Chain and pulse": (
+        "chain_file", "profile", "tolerance", "system_file", "force", "survey", "calibration_file", "waveforms",
+        "divergence",
+    ),
+    "Reading": ("direction", "headerless", "recursive"),
+    "Position of the sensor": ("trajectory", "lever_arm", "crs", "flight_height"),
+    "Air and light": (
+        "attenuation", "attenuation_error", "visibility", "wavelength", "pulse_energy", "reflectance_error",
+    ),
+    "Which points": (
+        "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",
+        "points_", "times", "most", "random", "limit",
+    ),
+    "Output": (
+        "output", "points", "columns", "column", "names", "file_format", "point_format", "las_version", "keep_packets",
+        "no_data", "html_file", "report", "as_json", "plot", "overwrite",
+    ),
+    "Speed and memory": ("jobs", "scheduler", "memory", "block_size"),
+    "How it runs": (
+        "resume", "dry_run", "strict", "progress", "verbose", "quiet", "log_path", "log_level",
+        "debug", "help",
+    ),
+}  # fmt: skip
+"""Heading of a group: names of its options. Options of no group come first, under Options."""
+
+FEWEST = 8
+"""Pages with fewer options than this have no groups."""

@@ -1,0 +1,156 @@
+"""GeoTIFF files, written tile by tile with rasterio (optional extra `gis`), so that a raster never is in memory.
+
+`tools/rasters` writes with it. rasterio is imported only here, when a raster is written.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.disk.closing import Closing
+from wavebatch.files.disk.publish import Draft, check_target
+
+TILE = 256
+"""Cells along a side of a tile: usual for web viewers and cloud storage."""
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """One band of a raster."""
+
+    description: str
+    unit: str
+    """Empty where it has none."""
+
+
+@dataclass(frozen=True, slots=True)
+class RasterLayout:
+    """Size and place of a raster: square cells, the first row is the northernmost."""
+
+    west: float
+    north: float
+    size: float
+    """Side of a cell, in units of the CRS."""
+    rows: int
+    columns: int
+    dtype: str
+    no_data: float
+    crs: str | None
+    """WKT or `EPSG:n`."""
+    unit: str = "m"
+    """Of the coordinates."""
+
+
+def check_raster(target: Path, *, overwrite: bool) -> None:
+    """Raise ConfigError if the suffix is not that of a GeoTIFF or rasterio is missing, InputError if it exists."""
+    if target.suffix.lower() not in (".tif", ".tiff"):
+        raise ConfigError(f"{target}: unknown kind of raster; use .tif")
+    if importlib.util.find_spec("rasterio") is None:
+        raise ConfigError(f"{target}: rasters need rasterio: pip install rasterio (extra `gis` of wavebatch)")
+    check_target(target, overwrite=overwrite)
+
+
+def find_crs_unit(text: str, where: str) -> str:
+    """Return the unit of a CRS: m, ft, degree ...; ConfigError if it is not known, or not of plane coordinates."""
+    found = _read_crs(text, where)
+    if found.is_geographic:
+        return "degree"
+    names = {"metre": "m", "meter": "m", "unknown": "m"}
+    unit = str(found.linear_units or "metre")
+    return names.get(unit.lower(), unit)
+
+
+def same_crs(one: str, other: str, where: str) -> bool:
+    """Whether two definitions mean the same CRS; ConfigError as find_crs_unit."""
+    return one == other or _read_crs(one, where) == _read_crs(other, where)
+
+
+def _read_crs(text: str, where: str) -> Any:
+    from rasterio.crs import CRS
+    from rasterio.env import Env
+
+    with Env():
+        try:
+            found = CRS.from_user_input(text)
+        except Exception as error:  # of GDAL and PROJ, for whatever a file may hold
+            why = " ".join(str(error).split())
+            raise ConfigError(f"{where}: the CRS cannot be read ({why[:120]}); give it with --crs EPSG:n") from error
+        if found.to_wkt().upper().startswith("GEOCCS"):
+            raise ConfigError(f"{where}: coordinates are geocentric; a raster needs plane coordinates")
+        return found
+
+
+class RasterWriter(Closing):
+    """Writes the tiles of a GeoTIFF; it appears at `publish`, whole, or not at all. A context manager.
+
+    Tiles that are never written take no room and read as no-data. Raises InputError if the file cannot be written.
+    """
+
+    def __init__(
+        self, target: Path, layout: RasterLayout, bands: Sequence[Band], tags: dict[str, str], *, overwrite: bool
+    ) -> None:
+        import rasterio
+        from rasterio import Affine
+
+        self._draft = Draft(target, overwrite=overwrite)
+        self._target = target
+        self._layout = layout
+        crs = None if layout.crs is None else _read_crs(layout.crs, str(target))
+        try:
+            self._file = rasterio.open(
+                self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
+                dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
+                transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
+                compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
+            )  # fmt: skip
+            self._file.update_tags(**tags)
+            for number, band in enumerate(bands, 1):
+                self._file.set_band_description(number, band.description)
+                self._file.set_band_unit(number, band.unit)
+        except BaseException as error:
+            self._draft.discard()
+            if isinstance(error, rasterio.errors.RasterioError | OSError):
+                raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
+            raise
+
+    def write_tile(self, row: int, column: int, values: np.ndarray) -> None:
+        """Write a tile by its place: values (bands, TILE, TILE), NaN for no-data; what lies outside is cut off."""
+        import rasterio
+        from rasterio.windows import Window
+
+        rows = min(TILE, self._layout.rows - row * TILE)
+        columns = min(TILE, self._layout.columns - column * TILE)
+        cut = values[:, :rows, :columns]
+        if (cut == self._layout.no_data).any():
+            raise ConfigError(
+                f"{self._target}: a cell has the value {self._layout.no_data:g}, which stands for no data; choose "
+                "another with --no-data"
+            )
+        stored = np.where(np.isnan(cut), self._layout.no_data, cut).astype(self._layout.dtype)
+        try:
+            self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
+        except (rasterio.errors.RasterioError, OSError) as error:
+            raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+
+    def publish(self) -> None:
+        """End the file and give it its name."""
+        import rasterio
+
+        try:
+            self._file.close()
+        except (rasterio.errors.RasterioError, OSError) as error:
+            raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+        self._draft.publish()
+
+    def close(self) -> None:
+        """Remove what was not published; may be called twice."""
+        if not self._file.closed:
+            self._file.close()
+        self._draft.discard()

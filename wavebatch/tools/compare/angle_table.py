@@ -1,0 +1,138 @@
+"""The lookup table of a sensor: which echo width means which incidence angle, and how sure that is.
+
+`wavebatch survey --angles` writes it as .csv or draws it. The widths go through the functions of stage
+attribute.incidence_angle, so that the table is what a run writes for surfaces that fill the beam.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.disk.publish import check_target
+from wavebatch.files.figure_file import check_picture, open_picture
+from wavebatch.files.text_file import write_text
+from wavebatch.kernels.fit.bounds import bound_time
+from wavebatch.kernels.physics.angle_errors import angles_of_variance
+from wavebatch.kernels.physics.incidence import spread_of_angle
+from wavebatch.stages.attribute.width_angle import added_variance
+from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+
+ANGLES = np.arange(0.0, 81.0)
+"""Angles of the table [deg]."""
+
+_WIDEST, _FINE = 40.0, 20_000
+"""Largest width that is tried [system widths], and number of widths."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AngleTable:
+    """Widths by angle at one distance and amplitude; NaN where no width means the angle."""
+
+    distance: float
+    """Sensor to echo [m]."""
+    divergence: float
+    """Full angle of the beam between the 1/e^2 points [mrad]."""
+    amplitude: float
+    """Of the echoes whose errors are given [DN]."""
+    angle: np.ndarray
+    """f8 (a,) [deg]."""
+    spread: np.ndarray
+    """What the surface adds to the pulse, as a standard deviation, f8 (a,) [ns]."""
+    width: np.ndarray
+    """Column echo_width, f8 (a,) [ns]."""
+    error: np.ndarray
+    """Standard deviation of the angle of one echo, f8 (a,) [deg]."""
+
+
+def tabulate_angles(
+    system: SystemPulse, spacing: float, distance: float, divergence: float, amplitude: float
+) -> AngleTable:
+    """The table of a system; amplitude: of the echoes for whose noise errors are given [DN]."""
+    beam = 1e-3 * divergence
+    spread = spread_of_angle(np.radians(ANGLES), distance, divergence=beam)
+    tried = np.linspace(0.3, _WIDEST, _FINE) * system.sigma_ref
+    variance, _ = _add_variance(system, spacing, tried, np.zeros(_FINE))
+    sigma = np.interp(spread**2, variance, tried, left=np.nan, right=np.nan)
+    bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise_std, spacing)
+                      for one in np.nan_to_num(sigma, nan=1.0)])  # fmt: skip
+    variance, variance_err = _add_variance(system, spacing, sigma, bound)
+    error = np.degrees(angles_of_variance(variance, variance_err, np.full(len(ANGLES), distance), beam)[1])
+    width = FWHM_PER_SIGMA * sigma
+    return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
+
+
+def _add_variance(
+    system: SystemPulse, spacing: float, sigma: np.ndarray, sigma_err: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance that a surface added to echoes of these widths, as the stage computes it [ns2]."""
+    block = WaveformBlock.from_samples(np.zeros((1, 2), np.uint8), bits=8, spacing=spacing)
+    zero = np.zeros(len(sigma))
+    echoes = EchoTable.build(zero.astype(int), zero, zero + 1.0, sigma, sigma_err=sigma_err)
+    return added_variance(block, system, echoes, "system", REFERENCE_ERROR)
+
+
+def check_angles(target: Path, *, overwrite: bool) -> None:
+    """Raises ConfigError or InputError if the table cannot be written there."""
+    if target.suffix.lower() == ".csv":
+        check_target(target, overwrite=overwrite)
+    else:
+        check_picture(target, overwrite=overwrite)
+
+
+def write_angles(
+    target: Path, system: SystemPulse, *, spacing: float, distance: float | None, amplitude: float, overwrite: bool
+) -> None:
+    """Writes the table of a strip as .csv, or draws it.
+
+    Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
+    this system means an angle.
+    """
+    if not system.divergence:
+        raise ConfigError(f"--angles {target}: the beam is not known; give --divergence")
+    if distance is None:
+        raise InputError(f"--angles {target}: the distance of the sensor is not known, so no width means an angle")
+    if math.isinf(system.level_error or 0.0):
+        raise InputError(f"--angles {target}: the strip does not show which width a surface has that faces the sensor")
+    found = tabulate_angles(system, spacing, distance, system.divergence, amplitude)
+    if target.suffix.lower() == ".csv":
+        write_text(target, format_angles(found), overwrite=overwrite)
+    else:
+        draw_angles(found, target, overwrite=overwrite)
+
+
+def format_angles(found: AngleTable) -> str:
+    """The table as CSV; empty cells are no data."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["angle_deg", "spread_ns", "echo_width_ns", "angle_err_deg", "distance_m", "divergence_mrad",
+                    "amplitude_DN"])  # fmt: skip
+    for row in zip(found.angle, found.spread, found.width, found.error, strict=True):
+        values = (*row, found.distance, found.divergence, found.amplitude)
+        table.writerow([f"{value:.6g}" if math.isfinite(value) else "" for value in values])
+    return text.getvalue()
+
+
+def draw_angles(found: AngleTable, target: Path, *, overwrite: bool = False) -> None:
+    """Writes a picture of the table; raises as figure_file.open_picture does."""
+    with open_picture(target, (7.0, 4.6), overwrite=overwrite) as figure:
+        axes = figure.subplots()
+        low, high = np.clip(found.angle - found.error, 0, 90), np.clip(found.angle + found.error, 0, 90)
+        axes.fill_between(found.width, low, high, color="#0072b2", alpha=0.2, linewidth=0,
+                          label="one standard deviation")  # fmt: skip
+        axes.plot(found.width, found.angle, color="#0072b2", linewidth=1.5, label="angle")
+        axes.set_ylim(0, 90)
+        axes.set_xlabel("echo_width [ns]")
+        axes.set_ylabel("incidence angle [deg]")
+        beam = f"{found.distance:.0f} m, {found.divergence:g} mrad"
+        axes.set_title(f"{beam}; errors of echoes of {found.amplitude:.0f} DN")
+        axes.legend(loc="lower right")

@@ -1,0 +1,70 @@
+"""The page of `wavebatch calibrate --html`: constants, targets, channels, strips and how they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from wavebatch import __version__
+from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
+from wavebatch.surveying.calibrating.calibration_file import format_calibration
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.tools.html import markup
+from wavebatch.tools.html.drawing.charts import draw_values, figures
+from wavebatch.tools.html.page import write_page
+
+UNIT = "1/(m2 DN ns)"
+
+
+def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
+    """Write the page of a calibration of one strip or of several."""
+    found = flight.calibration
+    title = f"wavebatch calibrate: {found.strip or 'strips'}"
+    write_page(target, title, _parts(flight, found))
+
+
+def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
+    rows = {
+        "constant": f"{found.constant:.6g} +- {100 * found.relative_error:.1f} %, {UNIT}",
+        "attenuation of the air": f"{found.attenuation:g} dB/km one way",
+        "divergence": "not given" if found.divergence is None else f"{found.divergence:g} mrad",
+        "conditions": found.conditions,
+    }
+    yield markup.section("Summary", markup.facts(rows), markup.bullets(found.notes, "warning"))
+    yield _list_targets(found)
+    if found.channels:
+        channels = [[one.digitizer, one.scanner, one.echoes, one.constant, 100 * one.relative_error, 100 * one.spread]
+                    for one in found.channels]  # fmt: skip
+        head = ["digitizer", "scanner channel", "echoes", "constant", "error %", "spread %"]
+        yield markup.section("Channels", markup.table(head, channels))
+    if found.strips:
+        yield _list_strips(found)
+    if flight.pairs:
+        pairs = [[one.a, one.b, one.cells, 100 * (one.ratio - 1), 100 * (one.after - 1), 100 * one.spread, one.height]
+                 for one in flight.pairs]  # fmt: skip
+        head = ["a", "over b", "cells", "light %", "calibrated %", "spread %", "height m"]
+        yield markup.section("Overlaps", markup.table(head, pairs, sortable=True))
+    provenance = {"wavebatch": __version__, "strip": found.strip, "date of the strip": found.date}
+    yield markup.section("Provenance", markup.facts(provenance), markup.code(format_calibration(found)))
+
+
+def _list_targets(found: Calibration) -> str:
+    rows = [[one.name, one.reflectance, one.echoes, one.constant,
+             None if one.spread is None else 100 * one.spread, one.incidence_deg,
+             "used" if one.constant is not None else one.refused or "refused"] for one in found.targets]  # fmt: skip
+    head = ["target", "reflectance", "echoes", "constant", "spread %", "incidence deg", ""]
+    used = [(one.name, one.constant, one.constant * (one.relative_error or one.spread or 0.0))
+            for one in found.targets if one.constant is not None]  # fmt: skip
+    charts = [draw_values(*map(list, zip(*used, strict=True)), title="Constant of each target with its error",
+                          label=UNIT)] if used else []  # fmt: skip
+    return markup.section("Targets", markup.table(head, rows, sortable=True), figures(charts))
+
+
+def _list_strips(found: Calibration) -> str:
+    rows = [[one.strip, one.digitizer, one.scanner, one.constant, 100 * one.relative_error, 100 * one.drift,
+             100 * one.drift_error, one.ties] for one in found.strips]  # fmt: skip
+    names = [f"{one.strip} {one.digitizer}/{one.scanner}" for one in found.strips]
+    drifts, errors = zip(*((100 * one.drift, 100 * one.drift_error) for one in found.strips), strict=True)
+    chart = draw_values(names, drifts, errors, title="Drift of each strip with its error", label="%")
+    head = ["strip", "digitizer", "scanner channel", "constant", "error %", "drift %", "drift error %", "tie cells"]
+    return markup.section("Strips", markup.table(head, rows, sortable=True), figures([chart]))

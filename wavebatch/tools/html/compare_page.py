@@ -1,0 +1,136 @@
+"""The page of `wavebatch compare --html`: echoes of two sides, their differences, and who misses which."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.tools.compare.angles import AngleAgreement
+from wavebatch.tools.compare.chains import Matchup
+from wavebatch.tools.compare.overlap import OverlapComparison
+from wavebatch.tools.compare.pairing import Comparison
+from wavebatch.tools.html import markup
+from wavebatch.tools.html.drawing.charts import draw_counts, draw_histogram, figures
+from wavebatch.tools.html.page import write_page
+
+
+def write_compare_page(
+    target: Path, result: Comparison | Matchup | AngleAgreement | OverlapComparison, broken: Sequence[str] = ()
+) -> None:
+    """Write the page of a comparison; broken: the thresholds that are not met."""
+    between = result.between if isinstance(result, Matchup) else result
+    names = [Path(side).name for side in (between.a, between.b) if side]
+    if isinstance(result, AngleAgreement):
+        parts = _angle_parts(result)
+    elif isinstance(result, OverlapComparison):
+        parts = _overlap_parts(result)
+    else:
+        parts = _echo_parts(result, between, broken)
+    write_page(target, f"wavebatch compare: {' with '.join(names)}", parts)
+
+
+def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -> Iterator[str]:
+    yield markup.section("Summary", markup.bullets(broken, "warning"), _summarise(one))
+    yield markup.section("Sums", markup.table(["sum", "number", "is", "check"], _sums(one)))
+    if one.pulses:
+        charts = [draw_counts(_named(counts), title=f"Echoes per pulse, {side}", label="echoes")
+                  for side, counts in (("A", one.counts_a), ("B", one.counts_b))]  # fmt: skip
+        yield markup.section("Echoes per pulse", figures(charts))
+    rows = [[name, spread.number, spread.median, spread.mean, spread.rms, spread.nmad]
+            for name, spread in one.differences.items()]  # fmt: skip
+    head = ["A - B", "number", "median", "mean", "rms", "nmad"]
+    yield markup.section("Differences", markup.paragraph("Times and widths in ns, amplitudes in DN."),
+                         markup.table(head, rows))  # fmt: skip
+    yield _breakdown("Missed echoes of B", one.missed_by)
+    yield _breakdown("Extra echoes of A", one.extra_by)
+    if one.errors:
+        yield _truth_errors(one.errors)
+    if isinstance(result, Matchup):
+        yield from _strip_parts(result)
+    yield markup.section("Provenance", markup.facts({"wavebatch": __version__, "A": one.a, "B": one.b}))
+
+
+def _summarise(one: Comparison) -> str:
+    return markup.facts([
+        ("A", one.a), ("B", one.b), ("matched by", f"{one.matched_by}, within {one.tolerance_ns:g} ns"),
+        ("echoes of A", f"{one.echoes_a:,}"), ("echoes of B", f"{one.echoes_b:,}"),
+        ("identical", f"{one.matched:,}"), ("missed", f"{one.missed:,}"), ("extra", f"{one.extra:,}"),
+        ("completeness", markup.number(one.completeness, ".4f")),
+        ("correctness", markup.number(one.correctness, ".4f")),
+        ("same number of echoes", f"{markup.number(one.exact_count, '.4f')} of {one.pulses:,} pulses"),
+        ("more points in A", markup.number(one.gain, "+.2%")),
+    ])  # fmt: skip
+
+
+def _sums(one: Comparison) -> Iterable[list[Any]]:
+    for title, whole, rest, name in (("echoes of A", one.echoes_a, one.extra, "extra"),
+                                     ("echoes of B", one.echoes_b, one.missed, "missed")):  # fmt: skip
+        fine = one.matched + rest == whole
+        check = "adds up" if fine else markup.Cell('<span class="mark">does not add up</span>')
+        yield [title, whole, f"{one.matched:,} identical + {rest:,} {name}", check]
+
+
+def _named(counts: Mapping[int, int]) -> dict[str, int]:
+    last = max(counts, default=0)
+    return {str(number): counts.get(number, 0) for number in range(min(last, 16) + 1)}
+
+
+def _breakdown(title: str, tables: Mapping[str, Mapping[str, tuple[int, int]]]) -> str:
+    rows = [[kind, name, alone, of, markup.Cell(markup.share(alone, of), alone / of if of else "")]
+            for kind, classes in tables.items() for name, (alone, of) in classes.items() if alone]  # fmt: skip
+    if not rows:
+        return markup.section(title, markup.paragraph("none"))
+    return markup.section(title, markup.table(["by", "class", "number", "of", "share"], rows, sortable=True))
+
+
+def _truth_errors(errors: Mapping[str, Mapping[str, Any]]) -> str:
+    rows = [[kind, name, one.number, one.bias, one.rmse, one.rms_per_bound, one.nmad_per_bound, one.calibration,
+             one.calibration_nmad]
+            for kind, each in errors.items() for name, one in each.items() if one.number]  # fmt: skip
+    head = ["echoes", "quantity", "number", "bias", "rmse", "rms/bound", "nmad/bound", "rms/_err", "nmad/_err"]
+    return markup.section("Errors against the truth", markup.table(head, rows, sortable=True))
+
+
+def _strip_parts(result: Matchup) -> Iterator[str]:
+    sides = [[side.upper(), one.echoes_a, one.matched, one.missed, one.extra] for side, one in result.vendor.items()]
+    yield markup.section(
+        "With the vendor's returns",
+        markup.paragraph(f"{result.strip}: {result.waveforms:,} waveforms, {result.returns:,} returns of the vendor."),
+        markup.table(["side", "echoes", "identical", "missed", "extra"], sides),
+    )
+    rows = [[side.upper(), name, fit.waveforms, fit.mean, fit.median, fit.floor_mean, fit.floor_median]
+            for side, classes in result.fit.items() for name, fit in classes.items() if fit.waveforms]  # fmt: skip
+    words = "E = |f - y|^2 / |f|^2 of model f and waveform y; E0 is the E that noise alone gives."
+    head = ["side", "waveforms with", "number", "mean E", "median E", "mean E0", "median E0"]
+    yield markup.section("Goodness of fit", markup.paragraph(words), markup.table(head, rows))
+
+
+def _overlap_parts(result: OverlapComparison) -> Iterator[str]:
+    rows = {"A": result.a, "B": result.b, "cell": f"{result.cell:.1f} m", "angles from": result.angles}
+    yield markup.section("Summary", markup.facts(rows))
+    compared = {"height, A less B [m]": result.height}
+    compared |= {f"{name}, A over B less 1": one for name, one in result.columns.items()}
+    lines = [[name, one.cells, one.median, one.error, one.nmad, one.stated] for name, one in compared.items()]
+    head = ["A against B", "cells", "median", "error", "nmad", "stated"]
+    yield markup.section("Flat cells with single echoes of both", markup.table(head, lines))
+    yield markup.section("Provenance", markup.facts({"wavebatch": __version__}))
+
+
+def _angle_parts(result: AngleAgreement) -> Iterator[str]:
+    hidden = ("edges", "difference_edges", "histogram_widths", "histogram_normals", "histogram_difference")
+    plain = {name: value for name, value in asdict(result).items() if name not in hidden}
+    yield markup.section("Summary", markup.facts({name.replace("_", " "): value for name, value in plain.items()
+                                                  if value is not None}))  # fmt: skip
+    if result.number:
+        charts = [draw_histogram(np.array(edges), np.array(counts), title=title, label="deg")
+                  for title, edges, counts in (("From echo width", result.edges, result.histogram_widths),
+                                               ("From normals", result.edges, result.histogram_normals),
+                                               ("Width less normals", result.difference_edges,
+                                                result.histogram_difference))]  # fmt: skip
+        yield markup.section("Angles", figures(charts))
+    yield markup.section("Provenance", markup.facts({"wavebatch": __version__}))

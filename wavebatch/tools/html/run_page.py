@@ -1,0 +1,147 @@
+"""The page of `wavebatch run --html`: sums of the batch, an index of its strips, and a part per strip.
+
+The parts are written one after the other, so that memory does not grow with the batch.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wavebatch import __version__
+from wavebatch.batch.report_file import cloud_path, report_path
+from wavebatch.batch.run import BatchResult, Outcome
+from wavebatch.tools.html import markup
+from wavebatch.tools.html.drawing.charts import figures, figures_of
+from wavebatch.tools.html.outliers import FEWEST, FIGURES, find_outliers, measure_strip
+from wavebatch.tools.html.page import write_page
+from wavebatch.tools.html.strip_part import count_tables, draw_strip, flag_table
+
+MOST_PARTS = 40
+"""Strips with a part of their own: a part has up to 500 kB, and a browser must still open the page."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Strip:
+    """A strip of the batch; report None where it failed or its report cannot be read."""
+
+    outcome: Outcome
+    number: int
+    cloud: Path
+    report: dict[str, Any] | None
+    figures: dict[str, float]
+
+
+def write_run_page(target: Path, result: BatchResult, folder: Path, command: str = "") -> None:
+    """Write the page of a finished batch; folder: of its outputs. Raises InputError if it cannot be written."""
+    strips = [_read_strip(outcome, place, folder) for place, outcome in enumerate(result.outcomes)]
+    marks = find_outliers([strip.figures for strip in strips])
+    # Strips to look at come first where there are too many to show all.
+    order = sorted(strips, key=lambda strip: (not marks[strip.number], strip.number))
+    shown = {strip.number for strip in [one for one in order if one.report is not None][:MOST_PARTS]}
+    write_page(target, _title(strips), _parts(result, strips, marks, shown, command))
+
+
+def _title(strips: Sequence[_Strip]) -> str:
+    names = strips[0].outcome.job.path.name if len(strips) == 1 else f"{len(strips)} strips"
+    return f"wavebatch run: {names}"
+
+
+def _read_strip(outcome: Outcome, number: int, folder: Path) -> _Strip:
+    report = None
+    if outcome.status != "failed":
+        try:
+            report = json.loads(report_path(outcome.job, folder).read_text("utf-8"))
+        except (OSError, ValueError):  # moved or changed after the run; the index then has its counts only
+            report = None
+    figures_ = {} if report is None else measure_strip(report)
+    return _Strip(outcome, number, cloud_path(outcome.job, folder), report, figures_)
+
+
+def _parts(
+    result: BatchResult, strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int], command: str
+) -> Iterator[str]:
+    report = result.report.to_json()
+    counts = report["counts"]
+    yield _summary(result, counts)
+    failed = [f"{one.outcome.job.path}: {' '.join(str(one.outcome.error).split())}" for one in strips
+              if one.outcome.error is not None]  # fmt: skip
+    if failed:
+        yield markup.section("Failed strips", markup.bullets(failed, "warning"), mark="failed")
+    if len(strips) > 1:
+        yield _index(strips, marks, shown)
+        yield markup.section("All strips together", count_tables(counts), figures(figures_of(report["quality"])),
+                             flag_table(counts))  # fmt: skip
+    for strip in strips:
+        if strip.number in shown and strip.report is not None:
+            body = draw_strip(strip.outcome.job.path, strip.cloud, strip.report)
+            notes = [f"{FIGURES[key][0]}: {words}" for key, words in marks[strip.number].items()]
+            unusual = markup.bullets([f"differs from the other strips: {note}" for note in notes], "warning")
+            heading = markup.section(strip.outcome.job.path.name, unusual, body, mark=f"strip-{strip.number}")
+            yield heading.replace("<section ", '<section class="strip" ', 1)
+    yield _provenance(result, command)
+
+
+def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
+    passed = sum(counts["passed_through"].values())
+    states = [outcome.status for outcome in result.outcomes]
+    cards = [
+        ("strips written", f"{states.count('written') + states.count('skipped')} of {len(states)}"),
+        ("points in", f"{counts['points_in']:,}"),
+        ("waveforms", f"{counts['waveforms']:,}"),
+        ("echoes", f"{counts['echoes']:,}"),
+        ("added echoes", f"{counts['added_echoes']:,}"),
+        ("passed through", f"{passed:,}"),
+        ("points out", f"{counts['points_out']:,}"),
+    ]
+    body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
+    lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
+    if result.advice:
+        lines.append(result.advice)
+    return markup.section("Summary", f'<div class="cards">{body}</div>', *map(markup.paragraph, lines))
+
+
+def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int]) -> str:
+    head = ["strip", "status", "points in", "waveforms", "echoes", "points out", *(one[0] for one in FIGURES.values())]
+    rows = []
+    for strip in strips:
+        counts = strip.outcome.report.to_json()["counts"]
+        numbers = [counts[name] for name in ("points_in", "waveforms", "echoes", "points_out")]
+        name, place = markup.text(strip.outcome.job.path.name), strip.number
+        link = f'<a href="#strip-{place}">{name}</a>' if place in shown else name
+        rows.append([markup.Cell(link, strip.outcome.job.path.name), strip.outcome.status,
+                     *([None] * 4 if strip.outcome.status == "failed" else numbers),
+                     *(_figure_cell(strip, key, marks[place]) for key in FIGURES)])  # fmt: skip
+    notes = [
+        f"{sum(map(bool, marks))} of {len(strips)} strips differ from the others in a figure: these are marked with "
+        "\u25b2. It is a reason to look at the strip, not a fault."
+        if len(strips) >= FEWEST
+        else f"Strips are held against each other where there are at least {FEWEST}."
+    ]
+    if len(shown) < sum(strip.report is not None for strip in strips):
+        notes.append(
+            f"{len(shown)} strips have a part of their own below, marked ones first; `run --resume --html` of single "
+            "strips shows the others."
+        )
+    notes.append("A click on a head of the table sorts it.")
+    index = markup.table(head, rows, sortable=True)
+    return markup.section("Strips", *map(markup.paragraph, notes), index, mark="strips")
+
+
+def _figure_cell(strip: _Strip, key: str, marks: dict[str, str]) -> markup.Cell:
+    value = strip.figures.get(key, float("nan"))
+    words = markup.number(value, FIGURES[key][1])
+    if key in marks:
+        words = f'<span class="mark" title="{markup.text(marks[key])}">\u25b2 {words}</span>'
+    return markup.Cell(words, float(value) if value == value else "")
+
+
+def _provenance(result: BatchResult, command: str) -> str:
+    timing = result.to_json()["timing"]
+    rows = {"wavebatch": __version__, "elapsed": f"{timing['elapsed_seconds']:.1f} s"}
+    if timing["waveforms_per_process_second"]:
+        rows["waveforms per second of the processes"] = f"{timing['waveforms_per_process_second']:,}"
+    return markup.section("Run", markup.facts(rows), markup.code(command) if command else "")

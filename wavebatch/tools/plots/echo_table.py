@@ -1,0 +1,104 @@
+"""The parameters of the echoes of waveforms: as lines of text below a picture, and as rows of a CSV file.
+
+`wavebatch plot waveform` writes both. Nothing here needs matplotlib.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from wavebatch.core.echoes import COLUMNS, EchoFlag
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.tools.plots.waveform import WaveformView
+
+MOST_LISTED = 40
+"""Most echoes in the table of a picture; the CSV has all."""
+
+_FLAGS_WIDE = 50
+_NAMES = {"time": "echo_time", "amplitude": "amplitude", "sigma": "echo_width"}
+
+
+def name_flags(flags: int) -> str:
+    """Names of EchoFlag bits, separated by commas; empty without any."""
+    return ", ".join(flag.name for flag in EchoFlag(flags))
+
+
+def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
+    """A table of the echoes, for a monospaced font: time, amplitude, width, range if it is known, and flags."""
+    ranged = any(np.isfinite(_column(view, "range")).any() for view in views)
+    several = len(views) > 1
+    head = f"{'packet':>8}  " * several + f"{'echo':>4}  "
+    head += "".join(f"{name:>15}  " for name in ("time [ns]", "amplitude [DN]", "width [ns]"))
+    lines = [head + f"{'range [m]':>20}  " * ranged + "flags"]
+    every = [(view, row) for view in views for row in range(len(view.echoes))]
+    for view, row in every[:most]:
+        front = f"{view.packet if view.packet >= 0 else '-':>8}  " * several + f"{row + 1:>4}  "
+        front += "  ".join(f"{text:>15}" for text in _measures(view, row)) + "  "
+        if ranged:
+            front += f"{_measure(_column(view, 'range')[row], _column(view, 'range_err')[row]):>20}  "
+        flags = textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)
+        lines += [(front if number == 0 else " " * len(front)) + text for number, text in enumerate(flags)]
+    if len(every) > most:
+        lines.append(f"and {len(every) - most} more: -o FILE.csv writes all")
+    return "\n".join(lines) if every else "no echo"
+
+
+def _measures(view: WaveformView, row: int) -> Iterator[str]:
+    echoes = view.echoes
+    for name, factor in (("time", 1.0), ("amplitude", 1.0), ("sigma", FWHM_PER_SIGMA)):
+        value, error = (getattr(echoes, name + end)[row] for end in ("", "_err"))
+        yield _measure(factor * value, factor * error)
+
+
+def _column(view: WaveformView, name: str) -> np.ndarray:
+    """An attribute column of the echoes; NaN if the chain does not compute it."""
+    return np.asarray(view.echoes.attributes.get(name, np.full(len(view.echoes), np.nan)), np.float64)
+
+
+def _measure(value: float, error: float) -> str:
+    """`12.34 +- 0.05`, with two digits of the error; a dash for no data."""
+    if not math.isfinite(value):
+        return "-"
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.7g}"
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
+    return f"{value:.{digits}f} \N{PLUS-MINUS SIGN} {error:.{digits}f}"
+
+
+def _cell(value: float, digits: int) -> str:
+    """The value with so many digits; empty for no data."""
+    return f"{value:.{digits}g}" if math.isfinite(value) else ""
+
+
+def format_echoes(views: Sequence[WaveformView]) -> str:
+    """CSV with one row per echo; a waveform without echoes has one row without values. Empty cells are no data."""
+    extra = list(dict.fromkeys(name for view in views for name in view.echoes.attributes))
+    measured = [(name, _NAMES[name], COLUMNS[_NAMES[name]].unit) for name in _NAMES]
+    head = ["packet", "point", "gps_time [s]", "echo"]
+    head += [text for _, name, unit in measured for text in (f"{name} [{unit}]", f"{name}_err [{unit}]")]
+    own = (*_NAMES.values(), "point")
+    rest = [name for name in extra if name.removesuffix("_err") not in own and not name.endswith("_reason")]
+    head += [f"{name} [{COLUMNS[name].unit}]" if name in COLUMNS else name for name in rest]
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*head, "flags"])
+    for view in views:
+        place = [view.packet if view.packet >= 0 else "", view.point, f"{view.gps_time:.9f}"]
+        for row in range(len(view.echoes)):
+            values = []
+            for name, _, _ in measured:
+                factor = FWHM_PER_SIGMA if name == "sigma" else 1.0
+                values += [factor * float(getattr(view.echoes, name + end)[row]) for end in ("", "_err")]
+            texts = [_cell(value, 9) for value in values]
+            texts += [_cell(_column(view, name)[row], 9 if name not in ("x", "y", "z") else 13) for name in rest]
+            flags = name_flags(int(view.echoes.flags[row])).replace(", ", " ")
+            table.writerow([*place, row + 1, *texts, flags])
+        if not len(view.echoes):
+            table.writerow([*place, *[""] * (len(head) - 2)])
+    return text.getvalue()

@@ -1,0 +1,269 @@
+"""Sections and height profiles of clouds and of voxels, as arrays.
+
+`wavebatch plot section` and `plot profile` read them here and draw them with `draw_section`. Clouds of any size: a
+section keeps an even sample of its points, a profile only sums.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.even_sample import EvenSample
+from wavebatch.core.suggest import nearest
+from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.las.crs_name import name_crs
+from wavebatch.tools.plots.raster import check_crs
+from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, robust_limits
+from wavebatch.tools.voxels.grid import COLUMNS
+
+MOST_POINTS = 200_000
+"""Most points of a section that are drawn: more would only cover each other."""
+
+MOST_BINS = 5000
+"""Most bins of a profile."""
+
+_CHOSEN_BINS = 60
+"""Bins of a profile, about, if their size is not given."""
+
+_PIECE = 1_000_000
+
+
+class VoxelFile:
+    """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
+
+    Has the interface of `values.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
+    column.
+    """
+
+    def __init__(self, path: Path, selection: Selection) -> None:
+        self.paths, self.selection = (path,), selection
+        if selection.flags_with or selection.flags_without:
+            raise ConfigError(f"{path}: voxels have no echo_flags to select by")
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                self._data = {name: data[name] for name in data.files}
+            self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
+            self.size = float(self._data["size"])
+            self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
+            json.loads(str(self._data["meta"]))
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise InputError(f"{path}: holds no voxels of `wavebatch voxelize` ({error})") from error
+        known = {column.name: column for column in COLUMNS if column.name in self._data}
+        name = selection.column
+        if name is not None and name not in known:
+            raise ConfigError(f"{path}: has no column {name!r}; {nearest(name, known)}")
+        facts = known.get(name)
+        unit, meaning = (facts.unit, facts.meaning) if facts else ("-", "")
+        self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
+
+    def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
+        """As Clouds.read, with the height of the centre in `others`."""
+        dtype = [("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("others", "<f8", (1,))]
+        for start in range(0, len(self._index), _PIECE):
+            part = slice(start, start + _PIECE)
+            place = self._origin + (self._index[part] + 0.5) * self.size
+            rows = np.zeros(len(place), dtype)
+            rows["x"], rows["y"], rows["others"][:, 0] = place.T
+            rows["value"] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
+            good = rows[~np.isnan(rows["value"])]
+            yield 0, good, Tally(len(rows), 0, len(rows) - len(good), len(good))
+
+    def complain(self, tally: Tally) -> InputError:
+        """The error that says why nothing can be drawn."""
+        return InputError(f"{self.paths[0]}: nothing to draw: {tally.points} voxels, {tally.no_data} without data")
+
+
+def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
+    """Clouds or one file of voxels, whose rows have the height in `others`."""
+    voxels = [path for path in paths if path.suffix.lower() == ".npz"]
+    if voxels and len(paths) > 1:
+        raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
+    return VoxelFile(paths[0], selection) if voxels else Clouds(paths, replace(selection, others=("z",)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """The points of a vertical section along a line."""
+
+    facts: ColumnFacts
+    names: tuple[str, ...]
+    line: tuple[float, float, float, float]
+    """x and y of both ends."""
+    width: float
+    """Of the strip of ground whose points are shown: half of it on each side of the line."""
+    along: np.ndarray
+    """Distance from the first end, f8 (n,)."""
+    height: np.ndarray
+    value: np.ndarray
+    total: Tally
+    """Counts of all points of the clouds."""
+    inside: int
+    """Points with a value in the section, of which at most MOST_POINTS are here."""
+    shown: tuple[float, float]
+    """Limits of the colours."""
+    voxel: float
+    """Edge of a voxel; 0 for points."""
+    crs: str
+    unit: str
+
+
+def cut_section(
+    paths: Sequence[Path],
+    selection: Selection,
+    *,
+    line: tuple[float, float, float, float] | None = None,
+    width: float | None = None,
+) -> Section:
+    """The points within half of `width` from a line, as distance along it and height.
+
+    line: x0, y0, x1, y1; by default along the longer extent of the points, through their middle. width: by default a
+    fiftieth of the line, for voxels at least one voxel. Raises InputError if no point lies there.
+    """
+    clouds = open_heights(paths, selection)
+    voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
+    crs, unit = (clouds.crs, "m") if isinstance(clouds, VoxelFile) else check_crs(paths)
+    line = line or _choose_line(clouds)
+    start, end = np.array(line[:2]), np.array(line[2:])
+    length = float(np.hypot(*(end - start)))
+    if not (math.isfinite(length) and length > 0):
+        raise ConfigError("--line: the ends must be two different points: x0,y0,x1,y1")
+    width = max(length / 50, voxel) if width is None else width
+    if not (math.isfinite(width) and width > 0):
+        raise ConfigError(f"--width {width:g}: must be above 0")
+    unit_along = (end - start) / length
+    sample, total = EvenSample(MOST_POINTS), Tally()
+    for _, rows, tally in clouds.read():
+        total += tally
+        offset = np.stack([rows["x"], rows["y"]], axis=1) - start
+        along, across = offset @ unit_along, offset @ np.array([-unit_along[1], unit_along[0]])
+        keep = (along >= 0) & (along <= length) & (np.abs(across) <= 0.5 * width) & np.isfinite(rows["others"][:, 0])
+        if keep.any():
+            place = np.stack([along, rows["others"][:, 0], rows["value"]], axis=1)[keep]
+            sample.add({"place": place})
+    if not total.values:
+        raise clouds.complain(total)
+    if not sample.seen:
+        raise InputError(
+            f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} of the line from {start[0]:.10g} "
+            f"{start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
+        )
+    along, height, value = sample.read()["place"].T
+    shown = tuple(np.percentile(value, (2, 98)).tolist())
+    names = tuple(path.name for path in paths)
+    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen, shown,
+                   voxel, crs, unit)  # fmt: skip
+
+
+def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
+    """A line through the middle of the points, along their longer extent."""
+    sample = EvenSample()
+    for _, rows, _ in clouds.read():
+        places = np.stack([rows["x"], rows["y"]], axis=1)
+        places = places[np.isfinite(places).all(axis=1)]
+        if len(places):
+            sample.add({"place": places})
+    if not sample.seen:
+        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a value and a position")
+    places = sample.read()["place"]
+    middle = places.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.cov((places - middle).T) if len(places) > 1 else np.eye(2))
+    axis = vectors[:, 1] if values[1] > 0 else np.array([1.0, 0.0])
+    axis = axis if axis[np.argmax(np.abs(axis))] > 0 else -axis
+    ends = (places - middle) @ axis
+    low, high = robust_limits(ends, float(ends.min()), float(ends.max()))
+    margin = max(0.5 * (1.0 - (high - low)), 0.0)
+    return (*(middle + (low - margin) * axis).tolist(), *(middle + (high + margin) * axis).tolist())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Numbers or sums per height, for one series per cloud."""
+
+    facts: ColumnFacts
+    statistic: str
+    """`count`, `sum` or `mean`."""
+    names: tuple[str, ...]
+    edges: np.ndarray
+    """Heights, f8 (b + 1,)."""
+    values: np.ndarray
+    """f8 (series, b); NaN for a mean without a point."""
+    outside: int
+    """Points below or above the edges."""
+    total: Tally
+    unit: str
+
+    @property
+    def label(self) -> str:
+        """Label of the axis of values."""
+        if self.statistic == "count":
+            return f"{'voxels' if self.facts.name == 'voxels' else 'points'} per height [-]"
+        return f"{self.statistic} of {self.facts.label} per height"
+
+
+def measure_profile(
+    paths: Sequence[Path], selection: Selection, statistic: str, *, size: float | None = None, each: bool = False
+) -> Profile:
+    """The number of points, or the sum or mean of the column, per height.
+
+    size: height of a bin, by default about a sixtieth of all. each: one series per cloud instead of one for all. Far
+    outliers in height are left out and counted. Raises InputError without any value.
+    """
+    clouds = open_heights(paths, selection)
+    unit = "m" if isinstance(clouds, VoxelFile) else check_crs(paths)[1]
+    if statistic != "count" and selection.column is None:
+        raise ConfigError(f"--statistic {statistic} needs a --column; only count needs none")
+    if statistic != "count" and clouds.facts.is_flags:
+        raise ConfigError(f"{paths[0]}: {clouds.facts.name} are bits, which have no {statistic}")
+    sample, total, least, largest = EvenSample(), Tally(), math.inf, -math.inf
+    for _, rows, tally in clouds.read():
+        total += tally
+        height = rows["others"][:, 0]
+        height = height[np.isfinite(height)]
+        if len(height):
+            sample.add({"height": height})
+            least, largest = min(least, float(height.min())), max(largest, float(height.max()))
+    if not sample.seen:
+        raise clouds.complain(total)
+    voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
+    edges = _place_heights(sample.read()["height"], least, largest, size, voxel)
+    series = len(paths) if each else 1
+    sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
+    for cloud, rows, _ in clouds.read():
+        at = np.searchsorted(edges, rows["others"][:, 0], side="right") - 1
+        good = (at >= 0) & (at < len(edges) - 1)
+        outside += int(np.count_nonzero(~good))
+        row = cloud if each else 0
+        numbers[row] += np.bincount(at[good], minlength=len(edges) - 1)
+        sums[row] += np.bincount(at[good], rows["value"][good], minlength=len(edges) - 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        values: Any = {"count": numbers, "sum": sums, "mean": np.where(numbers > 0, sums / numbers, np.nan)}[statistic]
+    names = name_paths(paths)
+    names = names if each or len(paths) == 1 else (f"{len(paths)} clouds",)
+    return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit)
+
+
+def _place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
+    """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
+    low, high = robust_limits(sample, least, largest)
+    if size is None:
+        span = max(high - low, 1e-3)
+        power = 10.0 ** math.floor(math.log10(span / _CHOSEN_BINS))
+        size = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= span / _CHOSEN_BINS)
+    if not (math.isfinite(size) and size > 0):
+        raise ConfigError(f"--size {size:g}: must be above 0")
+    base = 0.0
+    if voxel:
+        size = voxel * max(round(size / voxel), 1)
+        base = float(sample.min()) - 0.5 * voxel
+    first, last = math.floor((low - base) / size + 1e-6), math.floor((high - base) / size + 1e-6)
+    if last - first >= MOST_BINS:
+        raise ConfigError(f"--size {size:g}: gives more than {MOST_BINS} bins; give a larger one")
+    return base + np.arange(first, last + 2) * size

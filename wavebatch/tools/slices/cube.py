@@ -1,0 +1,163 @@
+"""The data cube of scan lines: samples by line, pulse and time on one axis, as an .npz, and slices of it.
+
+`wavebatch slice --cube` writes it, `wavebatch plot cube` draws slices of it. The axis of time is one for all pulses:
+windows open at other heights for every pulse, and counted from their own first samples the relief would be lost.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.disk.publish import Draft, reporting
+from wavebatch.tools.slices.lines import ScanLine
+
+MOST_VALUES = 200_000_000
+"""Most values of a cube (800 MB): it is built in memory."""
+
+
+class CubeBuilder:
+    """Collects scan lines, one after the other, and writes them as a cube."""
+
+    def __init__(self, target: Path) -> None:
+        if target.suffix.lower() != ".npz":
+            raise ConfigError(f"--cube {target}: a cube is written as .npz")
+        self._target = target
+        self._lines: list[ScanLine] = []
+        self._samples = 0
+
+    def add(self, line: ScanLine) -> None:
+        """Adds a line; ConfigError where the cube grows too large."""
+        self._lines.append(line)
+        self._samples += len(line.row)
+        if self._samples > MOST_VALUES:
+            raise ConfigError(f"--cube {self._target}: more than {MOST_VALUES} samples; choose fewer --lines")
+
+    def write(self, meta: dict[str, Any], crs: str | None, *, overwrite: bool) -> tuple[int, int, int]:
+        """Writes the cube; returns its shape: lines, pulses, times.
+
+        Raises InputError without a line, and where lines differ in their spacing.
+        """
+        arrays = build_cube(self._lines, str(self._target))
+        arrays |= {"crs": np.array(crs or ""), "meta": np.array(json.dumps(meta, sort_keys=True))}
+        with Draft(self._target, overwrite=overwrite) as draft:
+            with reporting(self._target):
+                np.savez_compressed(draft.file, **arrays)
+            draft.publish()
+        return arrays["values"].shape
+
+
+def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
+    """Arrays of the cube of some lines; name: of the file, for messages.
+
+    values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
+    time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor. offset
+    f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not interpolated.
+    line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no more pulses.
+    """
+    if not lines:
+        raise InputError(f"{name}: not written, because there is no scan line")
+    spacing = lines[0].spacing
+    if any(abs(line.spacing - spacing) > 1e-6 * spacing for line in lines):
+        raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
+    starts = _find_starts(lines)
+    shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
+    pulses = max(map(len, lines))
+    times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
+    if len(lines) * pulses * times > MOST_VALUES:
+        raise ConfigError(
+            f"{name}: {len(lines)} lines of up to {pulses} pulses over {times} samples are too many: choose fewer"
+        )
+    shape = (len(lines), pulses)
+    values = np.full((*shape, times), np.nan, np.float32)
+    place = {"gps_time": np.full(shape, np.nan), "offset": np.full(shape, np.nan, np.float32)}
+    place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
+    for i, line in enumerate(lines):
+        sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
+        values[i, line.row, sample] = line.value
+        for key in ("gps_time", "origin", "direction"):
+            place[key][i, : len(line)] = getattr(line, key)
+        place["offset"][i, : len(line)] = starts[i] - shift[i] * spacing
+    number = np.array([line.number for line in lines])
+    return {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
+
+
+def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
+    """Time from the common plane to the first sample of each pulse [ns]; 0 where it is not known."""
+    direction = np.concatenate([line.direction for line in lines])
+    origin = np.concatenate([line.origin for line in lines])
+    along = np.linalg.norm(direction, axis=1)
+    mean = (direction / np.where(along > 0, along, 1.0)[:, None]).mean(axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-12)
+    depth, speed = (origin - origin.mean(axis=0)) @ mean, direction @ mean
+    known = speed > 1e-3 * along
+    if known.any():
+        depth = depth - depth[known].min()
+    start = np.where(known, depth / np.where(known, speed, 1.0), 0.0)
+    return np.split(start, np.cumsum([len(line) for line in lines])[:-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CubeSlice:
+    """One slice of a cube, ready to draw."""
+
+    image: np.ndarray
+    """f4 (rows, columns), the first row at the lower edge."""
+    extent: tuple[float, float, float, float]
+    """Left, right, lower and upper edge."""
+    across: str
+    up: str
+    """Labels of the axes."""
+    title: str
+    down: bool = False
+    """Whether the vertical axis is time, which grows downwards: away from the sensor."""
+
+
+def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
+    """Slices of a cube: `x` a pulse of the lines, `y` a scan line, `t` a time [ns]; the middle ones if none is wanted.
+
+    Raises InputError for a file that holds no cube, ConfigError for a slice outside of it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            values, time, number = (data[name] for name in ("values", "time", "line"))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{path}: holds no cube of `wavebatch slice --cube` ({error})") from error
+    if values.ndim != 3 or not values.size or values.shape[2] != len(time) or values.shape[0] != len(number):
+        raise InputError(f"{path}: holds no cube of `wavebatch slice --cube`: its arrays do not fit")
+    spacing = float(time[1] - time[0]) if len(time) > 1 else 1.0
+    if all(value is None for value in wanted.values()):
+        peak = int(np.nanargmax(np.nansum(values, axis=(0, 1))))
+        wanted = {"x": values.shape[1] // 2, "y": int(number[len(number) // 2]), "t": float(time[peak])}
+    x_edges, y_edges = (-0.5, values.shape[1] - 0.5), (-0.5, len(number) - 0.5)
+    t_edges = (float(time[0]) - 0.5 * spacing, float(time[-1]) + 0.5 * spacing)
+    x_label, y_label, t_label = "pulse of the line [-]", "scan line, in the order of the cube [-]", "time [ns]"
+    found = []
+    if wanted["x"] is not None:
+        place = _check("--x", wanted["x"], values.shape[1])
+        found.append(CubeSlice(values[:, place].T, (*y_edges, *t_edges), y_label, t_label, f"x = {place}", True))
+    if wanted["y"] is not None:
+        row = np.flatnonzero(number == int(wanted["y"]))
+        if not len(row):
+            raise ConfigError(f"--y {int(wanted['y'])}: the cube has scan lines {number.min()} to {number.max()}")
+        title = f"y = {int(wanted['y'])} (scan line)"
+        found.append(CubeSlice(values[row[0]].T, (*x_edges, *t_edges), x_label, t_label, title, True))
+    if wanted["t"] is not None:
+        sample = round((wanted["t"] - float(time[0])) / spacing)
+        place = _check("--t", sample, len(time), f"{time[0]:g} to {time[-1]:g} ns")
+        title = f"t = {time[place]:.4g} ns"
+        found.append(CubeSlice(values[:, :, place], (*x_edges, *y_edges), x_label, y_label, title))
+    return found
+
+
+def _check(option: str, value: float, number: int, has: str = "") -> int:
+    place = int(value)
+    if not 0 <= place < number:
+        raise ConfigError(f"{option} {value:g}: lies outside of the cube, which has {has or f'0 to {number - 1}'}")
+    return place
