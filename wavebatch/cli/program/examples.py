@@ -47,6 +47,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
     ),
     "plot histogram": (
+        ('wavebatch plot histogram clouds/*.laz --column z --where "classification == 2" -o ground.png', "ground only"),
         ("wavebatch plot histogram clouds/*.laz --column echo_width -o widths.png", "widths of all clouds"),
     ),
     "plot map": (
