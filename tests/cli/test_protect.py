@@ -91,7 +91,7 @@ def test_every_option_that_writes_is_known_as_such():
         for one in getattr(command, "commands", {name: command}).values():
             found |= {f"{one.name} {p.opts[-1]}" for p in one.params if isinstance(p.type, OutputPath)}
     logs = {name for name in found if name.endswith(" --log-file")}
-    assert len(logs) == len(COMMANDS) + 2  # `plot` has three commands
+    assert len(logs) == len(COMMANDS) + 5  # `plot` has six commands
     assert found - logs == {
         "run --output", "run --report", "survey --output", "survey --chain", "simulate --output", "simulate --truth",
         "stats --output", "synthesize --output", "slice --output", "slice --png", "voxelize --output",

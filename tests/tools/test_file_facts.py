@@ -52,7 +52,8 @@ def test_a_cloud_shows_how_it_was_made(tiny_strip, tmp_path):
     shown = CliRunner().invoke(main, ["info", str(tmp_path / "tiny.laz")]).stdout
     for line in ("command        wavebatch run tiny.las", "chain          noise.pooled", "range as EchoRange"):
         assert line in shown
-    assert json.loads(CliRunner().invoke(main, ["info", "--json", str(tmp_path / "tiny.laz")]).stdout) == facts
+    document = json.loads(CliRunner().invoke(main, ["info", "--json", str(tmp_path / "tiny.laz")]).stdout)
+    assert document == {"schema": "wavebatch.info/1", **facts}
 
 
 def test_headers_that_are_wrong_show():

@@ -53,6 +53,16 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "plot map": (
         ("wavebatch plot map clouds/ --column amplitude --size 1 -o map.png", "mean amplitude in cells of 1 m"),
     ),
+    "plot section": (
+        ("wavebatch plot section clouds/ --width 2 --column echo_width -o side.png",
+         "2 m wide, along the longer extent"),
+    ),
+    "plot profile": (
+        ("wavebatch plot profile voxels.npz -o heights.png", "energy by height"),
+    ),
+    "plot cube": (
+        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and the plane at sample 250"),
+    ),
     "grid": (
         ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
          "two bands for GIS"),
