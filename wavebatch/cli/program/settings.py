@@ -101,7 +101,8 @@ def _find_file(parsed: Mapping[str, Any]) -> Path | None:
     for word in words:
         folder = _folder(word)
         path = folder / FILE
-        found[os.path.realpath(path) if path.is_file() else ""] = path
+        # os.path.isfile is false for names that the system refuses, such as one that is too long: `run` says so.
+        found[os.path.realpath(path) if os.path.isfile(path) else ""] = path
     if len(found) > 1:
         files = ", ".join(str(path) for key, path in found.items() if key)
         raise click.UsageError(f"the inputs lie in folders with different settings ({files}); run them one by one")
