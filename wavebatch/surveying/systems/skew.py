@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.least_squares import OUTSIDE, Limits, Windows
 from wavebatch.stages.noise import pooled
 from wavebatch.surveying.measure import ENOUGH_TO_LEARN, FEW, MIN_SNR, find_edge
 
-MOST_FITTED = 800
+MOST_FITTED = 400
 """Echoes whose skews are measured; more do not make the skew of the strip better known."""
 
 LOBE = 3.0
@@ -97,10 +97,15 @@ def fit_single(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     part = block.rows(echoes.waveform)
     signal = (part.samples - pooled(part, system).level).astype(np.float32)
     time, width = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
-    x = np.tile(np.arange(s, dtype=np.float32), (len(echoes), 1))
-    outside = np.abs(x - time[:, None]) > np.maximum(LOBE * width, 2.5)[:, None]
+    reach = np.maximum(LOBE * width, 2.5)
+    length = min(int(np.ceil(2 * reach.max())) + 2, s)
+    begin = np.clip(np.rint(time - 0.5 * length), 0, s - length).astype(np.int64)
+    at = begin[:, None] + np.arange(length)
+    x, rows = at.astype(np.float32), np.arange(len(echoes))[:, None]
+    signal = signal[rows, at]
+    outside = np.abs(x - time[:, None]) > reach[:, None]
     if part.missing is not None:
-        outside |= part.missing
+        outside |= part.missing[rows, at]
     x[outside], signal[outside] = OUTSIDE, 0
     windows = Windows(signal, x, np.full(len(echoes), system.noise_std))
     start = np.stack([echoes.amplitude.astype(np.float64), time, width, np.zeros(len(echoes))], axis=1)[:, :, None]
