@@ -220,3 +220,9 @@ def test_the_claim_of_a_killed_run_counts_no_more(tmp_path):
     assert publish.remove_stale(tmp_path) == []
     claim.discard()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_pattern_that_is_no_name_ends_at_once(place):
+    """A list of 100,000 brackets was searched for minutes."""
+    Path("list.txt").write_text("good.las\n" + "[" * 100_000 + "a.las\n")
+    _is_fine(_run("@list.txt"), 3, "File name too long")

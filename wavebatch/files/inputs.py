@@ -16,6 +16,9 @@ from wavebatch.files.text_file import read_text
 
 SUFFIXES = (".las", ".laz")
 
+LONGEST_PATTERN = 4096
+"""Characters of a pattern: a longer one is taken as a name, which no file can have. 100,000 brackets took minutes."""
+
 
 def find_files(arguments: Iterable[str], *, recursive: bool = False) -> list[Path]:
     """Return the files of the arguments, each once, in the order of the arguments.
@@ -62,7 +65,7 @@ def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
             yield path
             return
         found, problem = sorted(path / name for name in names), f"{path}: the folder holds"
-    elif os.path.exists(path) or not glob.has_magic(argument):
+    elif os.path.exists(path) or not glob.has_magic(argument) or len(argument) > LONGEST_PATTERN:
         yield path
         return
     else:
