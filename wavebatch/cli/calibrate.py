@@ -70,8 +70,6 @@ def calibrate(
     from wavebatch.surveying.calibrating.target_file import load_targets
 
     paths = find_files(map(str, strips))
-    if not paths:
-        raise ConfigError("no strip given")
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], options["plot"], html_file)):
             refuse_input(target)
