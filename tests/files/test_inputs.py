@@ -95,8 +95,8 @@ def test_every_command_that_takes_lists_refuses_an_empty_one_in_one_line(tmp_pat
         rest = [*more.get(words, []), *(["-o", tmp_path / "p.png"] if words.startswith("plot") else [])]
         result = CliRunner().invoke(main, [*words.split(), given, *map(str, rest)])
         assert result.exit_code == 2, (words, result.output, result.exception)
-        lines = result.stderr.splitlines()
-        assert lines == [f"error: {given[1:]}: the list names no file; write one file, folder or pattern per line"], words
+        (line,) = result.stderr.splitlines()
+        assert line == f"error: {given[1:]}: the list names no file; write one file, folder or pattern per line", words
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.txt", "targets.csv"]
 
 

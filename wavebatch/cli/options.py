@@ -81,6 +81,15 @@ def where_option(text: str) -> Callable:
     return click.option("--where", callback=_read_where, metavar="CONDITION", help=f"{text} {more}")
 
 
+selection_options = together(
+    click.option("--flags-with", multiple=True, metavar="NAMES",
+                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
+    click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
+    where_option("Use only points"),
+)  # fmt: skip
+"""Options that select points by their flags and columns."""
+
+
 html_option = output_option(
     "Also write a report page: one HTML file with all pictures in it. An older report of that name is replaced.",
     "FILE", "--html", "html_file", required=False,

@@ -14,7 +14,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, print_json, talk
-from wavebatch.cli.plot.sections import cube, flag_options, profile, section, select
+from wavebatch.cli.plot.sections import cube, describe_picture, list_tally, profile, section, select
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
@@ -173,7 +173,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
-@flag_options
+@shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Draw histograms of columns of CLOUDs of any size.
@@ -197,17 +197,8 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
     if not options["quiet"]:
         talk(f"{output}: {text}")
     if options["as_json"]:
-        drawn = [{"columns": list(names), **_list_tally(tally)} for names, tally in tallies.items()]
-        print_json({**_describe(output, clouds), "drawn": drawn})
-
-
-def _describe(output: Path, clouds: Sequence[Path]) -> dict[str, Any]:
-    return {"output": str(output), "clouds": [str(path) for path in clouds]}
-
-
-def _list_tally(tally: Any) -> dict[str, int]:
-    """How many points were drawn, and how many were not, for --json."""
-    return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
+        drawn = [{"columns": list(names), **list_tally(tally)} for names, tally in tallies.items()]
+        print_json({**describe_picture(output, clouds), "drawn": drawn})
 
 
 def _draw_flags(
@@ -275,7 +266,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
-@flag_options
+@shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
@@ -305,7 +296,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     if options["as_json"]:
         cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size}
         more = {"statistic": statistic, "outside": found.outside, **cells}
-        print_json({**_describe(output, clouds), "column": column, **_list_tally(found.total), **more})
+        print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
 
 
 plot.add_command(section)
