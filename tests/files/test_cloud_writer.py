@@ -32,7 +32,7 @@ from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.publish import remove_stale
 from wavebatch.files.las import laz_encode
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import Vlr, WKT_ID, build_wkt, find_evlrs, read_header
+from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, read_header
 from wavebatch.tools.api.cloud import read_cloud
 
 RIEGL = "riegl-q680i/100429_152240_2535pt_UTM.las"

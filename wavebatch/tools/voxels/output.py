@@ -18,8 +18,8 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft
-from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.crs import repair_records, repair_wkt
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,
     WKT_BIT,
