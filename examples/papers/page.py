@@ -193,7 +193,7 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[str, bool]:
             parts += [format_picture(*one) for one in drawn]
     notes = [f'<p class="fail">{html.escape(error)}</p>' for error in errors]
     if not drawing:
-        notes.append("<p>No pictures: matplotlib is not installed (pip install 'wavebatch[plot]').</p>")
+        notes.append("<p>No pictures: matplotlib is not installed (pip install matplotlib).</p>")
     intro = (
         "<p>Every figure with the paper's value, that of a simulation by other code from the same description (spec), "
         f"ours, and the band that is accepted. Seed {seed}. The papers' data and pictures are not used.</p>"

@@ -32,7 +32,8 @@ def test_only_the_unit_of_the_longitudes_changes():
         assert repair_wkt(right) == right
     records = [build_wkt(RIPROCESS), build_wkt(build_utm(32633)), Vlr(b"other", WKT_ID, RIPROCESS.encode(), b"")]
     first, *rest = repair_records(records)
-    assert first.payload == found.encode() + b"\0" and all(one is old for one, old in zip(rest, records[1:], strict=True))
+    assert first.payload == found.encode() + b"\0"
+    assert all(one is old for one, old in zip(rest, records[1:], strict=True))
 
 
 @pytest.fixture(scope="module")

@@ -105,7 +105,8 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
 @click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
               help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
 @file_option("--polygon", metavar="FILE.geojson",
-             text="Write only points inside these polygons, in the coordinates of the strips.")
+             text="Write only points inside these polygons, in WGS 84, in the CRS that the file names, or in the "
+                  "coordinates of the strips.")
 @click.option("--columns", metavar="LIST",
               help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
               "shipped ones get the stages that make them.")

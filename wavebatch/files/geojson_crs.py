@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.las.crs import repair_wkt
 from wavebatch.files.las.geotiff_wkt import find_code
 from wavebatch.files.las.header import Vlr
@@ -75,8 +76,8 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
         import pyproj
     except ImportError as error:
         raise ConfigError(
-            f"{path}: GeoJSON in WGS 84 needs pyproj: pip install 'wavebatch[gis]'; or write .csv, or --geojson-crs "
-            "keep for the coordinates of the strip"
+            f"{path}: GeoJSON in WGS 84 needs pyproj: {advise_install('pyproj')}; or write .csv, or "
+            "--geojson-crs keep for the coordinates of the strip"
         ) from error
     try:
         source = pyproj.CRS.from_user_input(crs)

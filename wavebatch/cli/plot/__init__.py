@@ -45,7 +45,7 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 def plot() -> None:
     """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
 
-    Needs matplotlib: pip install 'wavebatch[plot]'. No screen is needed; the same input gives the same bytes.
+    Needs matplotlib: pip install matplotlib. No screen is needed; the same input gives the same bytes.
     """
 
 
