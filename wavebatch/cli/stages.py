@@ -11,6 +11,7 @@ import click
 
 from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.options import common_options
+from wavebatch.cli.program.completion import complete_stages
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=complete_stages)
 @common_options("json")
 def stages(name: str | None, as_json: bool, debug: bool) -> None:
     """List the algorithms that a chain can use, or explain the one called NAME.

@@ -13,6 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.program.completion import complete_columns
 from wavebatch.files.inputs import find_files
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 @click.command()
 @shared.clouds_argument
 @shared.recursive_option
-@click.option("--column", "columns", multiple=True, metavar="NAME",
+@click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "std", "count", "density"]),
               default="mean", show_default=True,

@@ -15,6 +15,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, print_json, talk
 from wavebatch.cli.plot.sections import cube, describe_picture, list_tally, profile, section, select
+from wavebatch.cli.program.completion import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
@@ -60,7 +61,7 @@ def plot() -> None:
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
-@click.option("--flags-with", multiple=True, metavar="NAMES",
+@click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
               help="Most waveforms of --flags-with or of the default.")
@@ -162,11 +163,11 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", "columns", required=True, multiple=True,
+@click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
               help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
               "share an axis, others get one of their own.")
-@click.option("--by", metavar="COLUMN", help="Draw one line per value of this column, e.g. number_of_returns or "
-              "classification.")
+@click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
+              help="Draw one line per value of this column, e.g. number_of_returns or classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
               help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
@@ -260,7 +261,8 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
+@click.option("--column", shell_complete=complete_columns,
+              help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")

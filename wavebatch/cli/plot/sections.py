@@ -13,6 +13,7 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
@@ -64,7 +65,8 @@ def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
               help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
 @click.option("--width", type=float, metavar="W",
               help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")
-@click.option("--column", help="Column for the colours.  [default: z; energy for voxels]")
+@click.option("--column", shell_complete=complete_columns,
+              help="Column for the colours.  [default: z; energy for voxels]")
 @click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
               help="Exaggerate heights F times.")
 @shared.selection_options
@@ -99,7 +101,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", help="Column for --statistic sum and mean, e.g. energy.")
+@click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy.")
 @click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
               help="Of the points or voxels of a height.  [default: sum with --column, else count]")
 @click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]")
