@@ -16,14 +16,13 @@ from click.shell_completion import CompletionItem
 def complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Let the shell complete file names; those of lists, which begin with `@`, are found here.
 
-    bash ends a word at `@`: it gives the sign as an argument of its own, and wants the name without it.
+    bash ends a word at `@`: it gives the sign as an argument of its own, but replaces it too.
     """
     given = context.params.get(parameter.name or "") if context is not None else None
     apart = isinstance(given, tuple) and bool(given) and str(given[-1]) == "@"
     if not (apart or incomplete.startswith("@")):
         return [CompletionItem(incomplete, type="file")]
-    sign = "" if apart else "@"
-    folder, start = os.path.split(incomplete.removeprefix(sign))
+    folder, start = os.path.split(incomplete.removeprefix("@"))
     try:
         entries = sorted(os.scandir(folder or "."), key=lambda entry: entry.name)
     except OSError:
@@ -31,7 +30,7 @@ def complete_files(context: click.Context, parameter: click.Parameter, incomplet
     found = []
     for entry in entries:
         if entry.name.startswith(start) and (start or not entry.name.startswith(".")):
-            found.append(CompletionItem(sign + os.path.join(folder, entry.name) + "/" * entry.is_dir()))
+            found.append(CompletionItem("@" + os.path.join(folder, entry.name) + "/" * entry.is_dir()))
     return found
 
 
