@@ -94,7 +94,10 @@ def _explain_keys(target: int, modern: int) -> str:
 def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
     """LAS 1.3, if it can hold all that the strip has."""
     if target >= 6:
-        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}; leave one of the two out")
+        needed = header.point_format >= 6
+        what = "leave --las-version out" if needed else "leave one of the two out"
+        reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
+        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
     evlrs, _ = find_evlrs(path, header)
     if any(evlr.record_id != WAVEFORM_RECORD_ID for evlr in evlrs):
         raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
