@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import laspy
+import like_pdal
 import numpy as np
 import pytest
 from batch_tools import run_one
@@ -19,6 +20,8 @@ from click.testing import CliRunner
 
 import wavebatch as wb
 from wavebatch.cli import main
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.files.cloud.column_names import name_columns
 from wavebatch.files.las.header import read_header
 
 SCRIPTS = Path(__file__).parent / "readers"
@@ -126,6 +129,46 @@ def test_copc_js_reads_the_no_data_value_of_every_column(make_cloud, tmp_path):
         values = np.array(found["columns"][one["name"]])
         values = values[values != one.get("nodata")]
         assert (one["min"], one["max"]) == (pytest.approx(values.min()), pytest.approx(values.max()))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_pdal_would_read_every_column(make_cloud, case):
+    """By PDAL's own rules, see `readers/like_pdal.py`: header, records, CRS, names and values."""
+    pytest.importorskip("laszip", reason="laszip is not installed")
+    path = make_cloud(case)
+    header, wkt, columns = like_pdal.read(path)
+    las = laspy.read(path)
+    count = len(las.points)
+    assert header["count"] == count and sum(header["returns"]) == count
+    if header["format"] >= 6:  # Header::setPointCount: the old fields are 0, and the WKT bit is set
+        assert header["legacy"] == 0 == sum(header["legacy_returns"]) and header["encoding"] & 16
+    else:
+        assert header["legacy"] == count == sum(header["legacy_returns"])
+    assert wkt == (_wkt(path) if header["version"] == (1, 4) else None)
+    names = {"ReturnNumber": "return_number", "NumberOfReturns": "number_of_returns"}
+    for name, values in columns.items():
+        field = next((one.name for one in las.point_format.extra_dimensions if _fix(one.name) == name), None)
+        field = field or names.get(name) or {"GpsTime": "gps_time"}.get(name) or name.lower()
+        np.testing.assert_allclose(values, np.asarray(las[field] if field not in "xyz" else getattr(las, field)),
+                                   rtol=1e-9, atol=1e-9, err_msg=name)  # fmt: skip
+    assert len(columns) == 8 + len(list(las.point_format.extra_dimensions))
+
+
+def _fix(name):
+    return "".join(letter if letter.isalnum() else "_" for letter in name)
+
+
+def test_no_column_of_ours_has_a_name_that_pdal_joins_with_another():
+    """PDAL joins names that differ in case only, and turns signs into `_`: `echo width` would be `echo_width`."""
+    taken = {name.lower() for name in like_pdal.FIELDS}
+    for style in STYLES:
+        fixed = [_fix(one.record.name).lower() for one in name_columns(list(COLUMNS), style, [])]
+        assert len(set(fixed)) == len(fixed) > 20 and not taken & set(fixed), style
+    vendor = ["echo width", "Echo-Width2", "ECHO_WIDTH_ERR", "amplitude.err", "range/err", "wb_echo width"]
+    written = name_columns(["echo_width", "echo_width_err", "amplitude_err", "range_err"], "wavebatch", vendor)
+    fixed = [_fix(one.record.name).lower() for one in written]
+    assert fixed == ["wb2_echo_width", "wb_echo_width_err", "wb_amplitude_err", "wb_range_err"]
+    assert not set(fixed) & {_fix(name).lower() for name in vendor}
 
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.endswith(".laz")])

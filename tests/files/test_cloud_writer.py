@@ -208,7 +208,7 @@ def test_kept_packets_keep_their_format_in_las_1_4(tmp_path, point_format, inter
 
 def test_what_las_1_3_cannot_hold_is_refused(tmp_path):
     write_source(tmp_path / "nine.las", 9, (1, 4))
-    line = "nine.las: --las-version 1.3 has no point format 6, and the strip's points of format 9 .*; leave --las-version"
+    line = "nine.las: --las-version 1.3 has no point format 6, and the strip's points of format 9 .*; leave --las"
     with pytest.raises(ConfigError, match=line):
         plan_output(tmp_path / "nine.las", [], las_version="1.3")
     write_source(tmp_path / "evlr.las", 4, (1, 4), evlrs=[(b"me", 7, b"x")])
