@@ -74,6 +74,7 @@ def calibrate(
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], options["plot"], html_file)):
             refuse_input(target)
+    shared.check_toml(output)
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     if options["plot"] is not None:

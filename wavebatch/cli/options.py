@@ -219,6 +219,16 @@ def _protected(command: Callable) -> Callable:
     return call
 
 
+_NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
+
+
+def check_toml(target: Path | None) -> None:
+    """Raises ConfigError for a name that says that another kind of file would be written."""
+    if target is not None and target.suffix.lower() in _NO_TOML:
+        more = "; --json prints the figures" if target.suffix.lower() == ".json" else ""
+        raise ConfigError(f"{target}: this file is written as TOML; name it {target.with_suffix('.toml').name}{more}")
+
+
 def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:
     """The options of these names that the user gave."""
     return {name: options[name] for name in names if options.get(name) is not None}

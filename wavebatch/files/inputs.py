@@ -58,6 +58,8 @@ def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
         yield from _read_list(folder / argument[1:], recursive)
         return
     path = folder / argument
+    if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
+        path = folder / os.path.expanduser(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
