@@ -69,8 +69,8 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
 
 
 _REPAIRED = (
-    "the WKT of the strip gives metres as the unit of its longitudes, as RiPROCESS writes it: GIS place it on another "
-    "continent; the cloud's WKT says degrees"
+    "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS show the strip elsewhere; the "
+    "cloud's WKT is right"
 )
 
 
