@@ -294,9 +294,10 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
         grid, total = found.grid, found.total
         points = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
         points += f", {total.left_out} left out" * bool(total.left_out)
-        talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} m")
+        talk(f"{output}: {points}; {grid.columns} x {grid.rows} cells of {grid.size:g} {found.unit}")
     if options["as_json"]:
-        cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size}
+        cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size,
+                 "unit": found.unit}
         more = {"statistic": statistic, "outside": found.outside, **cells}
         print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
 

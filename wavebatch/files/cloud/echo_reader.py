@@ -6,6 +6,7 @@ come from any program: laspy only describes the fields, the bytes are read and c
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
@@ -14,11 +15,13 @@ import numpy as np
 from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError
 from wavebatch.files.cloud.column_names import STYLES
 from wavebatch.files.cloud.provenance import find_written
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
+from wavebatch.files.las.crs import metres_per_unit, read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.point_formats import split_numbers
 from wavebatch.files.las.read_points import open_points
@@ -58,6 +61,10 @@ class CloudReader(Closing):
         checked = read_checked_header(self.path, waveforms=False)
         self.point_count: int = checked.header.point_count
         self.scales, self.offsets = checked.header.scales, checked.header.offsets
+        units = read_crs(self.path, checked.header)[1]
+        self.metres = metres_per_unit(units)
+        """Metres of a step of 1 in x, y and z; NaN in degrees."""
+        self.unit = next((one.describe() for one in units if not one.is_metric), "metres")
         self.bounds = checked.header.mins, checked.header.maxs
         self._format = describe_format(checked)
         names = set(self._format.dimension_names)
@@ -73,6 +80,13 @@ class CloudReader(Closing):
         self.left_out = 0
         """Points that `keep` has left out so far."""
         self._points = open_points(checked)
+
+    def measure_in_metres(self) -> None:
+        """Let positions be in metres; raises ConfigError for degrees, and for units of unknown length."""
+        if any(map(math.isnan, self.metres)):
+            raise ConfigError(f"{self.path}: coordinates are {self.unit}, which have no length; project it to metres")
+        self.scales = tuple(scale * one for scale, one in zip(self.scales, self.metres, strict=True))
+        self.offsets = tuple(offset * one for offset, one in zip(self.offsets, self.metres, strict=True))
 
     def close(self) -> None:
         """Close the file."""

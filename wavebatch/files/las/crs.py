@@ -84,6 +84,20 @@ class CrsUnits:
         return along if self.vertical is None or up == along else f"{along} with heights in {up}"
 
 
+def metres_per_unit(units: Sequence[CrsUnits]) -> tuple[float, float, float]:
+    """Return the metres of a step of 1 in x, y and z; NaN where it has no length, as in degrees, or an unknown one.
+
+    units: as `read_crs` gives them. Without a unit, coordinates are metres.
+    """
+    if any(unit.kind == "geographic" for unit in units):
+        along = math.nan
+    else:
+        along = next((unit.horizontal for unit in units if unit.horizontal is not None), 1.0)
+    default = 1.0 if math.isnan(along) else along
+    up = next((unit.vertical for unit in units if unit.vertical is not None), default)
+    return along, along, up
+
+
 def looks_geocentric(mins: Sequence[float], maxs: Sequence[float]) -> bool:
     """Whether the extent of a strip lies on the surface of the Earth as seen from its centre.
 

@@ -36,7 +36,8 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condit
     nearest first. If GPS times do not separate pulses, mutual nearest neighbours are the same. Points passed through
     without an echo are ignored. where: only points that meet it are compared, in both clouds. Memory is bounded; large
     clouds need room in TMPDIR.
-    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance or an unknown column.
+    Raises InputError for a file that cannot be read, ConfigError for a wrong tolerance, an unknown column, or
+    coordinates without a length.
     """
     with CloudReader(a) as first, CloudReader(b) as second, open_task(first, second, tolerance_ns) as task:
         for reader, side in ((first, 0), (second, 1)):
@@ -50,6 +51,8 @@ def compare_clouds(a: Path, b: Path, *, tolerance_ns: float = 1.0, where: Condit
 def open_task(first: CloudReader, second: CloudReader, tolerance_ns: float) -> CloudTask:
     """A comparison by GPS time if both clouds have times that separate pulses and share some, else by position."""
     by_time = pulses_told_apart(first) and pulses_told_apart(second) and _share_times(first, second)
+    for reader in (first, second):
+        reader.measure_in_metres()
     task = CloudTask(by_time, check_tolerance(tolerance_ns), max(first.point_count, second.point_count))
     if not by_time:
         task.place_borders(first)

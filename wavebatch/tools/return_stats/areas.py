@@ -186,11 +186,13 @@ class AreaTally:
     def __len__(self) -> int:
         return len(self._areas)
 
-    def add(self, rows: np.ndarray, first: np.ndarray, before: np.ndarray, distance: np.ndarray) -> None:
+    def add(
+        self, rows: np.ndarray, first: np.ndarray, before: np.ndarray, distance: np.ndarray, up: float = 1.0
+    ) -> None:
         """Adds whole pulses: a pulse belongs, with all its returns, to the area of its first return.
 
         rows: returns sorted by pulse, then number; first: row of the first return of each pulse; before: rows that form
-        a pair with the next row; distance: of these pairs [m].
+        a pair with the next row; distance: of these pairs [m]; up: metres of a step of 1 in height.
         """
         places = rows["xyz"][first]
         areas, area = np.unique(self.division.find(places[:, 0], places[:, 1]), return_inverse=True)
@@ -204,7 +206,7 @@ class AreaTally:
         pairs = np.bincount(of_pair, minlength=cells).reshape(n, -1)
         least = np.full(cells, np.inf)
         np.minimum.at(least, of_pair, distance)
-        pulses, depth = measure_depths(rows, first)
+        pulses, depth = measure_depths(rows, first, up)
         several = np.bincount(area[pulses], minlength=n)[:, None]
         tables = (by_number.reshape(n, -1), by_count.reshape(n, -1), pairs, several)
         apart = np.bincount(of_pair, distance, cells).reshape(n, -1)
@@ -260,14 +262,15 @@ class AreaTally:
         )
 
 
-def measure_depths(rows: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def measure_depths(rows: np.ndarray, first: np.ndarray, up: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """Pulses with several returns, and the height of their first above their last return [m].
 
-    rows: returns sorted by pulse, then number; first: row of the first return of each pulse.
+    rows: returns sorted by pulse, then number; first: row of the first return of each pulse; up: metres of a step of 1
+    in height.
     """
     last = np.append(first[1:], len(rows)) - 1
     with np.errstate(invalid="ignore", over="ignore"):
-        depth = rows["xyz"][first, 2] - rows["xyz"][last, 2]
+        depth = up * (rows["xyz"][first, 2] - rows["xyz"][last, 2])
     pulses = np.flatnonzero((last > first) & np.isfinite(depth))
     return pulses, depth[pulses]
 

@@ -136,7 +136,12 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
         select_points(reader, where)
         placed = [division.place(path) for division in divisions]
         tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
-        tally.misses = [line for division in placed for line in [division.miss(path)] if line]
+        tally.notes = [line for division in placed for line in [division.miss(path)] if line]
+        tally.metres = reader.metres
+        if math.isnan(reader.metres[0]):
+            tally.notes.append(f"coordinates are {reader.unit}: returns have no distances; project the cloud to metres")
+        elif reader.metres != (1.0, 1.0, 1.0):
+            tally.notes.append(f"coordinates are {reader.unit}: distances and depths are converted to metres")
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count)
@@ -197,8 +202,10 @@ class _Tally:
     least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
-    misses: list[str] = field(default_factory=list)
-    """Lines that say that no area lies in the cloud."""
+    notes: list[str] = field(default_factory=list)
+    """Lines about the areas and the unit of the coordinates."""
+    metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Of a step of 1 in x, y and z; NaN in degrees, which have no distances."""
 
     def add_points(self, rows: np.ndarray) -> None:
         """Adds return numbers and flags of some points."""
@@ -216,13 +223,13 @@ class _Tally:
         counts = np.diff(np.append(first, len(rows)))
         self.by_count += np.bincount(np.minimum(counts, MOST_COUNT), minlength=MOST_COUNT + 1)
         self.incomplete += int(np.count_nonzero(counts != rows["total"][first]))
-        pulses, depth = measure_depths(rows, first)
+        pulses, depth = measure_depths(rows, first, self.metres[2])
         self.several += len(pulses)
         self.depth += float(depth.sum())
         pair = (rows["key"][1:] == rows["key"][:-1]) & rows["echo"][1:] & rows["echo"][:-1]
         before = np.flatnonzero(pair & (rows["number"][1:] == rows["number"][:-1] + 1) & (rows["number"][:-1] > 0))
         with np.errstate(over="ignore", invalid="ignore"):
-            distance = np.linalg.norm(rows["xyz"][before + 1] - rows["xyz"][before], axis=1)
+            distance = np.linalg.norm((rows["xyz"][before + 1] - rows["xyz"][before]) * self.metres, axis=1)
         known = np.isfinite(distance)
         before, distance = before[known], distance[known]
         rank = np.minimum(rows["number"][before], _MOST_PAIR) - 1
@@ -231,7 +238,7 @@ class _Tally:
         self.sums += np.bincount(rank, distance, _MOST_PAIR)
         np.minimum.at(self.least, rank, distance)
         for area in self.areas:
-            area.add(rows, first, before, distance)
+            area.add(rows, first, before, distance, self.metres[2])
 
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
@@ -286,7 +293,7 @@ class _Tally:
         return round(int(np.searchsorted(np.cumsum(self.bins), _EDGE * total, side="right")) * _BIN, 2)
 
     def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
-        lines = list(self.misses)
+        lines = list(self.notes)
         if self.left_out:
             lines.append(
                 f"--where: {self.left_out} of {self.points + self.left_out} points are left out; pulses and distances "

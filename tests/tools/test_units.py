@@ -1,0 +1,86 @@
+"""Distances are metres whatever the unit of the coordinates is: state planes are in feet."""
+
+import json
+import shutil
+import struct
+
+import pytest
+from click.testing import CliRunner
+from strips import add_record
+
+from wavebatch.cli import main
+from wavebatch.files.las.crs import metres_per_unit, parse_wkt
+from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.header import build_wkt
+
+FOOT = 1200 / 3937
+FEET = build_utm(32614).replace('UNIT["metre",1,AUTHORITY["EPSG","9001"]]', f'UNIT["US survey foot",{FOOT!r}]')
+DEGREES = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257]],UNIT["degree",0.0174532925]]'
+
+
+@pytest.fixture(scope="module")
+def clouds(tiny_strip, tmp_path_factory):
+    """The same cloud in metres, in feet (the same places), and with a CRS in degrees."""
+    folder = tmp_path_factory.mktemp("units")
+    result = CliRunner().invoke(main, ["run", str(tiny_strip), "-o", str(folder), "--profile", "balanced", "--format",
+                                       "las", "-q"])  # fmt: skip
+    assert result.exit_code == 0, result.output
+    metres = folder / tiny_strip.name
+    found = {"m": metres}
+    for name, wkt, factor in (("ft", FEET, 1 / FOOT), ("deg", DEGREES, 1.0)):
+        found[name] = folder / f"{name}.las"
+        content = bytearray(metres.read_bytes())
+        for place in (131, 155):  # scales and offsets
+            values = struct.unpack_from("<3d", content, place)
+            struct.pack_into("<3d", content, place, *(value * factor for value in values))
+        extent = struct.unpack_from("<6d", content, 179)
+        struct.pack_into("<6d", content, 179, *(value * factor for value in extent))
+        found[name].write_bytes(content)
+        add_record(found[name], build_wkt(wkt))
+    return found
+
+
+def _print(*words, code=0):
+    result = CliRunner().invoke(main, [*map(str, words)])
+    assert result.exit_code == code, result.output
+    return result
+
+
+def test_units_of_a_crs():
+    assert metres_per_unit([]) == (1.0, 1.0, 1.0) == metres_per_unit([parse_wkt(build_utm(32633))])
+    assert metres_per_unit([parse_wkt(FEET)]) == pytest.approx((FOOT, FOOT, FOOT))
+    east, _, up = metres_per_unit([parse_wkt(DEGREES)])
+    assert east != east and up == 1.0
+
+
+def test_distances_of_returns_are_metres(clouds):
+    found = {name: json.loads(_print("stats", path, "--json").stdout)["total"] for name, path in clouds.items()}
+    metres, feet, degrees = (found[name] for name in ("m", "ft", "deg"))
+    assert metres["separations"]["all"]["pairs"] >= 10 and metres["several"] >= 10
+    for one, other in zip(metres["separations"].values(), feet["separations"].values(), strict=True):
+        assert other == pytest.approx(one, rel=1e-6)
+    assert feet["depth"] == pytest.approx(metres["depth"], rel=1e-6)
+    assert degrees["separations"]["all"] == {"pairs": 0, "mean": None, "least": None}
+    assert "coordinates are US survey feet: distances and depths are converted" in _print("stats", clouds["ft"]).output
+    assert "coordinates are degrees: returns have no distances" in _print("stats", clouds["deg"]).output
+    area = json.loads(_print("stats", clouds["ft"], "--area", 1e6, "--json").stdout)["files"][0]["areas"][0]
+    assert area["mean"] == pytest.approx(metres["separations"]["all"]["mean"], rel=1e-6)
+
+
+def test_clouds_in_feet_are_compared_in_metres(clouds):
+    shifted = clouds["ft"].with_name("shifted.las")
+    shutil.copy(clouds["ft"], shifted)
+    content = bytearray(shifted.read_bytes())
+    (height,) = struct.unpack_from("<d", content, 171)
+    struct.pack_into("<d", content, 171, height + 0.1)  # 0.1 ft are 0.2 ns; as metres they would be 0.67 ns
+    shifted.write_bytes(content)
+    found = json.loads(_print("compare", clouds["ft"], shifted, "--tolerance", 0.3, "--json").stdout)
+    assert found["identical"] == 1.0
+    line = _print("compare", clouds["deg"], clouds["deg"], code=2).stderr
+    assert "coordinates are degrees, which have no length; project it to metres" in line and line.count("\n") == 1
+
+
+def test_the_summary_of_a_map_names_the_unit(clouds, tmp_path):
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    result = _print("plot", "map", clouds["ft"], "--statistic", "count", "-o", tmp_path / "m.png", "--json")
+    assert " us-ft\n" in result.stderr and json.loads(result.stdout)["unit"] == "us-ft"
