@@ -12,6 +12,7 @@ from wavebatch.cli import main
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
+from wavebatch.tools.simulate import simulate_strip
 
 FOOT = 1200 / 3937
 FEET = build_utm(32614).replace('UNIT["metre",1,AUTHORITY["EPSG","9001"]]', f'UNIT["US survey foot",{FOOT!r}]')
@@ -84,3 +85,25 @@ def test_the_summary_of_a_map_names_the_unit(clouds, tmp_path):
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     result = _print("plot", "map", clouds["ft"], "--statistic", "count", "-o", tmp_path / "m.png", "--json")
     assert " us-ft\n" in result.stderr and json.loads(result.stdout)["unit"] == "us-ft"
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_packet_vectors_in_metres_do_not_place_echoes_in_feet(named, tmp_path):
+    """The spacing of the returns shows it, with a CRS and without: added echoes were metres from their place."""
+    simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
+    content = bytearray((tmp_path / "strip.las").read_bytes())
+    for place in (131, 155):
+        struct.pack_into("<3d", content, place, *(one / FOOT for one in struct.unpack_from("<3d", content, place)))
+    (tmp_path / "strip.las").write_bytes(content)
+    if named:
+        add_record(tmp_path / "strip.las", build_wkt(FEET))
+    line = _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast", code=4).stderr
+    assert "returns of one pulse lie 3.28 times as far apart" in line and "--points returns" in line
+    _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast", "--points", "returns")
+
+
+def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
+    """Spacing and vectors agree: only the label is wrong, and echoes lie where they should."""
+    simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
+    add_record(tmp_path / "strip.las", build_wkt(FEET))
+    _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast")

@@ -34,7 +34,7 @@ from wavebatch.surveying.calibration import Calibration, needs_sensor, with_colu
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, refuse_units
+from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, judge_scale, refuse_units
 from wavebatch.surveying.systems.saved_check import check_saved
 
 BLOCK_SAMPLES = 1 << 22
@@ -295,6 +295,7 @@ def prepare_strip(job: StripJob) -> Prepared:
                 refuse_units(reader, scan)
             sensor = find_sensor(reader, scan, job.sensor) if needs_sensor(job.chain) else UNKNOWN
             job, doubts = _fit_calibration(reader, scan, job, choice, sensor)
+            doubts += judge_scale(reader, scan) if job.options.points == "echoes" else ()
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more

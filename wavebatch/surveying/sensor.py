@@ -197,6 +197,33 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             )
 
 
+def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
+    """Raise InputError where packet vectors are in metres and coordinates in feet, or the other way round.
+
+    New echoes lie along the vectors, so they would be up to metres from their place. Spacings of returns decide, not
+    the CRS: it may be missing or wrong. Without enough pairs of returns, a doubt is returned where the CRS and the
+    length of the vectors differ.
+    """
+    path, units, ratio = reader.facts.path, reader.facts.units, scan.vectors.ratio
+    along = next((unit.horizontal for unit in units if unit.horizontal is not None), None)
+    is_feet = along is not None and abs(along / FOOT - 1.0) < 0.001
+    if along is not None and not is_feet and abs(ratio * FOOT - 1.0) >= 0.05:
+        return ()  # metres, and vectors of metres
+    scale = measure_scale(reader, scan)
+    if scale is None:
+        doubt = "coordinates are in feet by the CRS, packet vectors as long as metres: added echoes may be far off"
+        return (doubt,) if is_feet and abs(ratio - 1.0) < 0.05 else ()
+    kinds = ((FOOT, "in feet, packet vectors in metres"), (1 / FOOT, "in metres, packet vectors in feet"))
+    for factor, words in kinds:
+        if abs(scale * factor - 1.0) < 0.05:
+            raise InputError(
+                f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
+                f"coordinates are {words}, so new echoes would be misplaced: project the strip to metres, or write "
+                "only its own points with --points returns"
+            )
+    return ()
+
+
 def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
     crs = request.crs or find_crs(reader.facts.crs, reader.facts.header.vlrs)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
