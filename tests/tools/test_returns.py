@@ -15,7 +15,7 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.return_stats import returns
+from wavebatch.tools.return_stats import dead_zones, returns
 from wavebatch.tools.return_stats.returns import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
@@ -159,3 +159,49 @@ def test_text_has_every_figure(tmp_path):
     other = write_cloud(tmp_path / "d.las", **SMALL)
     assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
     assert "total" not in CliRunner().invoke(stats, [str(path), str(path)]).stdout  # one file counts once
+
+
+def _write_pairs(path, zones, pairs, rng, duplicates=0):
+    """Pulses of four returns; returns k and k + 1 are at least zones[k - 1] apart."""
+    apart = np.asarray(zones) + rng.exponential(3.0, (pairs, 3))
+    apart[:duplicates] = 0.0
+    z = 500.0 - np.concatenate([np.zeros((pairs, 1)), np.cumsum(apart, axis=1)], axis=1)
+    number = np.tile([1, 2, 3, 4], pairs)
+    return write_cloud(path, np.repeat(1.0 + np.arange(pairs), 4), z.ravel(), number, np.full(4 * pairs, 4))
+
+
+@pytest.mark.parametrize("pairs", [150, 3000, 40_000])
+def test_dead_zones_by_return_number_are_those_of_the_receiver(tmp_path, rng, pairs):
+    """The true distance lies between the size less three errors and the size."""
+    zones = (0.64, 1.5, 2.2)
+    duplicates = pairs // 3000
+    found = count_returns([_write_pairs(tmp_path / "c.las", zones, pairs, rng, duplicates)])[1].dead_zones
+    assert list(found) == ["all", "1-2", "2-3", "3-4"]
+    for name, true in zip(found, (0.64, *zones), strict=True):
+        one = found[name]
+        assert one.pairs == (3 * pairs if name == "all" else pairs)
+        assert one.size - 3 * one.error - 0.01 <= true <= one.size + 0.01
+        assert one.error < max(100 / pairs, 0.03)
+
+
+def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng):
+    """Over many samples the misses are as large as the errors say."""
+    misses = []
+    for _ in range(300):
+        bins = np.bincount((100 * (0.7 + rng.exponential(2.0, 400))).astype(int), minlength=dead_zones.BINS)
+        found = dead_zones.find_zone(bins[: dead_zones.BINS])
+        misses.append((found.size - 0.7) / found.error)
+    assert 0.4 < np.sqrt(np.mean(np.square(misses))) < 1.6
+    assert np.min(misses) > -1.01
+
+
+def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
+    path = _write_pairs(tmp_path / "c.las", (1, 1, 1), 40, rng)
+    result = CliRunner().invoke(stats, [str(path), "--json"])
+    zones = json.loads(result.stdout)["total"]["dead_zones"]
+    assert zones["1-2"] == {"pairs": 40, "size": None, "error": None}
+    assert zones["all"]["pairs"] == 120 and zones["all"]["size"] > 0.9
+    text = CliRunner().invoke(stats, [str(path)]).stdout
+    assert text.count("no-data: fewer than 100 pairs") == 3
+    far = _write_pairs(tmp_path / "f.las", (150, 150, 150), 200, rng)
+    assert CliRunner().invoke(stats, [str(far)]).stdout.count("no-data: all far") == 4
