@@ -21,7 +21,7 @@ from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.raster import check_crs
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, robust_limits
+from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
 from wavebatch.tools.voxels.grid import COLUMNS
 
 MOST_POINTS = 200_000
@@ -29,6 +29,9 @@ MOST_POINTS = 200_000
 
 MOST_BINS = 5000
 """Most bins of a profile."""
+
+LEAST = 20
+"""Least number of heights among which one can be an outlier."""
 
 _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
@@ -107,6 +110,8 @@ class Section:
     """Counts of all points of the clouds."""
     inside: int
     """Points with a value in the section, of which at most MOST_POINTS are here."""
+    outside: int
+    """Of these, far outliers in height, which are not here: they would press all others into a line."""
     shown: tuple[float, float]
     """Limits of the colours."""
     voxel: float
@@ -140,13 +145,18 @@ def cut_section(
         raise ConfigError(f"--width {width:g}: must be above 0")
     unit_along = (end - start) / length
     sample, total = EvenSample(MOST_POINTS), Tally()
-    for _, rows, tally in clouds.read():
-        total += tally
+
+    def cut(rows: np.ndarray) -> np.ndarray:
+        """Distance along the line, height and value of the points beside it, f8 (k, 3)."""
         offset = np.stack([rows["x"], rows["y"]], axis=1) - start
         along, across = offset @ unit_along, offset @ np.array([-unit_along[1], unit_along[0]])
         keep = (along >= 0) & (along <= length) & (np.abs(across) <= 0.5 * width) & np.isfinite(rows["others"][:, 0])
-        if keep.any():
-            place = np.stack([along, rows["others"][:, 0], rows["value"]], axis=1)[keep]
+        return np.stack([along, rows["others"][:, 0], rows["value"]], axis=1)[keep]
+
+    for _, rows, tally in clouds.read():
+        total += tally
+        place = cut(rows)
+        if len(place):
             sample.add({"place": place})
     if not total.values:
         raise clouds.complain(total)
@@ -155,11 +165,32 @@ def cut_section(
             f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} of the line from {start[0]:.10g} "
             f"{start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
         )
-    along, height, value = sample.read()["place"].T
+    places = sample.read()["place"]
+    low, high = choose_frame(places[:, 1], length)
+    near = (places[:, 1] >= low) & (places[:, 1] <= high)
+    outside = int(np.count_nonzero(~near))
+    if sample.seen > len(places):
+        every = (cut(rows)[:, 1] for _, rows, _ in clouds.read())
+        outside = sum(int(np.count_nonzero((height < low) | (height > high))) for height in every)
+    along, height, value = places[near].T
     shown = tuple(np.percentile(value, (2, 98)).tolist())
     names = tuple(path.name for path in paths)
-    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen, shown,
-                   voxel, crs, unit)  # fmt: skip
+    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen,
+                   outside, shown, voxel, crs, unit)  # fmt: skip
+
+
+def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
+    """Least and largest height that a section shows, of heights (n,): not the few that lie far from all others.
+
+    At each end the thousandth that is farthest, but at least one, is left out where it lies farther from the rest than
+    MARGIN of its extent and than a tenth of the section's length. Fewer than LEAST heights have no outliers.
+    """
+    few = math.ceil(0.001 * len(height))
+    if len(height) < LEAST:
+        return -math.inf, math.inf
+    rest = np.sort(height)[few:-few]
+    reach = max(MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
+    return float(rest[0]) - reach, float(rest[-1]) + reach
 
 
 def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
@@ -204,7 +235,8 @@ class Profile:
     def label(self) -> str:
         """Label of the axis of values."""
         if self.statistic == "count":
-            return f"{'voxels' if self.facts.name == 'voxels' else 'points'} per height [-]"
+            kind = self.facts.name if self.facts.name in ("voxels", "segments") else "points"
+            return f"{kind} per height [-]"
         return f"{self.statistic} of {self.facts.label} per height"
 
 
@@ -233,7 +265,7 @@ def measure_profile(
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    edges = _place_heights(sample.read()["height"], least, largest, size, voxel)
+    edges = place_heights(sample.read()["height"], least, largest, size, voxel)
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
@@ -250,7 +282,7 @@ def measure_profile(
     return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit)
 
 
-def _place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
+def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
     """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
     low, high = robust_limits(sample, least, largest)
     if size is None:
