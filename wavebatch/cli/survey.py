@@ -143,7 +143,8 @@ def _write_angles(target: Path, opened: Any, found: Any, overwrite: bool) -> Non
 
     distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
     sizes = {"spacing": found.figures["spacing_ns"], "amplitude": found.figures["amplitude_50"]}
-    write_angles(target, found.system, distance=distance, **sizes, overwrite=overwrite)
+    name = opened.facts.path.name
+    write_angles(target, found.system, distance=distance, strip=name, **sizes, overwrite=overwrite)
 
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:

@@ -231,6 +231,9 @@ class Profile:
     total: Tally
     unit: str
 
+    noun: str = "values"
+    """What is counted, in the title."""
+
     @property
     def label(self) -> str:
         """Label of the axis of values."""

@@ -20,11 +20,11 @@ from wavebatch.tools.plots.section_data import Profile, place_heights
 from wavebatch.tools.plots.values import Tally, name_paths
 from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
 
-UNIT = "unit of the strip"
-"""Of lengths and heights: the file does not say which it is."""
+UNIT = "units of the strip"
+"""Of lengths and heights: the file does not say which they are."""
 
 _COLUMNS = {
-    "length": (UNIT, "length of the segments"), "slope": ("deg", "angle above the horizontal"),
+    "length": ("units", ""), "slope": ("deg", "angle above the horizontal"),
     "residual": ("-", "rms distance of the centroids from the line"), "pulses": ("-", "pulses of a segment"),
     "weight": ("DN", "sum of the samples"),
 }  # fmt: skip
@@ -108,6 +108,7 @@ def profile_segments(
         outside=outside,
         total=Tally(len(heights), 0, 0, len(heights)),
         unit=UNIT,
+        noun="segments",
     )
 
 
