@@ -286,3 +286,11 @@ def test_a_tower_and_a_few_points_stay_in_the_section():
         low, high = section_data.choose_frame(every, 100.0)
         assert np.count_nonzero((every < low) | (every > high)) == far
     assert section_data.choose_frame(np.append(ground[:15], 90.0), 100.0) == (-np.inf, np.inf)
+
+
+def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
+    """Math text is off, so that a $ in a name is a $: powers of ten would show as source text."""
+    pytest.importorskip("matplotlib")
+    assert run("plot", "profile", cloud, "--log", "-o", tmp_path / "p.svg").exit_code == 0
+    text = (tmp_path / "p.svg").read_text("utf-8")
+    assert "mathdefault" not in text and ">100<" in text.replace("\n", "")

@@ -109,6 +109,9 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
             axes.stairs(values, found.edges, orientation="horizontal", color=color, linewidth=1.2, label=label)
         if log:
             axes.set_xscale("log")
+            # Labels as powers of ten need math text, which file names forbid: a $ in one would break the picture.
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+            axes.xaxis.set_minor_formatter("")
         elif np.nanmin(found.values) >= 0:
             axes.set_xlim(left=0)
         axes.set_ylim(found.edges[0], found.edges[-1])
