@@ -97,6 +97,8 @@ def test_sections_of_voxels(voxels):
         ("section {voxels} --flags-with WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
         ("profile {cloud} --size 1e-9", 2, "more than 5000 bins"),
         ("profile {cloud} --statistic sum", 2, "needs a --column"),
+        ("section {cloud} --where z<-99", 1, "5000 of 5000 points are left out by --where"),
+        ("section s.csv", 2, "segments have no side view"),
         ("section {cube}", 1, "holds no voxels"), ("cube {voxels}", 1, "holds no cube"),
     ],
 )  # fmt: skip

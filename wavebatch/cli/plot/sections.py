@@ -42,6 +42,9 @@ def _read_line(context: click.Context, parameter: click.Parameter, text: str | N
 
 def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
     """Clouds, or one file of voxels."""
+    segments = [path for path in clouds if path.suffix.lower() in (".csv", ".geojson")]
+    if segments:
+        raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
     voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
     if voxels and len(clouds) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")

@@ -122,7 +122,8 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         axes.set_xlabel(fit_text(figure, plain_text(f"{found.label} of {found.edges[1] - found.edges[0]:.4g} "
                                                     f"{found.unit.split()[0]}", 300), 5.0, size=9.5))  # fmt: skip
         axes.set_ylabel(f"height [{found.unit}]")
-        parts = [name_clouds(found.names), found.facts.name, f"{found.total.values:,} {found.noun}"]
+        parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
+        parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
         rest = {"without data": found.total.no_data, "left out": found.total.left_out, "outside": found.outside}
         parts += [f"{number:,} {text}" for text, number in rest.items() if number]
         figure.suptitle(fit_parts(figure, parts, 5.8, size=10.0), x=0.01, ha="left", fontsize=10.0)

@@ -195,14 +195,17 @@ def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
 
 def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
     """A line through the middle of the points, along their longer extent."""
-    sample = EvenSample()
-    for _, rows, _ in clouds.read():
+    sample, total = EvenSample(), Tally()
+    for _, rows, tally in clouds.read():
+        total += tally
         places = np.stack([rows["x"], rows["y"]], axis=1)
         places = places[np.isfinite(places).all(axis=1)]
         if len(places):
             sample.add({"place": places})
+    if not total.values:
+        raise clouds.complain(total)
     if not sample.seen:
-        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a value and a position")
+        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
     places = sample.read()["place"]
     middle = places.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov((places - middle).T) if len(places) > 1 else np.eye(2))

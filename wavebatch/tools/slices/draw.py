@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.labels import fit_parts
 from wavebatch.tools.slices.cube import CubeSlice
+from wavebatch.tools.slices.output import NO_SAMPLE
 from wavebatch.tools.slices.segments import Segment
 
 _LEAST_HEIGHT = 0.15
@@ -45,7 +46,8 @@ def draw_segments(
         plan.set_xlim(low[0] - base[0] - margin, high[0] - base[0] + margin)
         plan.set_ylim(low[1] - base[1] - margin, high[1] - base[1] + margin)
         plan.set_aspect("equal")
-        names = [f"{name} - {value:.10g} [m]" for name, value in zip("xyz", base, strict=True)]
+        names = [f"{name} {'-' if value >= 0 else '+'} {abs(value):.10g} [m]" if value else f"{name} [m]"
+                 for name, value in zip("xyz", base, strict=True)]  # fmt: skip
         plan.set_xlabel(names[0])
         plan.set_ylabel(names[1])
         figure.colorbar(shown, ax=plan, label="height [m]", orientation="horizontal", aspect=40)
@@ -85,11 +87,12 @@ def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite
     known = np.concatenate([one.image[np.isfinite(one.image)] for one in slices])
     high = float(np.percentile(known, 99.8)) if len(known) else 1.0
     with open_picture(target, (max(4.6 * len(slices), 6.0), 4.8), overwrite=overwrite) as figure:
-        title = fit_parts(figure, [plain_text(name), "white: no sample"], max(4.6 * len(slices), 6.0) - 0.2, size=10.5)
+        title = fit_parts(figure, [plain_text(name), "blue: no sample"], max(4.6 * len(slices), 6.0) - 0.2, size=10.5)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
         panels = figure.subplots(1, len(slices), squeeze=False)[0]
         for axes, one in zip(panels, slices, strict=True):
             axes.grid(visible=False)
+            axes.set_facecolor(NO_SAMPLE)
             shown = axes.imshow(one.image, extent=one.extent, origin="lower", aspect="auto", cmap="Greys", vmin=0.0,
                                 vmax=max(high, 1e-6), interpolation="nearest")  # fmt: skip
             if one.down:
