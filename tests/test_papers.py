@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.physics import radar, radiometry
 from wavebatch.stages.attribute import width_angle
 from wavebatch.stages.decompose import models, skew
-from wavebatch.tools.simulate import from_returns
+from wavebatch.tools.simulate import from_returns, return_light
 from wavebatch.tools.slices import segments
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
@@ -91,9 +91,24 @@ def double_amplitudes(monkeypatch, load):
 
 
 def double_strengths(monkeypatch, load):
-    measured = from_returns._measure_strength
-    monkeypatch.setattr(from_returns, "_measure_strength", lambda *a: 2 * measured(*a))
+    measured = return_light.LightModel.measure
+    double = lambda *a: replace((light := measured(*a)), strength=2 * light.strength)  # noqa: E731
+    monkeypatch.setattr(return_light.LightModel, "measure", double)
     return load("s4_ussyshkin").table_of_synthesis(3000, 0)
+
+
+def fill_the_beam_twice(monkeypatch, load):
+    """Each return takes the whole beam, whatever the others take."""
+    monkeypatch.setattr(return_light, "fill_shares", lambda share, starts: (np.ones_like(share), 0))
+    return load("s4_ussyshkin").table_of_footprints(3000, 0)
+
+
+def forget_a_power_of_the_range(monkeypatch, load):
+    """Received powers that fall with R instead of R^2."""
+    right = return_light._receive
+    monkeypatch.setattr(return_light, "_receive", lambda rho, rows, radar, path: right(rho, rows, radar, path) * (
+        radar.height - rows["xyz"][:, 2]) / 1000.0)  # fmt: skip
+    return load("s4_ussyshkin").table_of_footprints(3000, 0)
 
 
 def double_distances(monkeypatch, load):
@@ -186,7 +201,8 @@ RIGHT = {
 WRONG = [
     double_amplitudes, double_strengths, double_distances, leave_the_pulse_in, zero_the_heights, drop_from_equation(2),
     drop_from_equation(4), drop_from_footprint, drop_from_backscatter, drop_from_section, forget_the_skew,
-    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times,
+    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times, fill_the_beam_twice,
+    forget_a_power_of_the_range,
 ]  # fmt: skip
 
 
