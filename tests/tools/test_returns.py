@@ -205,3 +205,14 @@ def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
     assert text.count("no-data: fewer than 100 pairs") == 3
     far = _write_pairs(tmp_path / "f.las", (150, 150, 150), 200, rng)
     assert CliRunner().invoke(stats, [str(far)]).stdout.count("no-data: all far") == 4
+
+
+def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp_path):
+    """Distances at least 1 m, 300 per metre up to 2 m and 100 per metre beyond: the zone hides 300 of 1000 pulses."""
+    apart = np.concatenate([np.linspace(1.0, 1.999, 300), np.linspace(2.0, 8.999, 700)])
+    time, number = np.repeat(1.0 + np.arange(1000), 2), np.tile([1, 2], 1000)
+    z = 100.0 - np.stack([np.zeros(1000), apart], axis=1).ravel()
+    found = count_returns([write_cloud(tmp_path / "c.las", time, z, number, np.full(2000, 2))])[1]
+    assert found.dead_zone == pytest.approx(1.0, abs=0.011)
+    assert found.hidden == pytest.approx(0.3, abs=0.006)
+    assert any(line.startswith("dead zone") and "0.30" in line for line in found.warnings)
