@@ -104,3 +104,16 @@ def test_the_picture_names_the_strip(riegl, tmp_path):
     pytest.importorskip("matplotlib")
     assert run(riegl, "--divergence", 0.5, "--angles", tmp_path / "a.svg").exit_code == 0
     assert riegl.name in (tmp_path / "a.svg").read_text("utf-8")
+
+
+@pytest.mark.parametrize("level_error", [0.02, 0.2])
+def test_what_is_not_known_of_level_ground_is_in_the_error_of_every_angle(level_error):
+    """The least variance of a facing surface has an error, which no strong echo can undercut."""
+    block = WaveformBlock.from_samples(np.zeros((1, 2), np.uint8), bits=8, spacing=1.0)
+    echoes = EchoTable.build([0, 0], [5.0, 30.0], [1e4, 50.0], [2.5, 2.5], sigma_err=np.array([1e-4, 0.05]))
+    sharp = replace(GAUSSIAN, width_scatter=0.0)
+    alone = added_variance(block, sharp, echoes, "system", 1e-4)[1]
+    found = added_variance(block, replace(sharp, level_error=level_error), echoes, "system", 1e-4)[1]
+    assert found == pytest.approx(np.hypot(alone, level_error), rel=1e-6) and found.min() >= level_error
+    flat, given = (tabulate_angles(one, 1.0, 700.0, 0.5, 1000.0) for one in (sharp, replace(sharp, level_error=0.2)))
+    assert (given.error[10:70] > 2 * flat.error[10:70]).all()

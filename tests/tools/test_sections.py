@@ -296,3 +296,12 @@ def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
     assert run("plot", "profile", cloud, "--log", "-o", tmp_path / "p.svg").exit_code == 0
     text = (tmp_path / "p.svg").read_text("utf-8")
     assert "mathdefault" not in text and ">100<" in text.replace("\n", "")
+
+
+def test_level_segments_on_an_edge_lie_above_it(tmp_path):
+    """As points do: a bin holds its lower edge."""
+    heights = [(100.0, 100.0), (102.0, 102.0), (104.0, 104.0), (104.0, 106.0)]
+    found = profile_segments([_write_segments(tmp_path / "s.csv", heights, [1, 2, 4, 8])], "length", "sum", size=2.0)
+    sums = dict(zip(found.edges[:-1].tolist(), found.values[0].tolist(), strict=True))
+    assert [sums[edge] for edge in (100.0, 102.0, 104.0)] == pytest.approx([1, 2, 12])
+    assert found.values.sum() == pytest.approx(15)
