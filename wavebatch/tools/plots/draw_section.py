@@ -102,17 +102,20 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         for number, values in enumerate(found.values):
             color = SERIES[number % len(SERIES)]
             label = fit_text(figure, plain_text(found.names[number], 200), 4.5, size=8.5)
-            alone = len(found.values) == 1
+            alone = len(found.values) == 1 and found.statistic != "mean"
             if alone:
                 axes.stairs(np.nan_to_num(values), found.edges, orientation="horizontal", fill=True, color=color,
                             alpha=0.35)  # fmt: skip
-            axes.stairs(values, found.edges, orientation="horizontal", color=color, linewidth=1.2, label=label)
+            # A mean is no amount: from 0 on, differences of a few per cent would not be seen.
+            base = None if found.statistic == "mean" else 0.0
+            axes.stairs(values, found.edges, orientation="horizontal", color=color, linewidth=1.2, label=label,
+                        baseline=base)  # fmt: skip
         if log:
             axes.set_xscale("log")
             # Labels as powers of ten need math text, which file names forbid: a $ in one would break the picture.
             axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
             axes.xaxis.set_minor_formatter("")
-        elif np.nanmin(found.values) >= 0:
+        elif np.nanmin(found.values) >= 0 and found.statistic != "mean":
             axes.set_xlim(left=0)
         axes.set_ylim(found.edges[0], found.edges[-1])
         if not log:
