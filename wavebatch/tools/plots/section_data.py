@@ -6,9 +6,8 @@ section keeps an even sample of its points, a profile only sums.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,10 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.raster import check_crs
 from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
-from wavebatch.tools.voxels.grid import COLUMNS
+from wavebatch.tools.voxels.voxel_points import VoxelFile
 
 MOST_POINTS = 200_000
 """Most points of a section that are drawn: more would only cover each other."""
@@ -35,53 +32,6 @@ LEAST = 20
 
 _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
-
-_PIECE = 1_000_000
-
-
-class VoxelFile:
-    """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
-
-    Has the interface of `values.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
-    column.
-    """
-
-    def __init__(self, path: Path, selection: Selection) -> None:
-        self.paths, self.selection = (path,), selection
-        if selection.flags_with or selection.flags_without:
-            raise ConfigError(f"{path}: voxels have no echo_flags to select by")
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                self._data = {name: data[name] for name in data.files}
-            self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
-            self.size = float(self._data["size"])
-            self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
-            json.loads(str(self._data["meta"]))
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise InputError(f"{path}: holds no voxels of `wavebatch voxelize` ({error})") from error
-        known = {column.name: column for column in COLUMNS if column.name in self._data}
-        name = selection.column
-        if name is not None and name not in known:
-            raise ConfigError(f"{path}: has no column {name!r}; {nearest(name, known)}")
-        facts = known.get(name)
-        unit, meaning = (facts.unit, facts.meaning) if facts else ("-", "")
-        self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
-
-    def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
-        """As Clouds.read, with the height of the centre in `others`."""
-        dtype = [("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("others", "<f8", (1,))]
-        for start in range(0, len(self._index), _PIECE):
-            part = slice(start, start + _PIECE)
-            place = self._origin + (self._index[part] + 0.5) * self.size
-            rows = np.zeros(len(place), dtype)
-            rows["x"], rows["y"], rows["others"][:, 0] = place.T
-            rows["value"] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
-            good = rows[~np.isnan(rows["value"])]
-            yield 0, good, Tally(len(rows), 0, len(rows) - len(good), len(good))
-
-    def complain(self, tally: Tally) -> InputError:
-        """The error that says why nothing can be drawn."""
-        return InputError(f"{self.paths[0]}: nothing to draw: {tally.points} voxels, {tally.no_data} without data")
 
 
 def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
@@ -143,16 +93,11 @@ def cut_section(
     width = max(length / 50, voxel) if width is None else width
     if not (math.isfinite(width) and width > 0):
         raise ConfigError(f"--width {width:g}: must be above 0")
-    unit_along = (end - start) / length
-    sample, total = EvenSample(MOST_POINTS), Tally()
 
     def cut(rows: np.ndarray) -> np.ndarray:
-        """Distance along the line, height and value of the points beside it, f8 (k, 3)."""
-        offset = np.stack([rows["x"], rows["y"]], axis=1) - start
-        along, across = offset @ unit_along, offset @ np.array([-unit_along[1], unit_along[0]])
-        keep = (along >= 0) & (along <= length) & (np.abs(across) <= 0.5 * width) & np.isfinite(rows["others"][:, 0])
-        return np.stack([along, rows["others"][:, 0], rows["value"]], axis=1)[keep]
+        return _cut_rows(rows, start, (end - start) / length, length, width)
 
+    sample, total = EvenSample(MOST_POINTS), Tally()
     for _, rows, tally in clouds.read():
         total += tally
         place = cut(rows)
@@ -177,6 +122,15 @@ def cut_section(
     names = tuple(path.name for path in paths)
     return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen,
                    outside, shown, voxel, crs, unit)  # fmt: skip
+
+
+def _cut_rows(rows: np.ndarray, start: np.ndarray, along: np.ndarray, length: float, width: float) -> np.ndarray:
+    """Distance along the line, height and value of the points beside it, f8 (k, 3); along: its unit vector."""
+    offset = np.stack([rows["x"], rows["y"]], axis=1) - start
+    far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+    height = rows["others"][:, 0]
+    keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
+    return np.stack([far, height, rows["value"]], axis=1)[keep]
 
 
 def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
