@@ -99,7 +99,7 @@ def double_strengths(monkeypatch, load):
 
 def fill_the_beam_twice(monkeypatch, load):
     """Each return takes the whole beam, whatever the others take."""
-    monkeypatch.setattr(return_light, "fill_shares", lambda share, starts: (np.ones_like(share), 0))
+    monkeypatch.setattr(return_light, "share_equally", lambda total, starts: np.ones(len(total)))
     return load("s4_ussyshkin").table_of_footprints(3000, 0)
 
 

@@ -308,3 +308,21 @@ def test_wrong_shares_and_widths_are_one_line(cloud, tmp_path):
     document = json.loads(run(given, *figures, "--shares", "footprint", "--json", "-q", "--overwrite").stdout)
     assert document["light"]["over_one"] == np.count_nonzero(pulses_of(cloud)[1] > 1)
     assert document["light_used"] < 1
+
+
+def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_path):
+    """First returns alone keep the energy that they have in the whole cloud."""
+    las = laspy.read(cloud)
+    las.points = las.points[np.array(las.return_number) == 1]
+    las.write(tmp_path / "first.las")
+    options = SynthesisOptions("reflectance", shares="equal", **FIGURES)
+    whole = synthesize_strip(cloud, tmp_path / "w.las", options)
+    first = synthesize_strip(tmp_path / "first.las", tmp_path / "f.las", options)
+    number = np.array(las.number_of_returns)
+    assert whole.light_used == pytest.approx(1) and first.light_used == pytest.approx(np.mean(1 / number))
+    assert first.scattered == np.count_nonzero(number > 1)
+    starts = np.array([0, 2, 3])
+    assert return_light.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
+    said = run(tmp_path / "first.las", "-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200,
+               "--shares", "equal")  # fmt: skip
+    assert "shares of incomplete pulses" in said.stderr

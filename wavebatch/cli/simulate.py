@@ -222,5 +222,7 @@ def _list_light(summary: SynthesisSummary) -> Iterator[str]:
     if light.pulses:
         found = f"{light.own_share} of the cloud, {light.assumed_share} assumed"
         yield f"shares: {found}; the returns of a pulse take {summary.light_used:.1%} of its light on average"
+    if light.pulses and summary.scattered:
+        yield "note: shares of incomplete pulses are those of the points that are there in a row"
     if light.over_one:
         yield f"note: {count(light.over_one, 'pulse')} with shares above 1 together, scaled to 1"

@@ -19,7 +19,7 @@ from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 
 EQUAL = "equal"
-"""Word in place of a column of shares: the returns of a pulse take the same share each."""
+"""Word in place of a column of shares: the returns of a pulse take the same share each, as many as it had."""
 
 WIDEST = 50.0
 """Largest standard deviation of an echo [ns]; the least is half a sample."""
@@ -111,7 +111,7 @@ class LightModel:
         # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
         power *= self.sigma / sigma
         if self.share_column is not None:
-            power *= self._measure_shares(records, starts)
+            power *= self._measure_shares(rows, records, starts)
         return Light(power, sigma)
 
     def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
@@ -122,23 +122,40 @@ class LightModel:
         self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
         return np.where(known, limited, self.sigma)
 
-    def _measure_shares(self, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
-        share = np.full(len(records), np.nan) if self.read_share is None else self.read_share(records).astype(float)
+    def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        if self.read_share is None:
+            share = share_equally(rows["total"], starts)
+            self._count_shares(share, 0, 0, starts)
+            return share
+        share = self.read_share(records).astype(float)
         wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
         if len(wrong):
             raise InputError(
                 f"{self.path}: {self.share_column} holds {share[wrong[0]]:g}, which is no share of a footprint: shares "
                 "are 0 to 1; give a column with such values to --shares"
             )
-        known = np.isfinite(share)
+        known = int(np.count_nonzero(np.isfinite(share)))
         share, over = fill_shares(share, starts)
+        self._count_shares(share, known, over, starts)
+        return share
+
+    def _count_shares(self, share: np.ndarray, known: int, over: int, starts: np.ndarray) -> None:
         counts = self.counts
-        counts.own_share += int(np.count_nonzero(known))
-        counts.assumed_share += int(np.count_nonzero(~known))
+        counts.own_share += known
+        counts.assumed_share += len(share) - known
         counts.over_one += over
         counts.pulses += len(starts)
         counts.shares += float(share.sum())
-        return share
+
+
+def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Equal shares of the returns of whole pulses, f8 (k,).
+
+    total: number of returns that the points state, (k,): returns that the cloud lacks take their share, too. starts:
+    first return of each pulse.
+    """
+    number = np.diff(np.append(starts, len(total)))
+    return 1.0 / np.maximum(np.repeat(number, number), total)
 
 
 def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:
