@@ -20,7 +20,7 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.point_formats import split_numbers
+from wavebatch.files.las.point_formats import read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
@@ -34,12 +34,13 @@ CLOUD_DTYPE = np.dtype(
         ("flags", "<u2"),
         ("number", "u1"),
         ("total", "u1"),
+        ("classification", "u1"),
         ("intensity", "<u2"),
         *((name, "<f4") for name in CLOUD_COLUMNS),
     ]  # fmt: skip
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
-bits, return number and number of returns, intensity, and columns (NaN: no data)."""
+bits, return number and number of returns, class, intensity, and columns (NaN: no data)."""
 
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
@@ -107,6 +108,7 @@ class CloudReader(Closing):
         for name in CLOUD_COLUMNS:
             rows[name] = self._read_column(raw, self._sources.get(name))
         rows["number"], rows["total"] = split_numbers(raw)
+        rows["classification"] = read_classes(raw)
         rows["intensity"] = raw["intensity"]
         if "echo_flags" in self._sources:
             rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
