@@ -8,6 +8,7 @@ except for the result of a call of a process that is alive.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
@@ -30,6 +31,10 @@ from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
+
+_NAME = "wavebatch"
+"""Start of the names of our processes."""
+
 _PATIENCE = 3.0
 """Seconds that processes have to end by themselves."""
 
@@ -101,17 +106,28 @@ class Workers:
 
     def _end(self) -> None:
         """End all processes: those that wait for a call by themselves, all others at once."""
-        for worker in self._workers:
-            if worker.call is not None:
-                worker.process.kill()
-            self._calls.put(None)
-        deadline = time.monotonic() + _PATIENCE
-        for worker in self._workers:
-            worker.process.join(max(deadline - time.monotonic(), 0))
-        for worker in self._workers:
-            worker.process.kill()  # also one that is stopped
-            worker.process.join(_PATIENCE)
-        self._workers, self._calls = [], queue.SimpleQueue()
+        try:
+            for worker in self._workers:
+                if worker.call is not None:
+                    worker.process.kill()
+                self._calls.put(None)
+            deadline = time.monotonic() + _PATIENCE
+            for worker in self._workers:
+                worker.process.join(max(deadline - time.monotonic(), 0))
+        finally:
+            with uninterrupted():  # also after Ctrl-C while it waits above
+                for worker in self._workers:
+                    worker.process.kill()  # also one that is stopped
+                    worker.process.join(_PATIENCE)
+                self._workers, self._calls = [], queue.SimpleQueue()
+
+
+@atexit.register
+def _kill_all() -> None:
+    """At the end of the program: Python would wait for ever for a stopped process that an interrupt has left here."""
+    for process in multiprocessing.active_children():
+        if process.name.startswith(_NAME):
+            process.kill()
 
 
 class _Call:
@@ -136,6 +152,7 @@ class _Worker:
         """Whether it takes calls."""
         self._seen_dead = False
         self.process = context.Process(target=_work, args=(there, scratch), daemon=True)
+        self.process.name = f"{_NAME}-{self.process.name}"
         try:
             self.process.start()
         finally:

@@ -19,6 +19,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.disk.npz_reader import read_npz, reading_npz
 from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.raster import check_crs
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, robust_limits
@@ -47,15 +48,19 @@ class VoxelFile:
         self.paths, self.selection = (path,), selection
         if selection.flags_with or selection.flags_without:
             raise ConfigError(f"{path}: voxels have no echo_flags to select by")
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                self._data = {name: data[name] for name in data.files}
-            self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
-            self.size = float(self._data["size"])
-            self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
+        what, remedy = "voxels of `wavebatch voxelize`", "make them again"
+        columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}
+        facts = {"index": ("i", 2), "origin": ("f", 1), "size": ("f", 0), "crs": ("U", 0), "meta": ("U", 0)}
+        self._data = read_npz(path, {**facts, **columns}, what, remedy)
+        self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
+        self.size = float(self._data["size"])
+        lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
+        is_sound = self._index.shape[1] == 3 and lengths == {len(self._index)} and self._origin.shape == (3,)
+        if not is_sound or not np.isfinite(self._origin).all() or not 0 < self.size < math.inf:
+            raise InputError(f"{path}: holds no {what}: its arrays do not fit; {remedy}")
+        with reading_npz(path, what, remedy):
             json.loads(str(self._data["meta"]))
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise InputError(f"{path}: holds no voxels of `wavebatch voxelize` ({error})") from error
+        self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
         known = {column.name: column for column in COLUMNS if column.name in self._data}
         name = selection.column
         if name is not None and name not in known:

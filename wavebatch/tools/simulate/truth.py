@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +17,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.disk.npz_reader import read_header, read_text, reading_npz
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",
@@ -48,10 +47,6 @@ _META = "meta"
 _PIECE = 1 << 18
 _MOST_TEXT = 4 << 20
 """Most bytes of the description: it takes a few hundred."""
-_DAMAGED = (
-    zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, KeyError, RuntimeError, OverflowError,
-)  # fmt: skip
-"""What zipfile, NumPy and JSON raise for damaged archives; RuntimeError for encrypted and unknown members."""
 
 
 class TruthWriter(NpzWriter):
@@ -82,26 +77,14 @@ class TruthReader(Closing):
             with self._archive.open(f"{_META}.npy") as member:
                 self.meta: dict[str, Any] = json.loads(self._read_text(member))
 
-    @contextlib.contextmanager
-    def _reading(self) -> Iterator[None]:
-        """Turn what damaged archives raise into one InputError line."""
-        try:
-            yield
-        except InputError:
-            raise
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}; check the name") from error
-        except _DAMAGED as error:
-            raise InputError(
-                f"{self.path}: no truth file of wavebatch simulate, or damaged: {error}; simulate the strip again"
-            ) from error
+    def _reading(self) -> contextlib.AbstractContextManager[None]:
+        return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")
 
     def _read_text(self, member: IO[bytes]) -> str:
-        np.lib.format.read_magic(member)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        shape, _, dtype = read_header(member)
         if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
             raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
-        return str(np.frombuffer(member.read(dtype.itemsize), dtype)[0])
+        return read_text(member.read(dtype.itemsize), dtype)
 
     def close(self) -> None:
         """Closes the file."""
@@ -127,8 +110,7 @@ class TruthReader(Closing):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def _read_length(self, name: str, member: IO[bytes]) -> int:
-        np.lib.format.read_magic(member)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        shape, _, dtype = read_header(member)
         if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
             raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again")
         return shape[0]
