@@ -167,7 +167,7 @@ class Attacker:
         try:
             said = process.communicate(timeout=LONGEST)[1]
         except subprocess.TimeoutExpired:
-            return is_ready, "hangs", ""
+            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid)))
         return is_ready, process.returncode, said
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
@@ -196,7 +196,7 @@ class Attacker:
     def _judge_end(self, attack: Attack, is_ready: bool, code: int | str, said: str) -> str:
         """The exit code and stderr."""
         if code == "hangs":
-            return f"hangs for more than {LONGEST:.0f} s"
+            return f"hangs for more than {LONGEST:.0f} s: {said}"
         if not is_ready and isinstance(code, int) and code < 0:
             return ""  # Python itself had not begun
         killed = "KILL" in attack.kind and not attack.kind.startswith("worker K")
@@ -246,7 +246,9 @@ class Attacker:
             in_child(work)
         except AssertionError as error:
             return f"cannot be run again: {error}"
-        found = _contents(out)
+        found = {**_contents(out), "all.json": self.sound[name].get("all.json")}  # it says what is new
+        if found["all.json"] is None:
+            del found["all.json"]
         different = sorted(key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key))
         return f"run again: other bytes in {different}" if different else ""
 
@@ -318,6 +320,15 @@ def _command_line(pid: int) -> bytes:
             return file.read()
     except OSError:
         return b""
+
+
+def _describe(pid: int) -> str:
+    """State and place of a process that hangs."""
+    found = [str(pid), _command_line(pid).replace(b"\0", b" ").decode(errors="replace")[-60:]]
+    for name in ("wchan", "stat"):
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/{name}") as file:
+            found.append(file.read().rpartition(")")[2][:20])
+    return " ".join(found)
 
 
 def _session(number: int) -> list[int]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.text_file import read_text
+from wavebatch.files.text_file import MOST_LIST, read_text
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
 
@@ -65,7 +65,7 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     Raises ConfigError if the file cannot be read or holds anything else.
     """
     polygons = []
-    for number, (properties, rings) in enumerate(read_features(read_text(path, "polygon file", 1 << 30), path), 1):
+    for number, (properties, rings) in enumerate(read_features(read_text(path, "polygon file", MOST_LIST), path), 1):
         for ring in rings:
             if len(ring) < 3 or not np.isfinite(ring).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")

@@ -16,7 +16,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.geojson import find_inside, read_features
-from wavebatch.files.text_file import read_text
+from wavebatch.files.text_file import MOST_LIST, read_text
 
 _CORNERS = 64
 """Corners of the polygon that stands for a circle."""
@@ -66,7 +66,7 @@ def load_targets(path: Path | str) -> list[Target]:
     ConfigError
         In one line, where the file cannot be read, is empty or holds a wrong target.
     """
-    text = read_text(path, "target file", 1 << 30)
+    text = read_text(path, "target file", MOST_LIST)
     lines = io.StringIO(text, newline=None)
     try:
         rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
