@@ -33,6 +33,9 @@ from wavebatch.tools.simulate.strip import StripOptions
 LONGEST = 60.0
 """Seconds after which a command hangs; undisturbed ones take one or two."""
 
+STAY = 15.0
+"""Seconds that other processes of the session have to end after the command."""
+
 RUN = "run {base}/strips -o {out} -q"
 COMMANDS = {
     "run, 1 job": f"{RUN} --profile fast",
@@ -182,7 +185,7 @@ class Attacker:
 
     def _end(self, process: subprocess.Popen) -> list[str]:
         """Wait until all processes of the session are gone; those that stay are killed and returned."""
-        deadline = time.monotonic() + 15
+        deadline = time.monotonic() + STAY
         while (left := _session(process.pid)) and time.monotonic() < deadline:
             time.sleep(0.01)
         found = [_command_line(pid).replace(b"\0", b" ").decode()[:200] for pid in left]
@@ -191,6 +194,7 @@ class Attacker:
                 os.kill(pid, signal.SIGKILL)
         process.kill()
         process.wait()
+        process.stderr.close()
         return found
 
     def _judge_end(self, attack: Attack, is_ready: bool, code: int | str, said: str) -> str:
@@ -209,7 +213,7 @@ class Attacker:
             return f"exit code {code}: {said[-300:]}"
         if "Traceback" in said or "this is a bug" in said:
             return f"says {said[-300:]}"
-        if code == 130 and "interrupted" not in said.splitlines()[-1]:
+        if code == 130 and "interrupted" not in "".join(said.splitlines()[-1:]):
             return f"the last line is not `interrupted`: {said[-300:]}"
         return ""
 

@@ -15,6 +15,7 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -34,6 +35,9 @@ _POLL = 1.0
 
 _NAME = "wavebatch"
 """Start of the names of our processes."""
+
+_SET_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of linux/prctl.h."""
 
 _PATIENCE = 3.0
 """Seconds that processes have to end by themselves."""
@@ -243,12 +247,22 @@ def _ctrl_c_held() -> Iterator[None]:
 def _work(pipe: Connection, scratch: Path | None) -> None:
     """In a new process: make calls until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
+    _die_with_parent()
     use_scratch(scratch)
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _die_with_parent() -> None:
+    """Let Linux kill this process when its parent dies: a stopped process cannot see that itself."""
+    if sys.platform == "linux":
+        import ctypes
+
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGKILL)
 
 
 def _answer(pickled: bytes) -> bytes:

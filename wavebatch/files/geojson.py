@@ -19,6 +19,9 @@ from wavebatch.files.text_file import MOST_LIST, read_text
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
 
+FARTHEST = 1e12
+"""Largest coordinate of a corner; squares and products of larger ones overflow."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Polygon:
@@ -67,7 +70,7 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     polygons = []
     for number, (properties, rings) in enumerate(read_features(read_text(path, "polygon file", MOST_LIST), path), 1):
         for ring in rings:
-            if len(ring) < 3 or not np.isfinite(ring).all():
+            if len(ring) < 3 or not (np.abs(ring) <= FARTHEST).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")
         polygons.append(Polygon(str(properties.get("name") or number), tuple(rings)))
     if not polygons:

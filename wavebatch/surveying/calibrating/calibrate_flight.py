@@ -130,7 +130,8 @@ def _read_strip(
     """Decompose what lies on targets or in the overlap with other strips, in one pass."""
     with open_strip_source(path, options) as source:
         seen = see_channels(source.reader, source.scan)
-        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen)
+        known = source.reader.facts.digitizers  # points may name others: they have no waveform
+        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen if digitizer in known)
         others = [box for i, box in enumerate(boxes) if i != number]
         area = _TieArea(
             boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets

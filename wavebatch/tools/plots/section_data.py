@@ -36,6 +36,9 @@ _CHOSEN_BINS = 60
 
 _PIECE = 1_000_000
 
+_LARGEST = 1e12
+"""Largest coordinate and size [m] of voxels, and the root of their largest value; damaged files have larger ones."""
+
 
 class VoxelFile:
     """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
@@ -56,7 +59,9 @@ class VoxelFile:
         self.size = float(self._data["size"])
         lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
         is_sound = self._index.shape[1] == 3 and lengths == {len(self._index)} and self._origin.shape == (3,)
-        if not is_sound or not np.isfinite(self._origin).all() or not 0 < self.size < math.inf:
+        is_sound &= bool((np.abs(self._origin) < _LARGEST).all()) and 1e-6 <= self.size < _LARGEST
+        values = [self._data[column.name] for column in COLUMNS if column.name in self._data]
+        if not is_sound or any((np.abs(one) > _LARGEST**2).any() for one in values):
             raise InputError(f"{path}: holds no {what}: its arrays do not fit; {remedy}")
         with reading_npz(path, what, remedy):
             json.loads(str(self._data["meta"]))

@@ -49,6 +49,10 @@ _MOST_TEXT = 4 << 20
 """Most bytes of the description: it takes a few hundred."""
 
 
+_LARGEST = 1e30
+"""Largest value that is taken for a true one; sums and squares of larger ones overflow."""
+
+
 class TruthWriter(NpzWriter):
     """Takes columns block by block and writes them as one .npz on `publish`; memory does not grow with their length.
 
@@ -120,4 +124,7 @@ class TruthReader(Closing):
         data = member.read(rows * dtype.itemsize)
         if len(data) != rows * dtype.itemsize:
             raise InputError(f"{self.path}: ends too early; simulate the strip again")
-        return np.frombuffer(data, dtype)
+        values = np.frombuffer(data, dtype)
+        if dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
+            raise InputError(f"{self.path}: column {name} holds {np.nanmax(np.abs(values)):g}; simulate the strip again")
+        return values
