@@ -103,6 +103,9 @@ def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     start = np.where(known, depth / np.where(known, speed, 1.0), 0.0)
     return np.split(start, np.cumsum([len(line) for line in lines])[:-1])
 
+_LARGEST = 1e30
+"""Largest time [ns] and sample [DN]; damaged files have larger ones."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CubeSlice:
@@ -130,8 +133,8 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
     values, time, number = read_npz(path, names, what, "make it again").values()
     if not values.size or values.shape[2] != len(time) or values.shape[0] != len(number):
         raise InputError(f"{path}: holds no {what}: its arrays do not fit")
-    if not np.isfinite(time).all() or not np.isfinite(values).any() or (len(time) > 1 and not time[0] < time[1]):
-        raise InputError(f"{path}: holds no {what}: its times do not ascend, or it has no value; make it again")
+    if not (np.abs(time) < _LARGEST).all() or (np.abs(values) > _LARGEST).any() or not np.isfinite(values).any() or (len(time) > 1 and not time[0] < time[1]):
+        raise InputError(f"{path}: holds no {what}: its times do not ascend, or its values are none; make it again")
     spacing = float(time[1] - time[0]) if len(time) > 1 else 1.0
     if all(value is None for value in wanted.values()):
         peak = int(np.nanargmax(np.nansum(values, axis=(0, 1))))
