@@ -3,6 +3,7 @@
 import multiprocessing.connection
 import os
 import signal
+import subprocess
 import sys
 import time
 
@@ -92,3 +93,37 @@ def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
             workers.wait([future for future in futures if not future.done()])
         assert time.monotonic() - start < 12
         assert all(isinstance(future.exception(), WorkerDied) for future in futures)
+
+
+_INTERRUPTED = """
+import os, signal, sys, threading, time
+sys.path.insert(0, {tests!r})
+from test_processes import square, stop_later
+from wavebatch.batch.processes import Workers
+from wavebatch.core.interrupts import guard
+
+def interrupt(join=None):
+    os.kill(os.getpid(), signal.SIGINT)
+
+def command():
+    with Workers(2) as workers:
+        workers.wait([workers.submit(stop_later)])
+        workers.wait([workers.submit(square, 5)])
+        time.sleep(1)
+        if {early}:
+            workers._end = interrupt
+        else:
+            threading.Timer(0.5, interrupt).start()
+
+if __name__ == "__main__":
+    guard(command)
+"""
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, early):
+    """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""
+    script = tmp_path / "interrupted.py"
+    script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr

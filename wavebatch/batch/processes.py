@@ -8,12 +8,14 @@ except for the result of a call of a process that is alive.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 import time
 import traceback
@@ -30,6 +32,13 @@ from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
+
+_NAME = "wavebatch"
+"""Start of the names of our processes."""
+
+_SET_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of linux/prctl.h."""
+
 _PATIENCE = 3.0
 """Seconds that processes have to end by themselves."""
 
@@ -101,17 +110,28 @@ class Workers:
 
     def _end(self) -> None:
         """End all processes: those that wait for a call by themselves, all others at once."""
-        for worker in self._workers:
-            if worker.call is not None:
-                worker.process.kill()
-            self._calls.put(None)
-        deadline = time.monotonic() + _PATIENCE
-        for worker in self._workers:
-            worker.process.join(max(deadline - time.monotonic(), 0))
-        for worker in self._workers:
-            worker.process.kill()  # also one that is stopped
-            worker.process.join(_PATIENCE)
-        self._workers, self._calls = [], queue.SimpleQueue()
+        try:
+            for worker in self._workers:
+                if worker.call is not None:
+                    worker.process.kill()
+                self._calls.put(None)
+            deadline = time.monotonic() + _PATIENCE
+            for worker in self._workers:
+                worker.process.join(max(deadline - time.monotonic(), 0))
+        finally:
+            with uninterrupted():  # also after Ctrl-C while it waits above
+                for worker in self._workers:
+                    worker.process.kill()  # also one that is stopped
+                    worker.process.join(_PATIENCE)
+                self._workers, self._calls = [], queue.SimpleQueue()
+
+
+@atexit.register
+def _kill_all() -> None:
+    """At the end of the program: Python would wait for ever for a stopped process that an interrupt has left here."""
+    for process in multiprocessing.active_children():
+        if process.name.startswith(_NAME):
+            process.kill()
 
 
 class _Call:
@@ -136,6 +156,7 @@ class _Worker:
         """Whether it takes calls."""
         self._seen_dead = False
         self.process = context.Process(target=_work, args=(there, scratch), daemon=True)
+        self.process.name = f"{_NAME}-{self.process.name}"
         try:
             self.process.start()
         finally:
@@ -226,12 +247,22 @@ def _ctrl_c_held() -> Iterator[None]:
 def _work(pipe: Connection, scratch: Path | None) -> None:
     """In a new process: make calls until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
+    _die_with_parent()
     use_scratch(scratch)
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
+
+
+def _die_with_parent() -> None:
+    """Let Linux kill this process when its parent dies: a stopped process cannot see that itself."""
+    if sys.platform == "linux":
+        import ctypes
+
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGKILL)
 
 
 def _answer(pickled: bytes) -> bytes:

@@ -402,7 +402,9 @@ def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
         look = Look(Level(**level, clip=figures.get("flight_level_clip")), *numbers)
         indices = sorted({int(key.split("_")[2]) for key in figures if key.startswith("flight_descriptor_")})
         kinds = {index: tuple(figures[f"flight_descriptor_{index}_{name}"] for name in _KIND) for index in indices}
-    except (KeyError, ValueError, IndexError) as error:
+        if not kinds:
+            raise KeyError("flight_descriptor")
+    except (KeyError, ValueError, IndexError, OverflowError) as error:
         remedy = "`wavebatch run --survey flight --overwrite` makes one"
         raise ConfigError(f"holds no survey of a flight; {remedy}") from error
     return look, kinds

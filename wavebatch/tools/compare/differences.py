@@ -100,8 +100,10 @@ class Differences:
         if not data:
             return {}
         sigma = data["true_echo_width"].astype(np.float64) / FWHM_PER_SIGMA
+        amplitude = data["true_amplitude"].astype(np.float64)
+        sigma[~(sigma > 0)] = amplitude[~(amplitude > 0)] = np.nan  # of a damaged truth: there is no bound
         reported = {name: data[name].astype(np.float64) for name in ("range_err", "amplitude_err", "echo_width_err")}
-        bounds = crlb(data["true_amplitude"], sigma, meta["noise_std"], meta["spacing"])
+        bounds = crlb(amplitude, sigma, meta["noise_std"], meta["spacing"])
         columns = {
             "time": (data["time"], bounds[0], reported["range_err"] / SPEED),
             "echo_time": (data["echo_time"], bounds[0], reported["range_err"] / SPEED),

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,9 @@ _NARROW = 3.0
 
 _LONG, _LEAST, _MOST = 10.0, 0.6, 8.0
 """Longer side, least and largest height of the axes of a section [inches]."""
+
+_MOST_CELLS = 2000
+"""Most cells of a picture along one side: more than it has pixels. A cell is one voxel where fewer do."""
 
 
 def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite: bool = False) -> None:
@@ -81,15 +85,17 @@ def _draw_points(axes, found: Section):
 
 def _draw_voxels(axes, found: Section):
     """The mean of the voxels that lie behind each other across the line."""
-    column = np.floor(found.along / found.voxel).astype(np.int64)
     base = float(found.height.min()) - 0.5 * found.voxel
-    row = np.floor((found.height - base) / found.voxel + 1e-6).astype(np.int64)
+    longest = max(float(found.along.max()), float(found.height.max()) - base) / found.voxel
+    edge = found.voxel * max(math.ceil(longest / _MOST_CELLS), 1)
+    column = np.floor(found.along / edge).astype(np.int64)
+    row = np.floor((found.height - base) / edge + 1e-6).astype(np.int64)
     shape = (int(row.max()) + 1, int(column.max()) + 1)
     cell = row * shape[1] + column
     number = np.bincount(cell, minlength=shape[0] * shape[1])
     with np.errstate(invalid="ignore"):
         image = (np.bincount(cell, found.value, shape[0] * shape[1]) / number).reshape(shape)
-    extent = (0.0, shape[1] * found.voxel, base, base + shape[0] * found.voxel)
+    extent = (0.0, shape[1] * edge, base, base + shape[0] * edge)
     axes.grid(visible=False)
     shown = axes.imshow(image, extent=extent, origin="lower", cmap="viridis", interpolation="nearest", aspect="auto")
     return shown, image

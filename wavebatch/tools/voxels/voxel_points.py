@@ -11,11 +11,15 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.disk.npz_reader import read_npz, reading_npz
 from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.values import Selection, Tally
 from wavebatch.tools.voxels.grid import COLUMNS
 
 _PIECE = 1_000_000
+
+_LARGEST = 1e12
+"""Largest coordinate and size [m] of voxels, and the root of their largest value; damaged files have larger ones."""
 
 
 class VoxelFile:
@@ -29,15 +33,21 @@ class VoxelFile:
         self.paths, self.selection = (path,), selection
         if selection.flags_with or selection.flags_without:
             raise ConfigError(f"{path}: voxels have no echo_flags to select by")
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                self._data = {name: data[name] for name in data.files}
-            self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
-            self.size = float(self._data["size"])
-            self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
+        what, remedy = "voxels of `wavebatch voxelize`", "make them again"
+        columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}
+        facts = {"index": ("i", 2), "origin": ("f", 1), "size": ("f", 0), "crs": ("U", 0), "meta": ("U", 0)}
+        self._data = read_npz(path, {**facts, **columns}, what, remedy)
+        self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
+        self.size = float(self._data["size"])
+        lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
+        is_sound = self._index.shape[1] == 3 and lengths == {len(self._index)} and self._origin.shape == (3,)
+        is_sound &= bool((np.abs(self._origin) < _LARGEST).all()) and 1e-6 <= self.size < _LARGEST
+        values = [self._data[column.name] for column in COLUMNS if column.name in self._data]
+        if not is_sound or any((np.abs(one) > _LARGEST**2).any() for one in values):
+            raise InputError(f"{path}: holds no {what}: its arrays do not fit; {remedy}")
+        with reading_npz(path, what, remedy):
             json.loads(str(self._data["meta"]))
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise InputError(f"{path}: holds no voxels of `wavebatch voxelize` ({error})") from error
+        self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
         known = {column.name: column for column in COLUMNS if column.name in self._data}
         name = selection.column
         if name is not None and name not in known:
