@@ -73,6 +73,10 @@ class Cluster:
     """
 
     is_remote = True
+    compresses = False
+    """Whether workers compress chunks: here rows would travel back to them."""
+    memory = None
+    """Folder of memory that processes share: those of other machines do not."""
 
     def __init__(
         self,

@@ -158,6 +158,7 @@ def run(**options: Any) -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     _check_options(options)
+    _start_processes(options)
     jobs, batch_options = _plan(options)
     if options["report"] not in (None, "-"):
         _check_report(Path(options["report"]), jobs, batch_options)
@@ -171,6 +172,16 @@ def run(**options: Any) -> None:
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise Interrupted(text) from None
+
+
+def _start_processes(options: dict[str, Any]) -> None:
+    """Start the worker processes that will surely be needed, before this process imports what it needs itself."""
+    jobs = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
+    # A limit of memory may allow fewer processes, and resume may find nothing to do.
+    if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
+        from wavebatch.batch.processes import start_early
+
+        start_early(jobs)
 
 
 def _check_options(options: dict[str, Any]) -> None:
