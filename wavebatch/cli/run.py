@@ -158,16 +158,16 @@ def run(**options: Any) -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     _check_options(options)
-    _start_processes(options)
-    jobs, batch_options = _plan(options)
-    if options["report"] not in (None, "-"):
-        _check_report(Path(options["report"]), jobs, batch_options)
-    if options["html_file"] is not None:
-        _check_report(options["html_file"], jobs, batch_options, "--html")
-        check_html(options["html_file"])
-    if options["dry_run"]:
-        sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
     try:
+        _start_processes(options)
+        jobs, batch_options = _plan(options)
+        if options["report"] not in (None, "-"):
+            _check_report(Path(options["report"]), jobs, batch_options)
+        if options["html_file"] is not None:
+            _check_report(options["html_file"], jobs, batch_options, "--html")
+            check_html(options["html_file"])
+        if options["dry_run"]:
+            sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
