@@ -19,6 +19,7 @@ import signal
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, wait
 from multiprocessing import resource_tracker
@@ -94,6 +95,25 @@ class Workers:
         call = _Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
         self._calls.put(call)
         return call.future
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        """Yield `function(item)` of every item, in order; here, where a process died of it."""
+        waiting: deque[tuple[Any, Future]] = deque()
+        for item in items:
+            waiting.append((item, self.submit(function, item)))
+            if len(waiting) >= self.limit:
+                yield self._take_first(function, waiting)
+        while waiting:
+            yield self._take_first(function, waiting)
+
+    def _take_first(self, function: Callable[[Any], Any], waiting: deque[tuple[Any, Future]]) -> Any:
+        item, future = waiting.popleft()
+        while not future.done():
+            self.wait([future])
+        try:
+            return future.result()
+        except WorkerDied:
+            return function(item)
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those that are done."""

@@ -130,7 +130,7 @@ def run_batch(
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)
         if any(job.request.flight for job in jobs):
-            jobs = with_flight(jobs, saved or _survey_flight(jobs, options, on_event))
+            jobs = with_flight(jobs, saved or _survey_flight(jobs, options, workers, on_event))
         with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
             batch.run()
         outcomes = tuple(batch.outcomes[job.path] for job in jobs)
@@ -138,15 +138,19 @@ def run_batch(
 
 
 def _survey_flight(
-    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None
+    jobs: Sequence[StripJob],
+    options: BatchOptions,
+    workers: Workers | Cluster,
+    on_event: Callable[[dict[str, Any]], None] | None,
 ) -> SavedSurvey | None:
     """Survey all strips together and keep the result; None where no strip can be read: each fails in its turn."""
     first = jobs[0].options
-    samples = read_samples([job.path for job in jobs], direction=first.direction, headerless=first.headerless)
+    reading = {"direction": first.direction, "headerless": first.headerless}
+    samples = read_samples([job.path for job in jobs], **reading, spread=workers.map)
     if not samples:
         return None
     path = flight_path(options.folder)
-    flight = survey_flight(samples)
+    flight = survey_flight(samples, spread=workers.map)
     try:
         write_text(path, format_survey(flight.saved), overwrite=options.overwrite)
     except InputError:
