@@ -36,7 +36,7 @@ DAMPING = 0.01
 KEPT = 0.75
 """A step whose fall of the cost is at least this share of what it promised eases the damping."""
 
-EASE, RAISE = 0.1, 10.0
+EASE, RAISE = 0.2, 4.0
 """Factors of the damping after such a step, and after a step that is refused; otherwise it stays. Overlapping echoes
 lie in a curved valley: if every accepted step eased the damping, each second step would be too long.
 """
