@@ -19,6 +19,7 @@ import numpy as np
 
 from wavebatch.batch.processes import Workers
 from wavebatch.batch.run import run_batch
+from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import InputError
 from wavebatch.tools.api.run import plan_run
 from wavebatch.tools.bench.worker import Worker
@@ -42,8 +43,6 @@ class Lap:
     """Processor seconds of the process that writes."""
     workers: float
     """Those of the workers."""
-    prepare: float
-    """Seconds of scan and survey, which one process does alone."""
     waveforms: int
 
 
@@ -58,7 +57,7 @@ class Parts:
     start_worker: float
     """The same of a worker; all start at once, while the parent starts."""
     prepare: float
-    """Scan and survey of a strip, by one process [s]."""
+    """Scan and survey of a strip, by one process: processor seconds."""
     single: float
     """One job: seconds per waveform."""
     work: float
@@ -114,6 +113,7 @@ def measure_jobs(
     laps: dict[int, list[Lap]] = {1: [], 2: []}
     with Worker() as worker:
         start_worker = worker.call(measure_worker)
+        prepare = _middle([worker.call(time_preparation, strip, folder) for _ in range(rounds)])
         for turn in range(rounds):
             for jobs in (1, 2) if turn % 2 else (2, 1):
                 say(f"running {strip.name} with {jobs} jobs, turn {turn + 1} of {rounds}")
@@ -124,15 +124,14 @@ def measure_jobs(
     n = one[0].waveforms
     if not n:
         raise InputError(f"{strip}: has no waveforms to be timed")
-    prepare = _middle([lap.prepare for lap in one])
-    work = _middle([lap.workers - lap.prepare - 2 * start_worker for lap in two]) / n
+    work = _middle([lap.workers - prepare - 2 * start_worker for lap in two]) / n
     units = max(n // 50_000, 1)
     parts = Parts(
         waveforms=n,
         start=time_imports(),
         start_worker=start_worker,
         prepare=prepare,
-        single=_middle([lap.own - lap.prepare for lap in one]) / n,
+        single=_middle([lap.own - prepare for lap in one]) / n,
         work=work,
         write=_middle([lap.own for lap in two]) / n,
         strip=few,
@@ -161,6 +160,14 @@ def measure_worker() -> float:
     return (_usage()[2] - before) / 2
 
 
+def time_preparation(strip: Path, folder: Path) -> float:
+    """Processor seconds of scan and survey."""
+    (job,), _ = plan_run([strip], folder, overwrite=True)
+    begin = time.process_time()
+    prepare_strip(job).scan.close()
+    return time.process_time() - begin
+
+
 def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
     """Take the strip from file to file."""
     planned = plan_run([strip], folder, jobs=jobs, overwrite=True)
@@ -171,9 +178,7 @@ def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
         if outcome.error is not None:
             raise outcome.error
     elapsed, own, workers = (late - early for early, late in zip(before, after, strict=True))
-    timing = result.report.timing
-    prepare = timing.get("scan", 0.0) + timing.get("survey", 0.0) + timing.get("sensor", 0.0)
-    return Lap(elapsed, own, workers, prepare, result.report.count("waveforms"))
+    return Lap(elapsed, own, workers, result.report.count("waveforms"))
 
 
 def run_small(strip: Path, folder: Path) -> float:
