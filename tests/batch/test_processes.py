@@ -1,5 +1,6 @@
 """Worker processes that are killed or stopped at the worst instants: the parent process never waits for them."""
 
+import functools
 import multiprocessing.connection
 import os
 import signal
@@ -127,3 +128,19 @@ def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, ea
     script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
     assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr
+
+
+def die_elsewhere(parent, number):
+    if os.getpid() != parent and number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def test_map_gives_results_in_order_and_makes_calls_itself_that_kill_a_process():
+    with Workers(2) as workers:
+        call = functools.partial(die_elsewhere, os.getpid())
+        assert list(workers.map(call, range(12))) == [number**2 for number in range(12)]
+        with pytest.raises(ValueError, match="bad 0"):
+            list(workers.map(raise_error, range(3)))
+    with Workers(1) as workers:
+        assert list(workers.map(square, range(3))) == [0, 1, 4]
