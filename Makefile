@@ -7,6 +7,7 @@
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
+#   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
@@ -15,9 +16,10 @@ BIN    := $(VENV)/bin
 DEMO   := demo
 BENCH  := bench
 MINUTES ?= 10
+RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test test-all readers papers bench fuzz docs man lint clean
+.PHONY: demo test test-all readers papers bench fuzz attack docs man lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -78,6 +80,9 @@ endif
 
 fuzz: $(VENV)/.test
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/fuzzing.py --minutes $(MINUTES) --seed $(SEED)
+
+attack: $(VENV)/.test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python tests/attacking.py --runs $(RUNS) --seed $(SEED)
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

@@ -1,213 +1,64 @@
-"""Fuzzing: damaged inputs of every kind through every command that reads them, each case in a process of its own.
+"""Fuzzing: damaged inputs of every kind through every command that reads them, and odd values of every option.
 
 `make fuzz MINUTES=10 SEED=1` runs it. What breaks a promise is made as small as possible and kept as one line of
-`tests/fuzz_regressions.jsonl`: the kind of input, the command, and the edits of the sound input, which code builds
-again. `tests/test_fuzz.py` replays these lines.
+`tests/fuzz_regressions.jsonl`: the kind of input, the command, the edits of the sound input, which code builds again,
+and variables. `tests/test_fuzz.py` replays these lines.
+
+Cases run in groups, a process per group, because a process per case took half of the time. A case that fails in a
+group runs once more in a process of its own; one that fails only after others is reported with these.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
+import contextlib
+import importlib
+import faulthandler
 import json
 import os
 import random
 import re
 import resource
+import select
+import shlex
 import signal
+import stat
 import sys
+import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from click.testing import CliRunner
+from fuzz_damage import Edit, apply_edits, damage
+from fuzz_inputs import BESIDE, COMMANDS, IN_RESUMED, build_inputs, read_sound, weight
+from fuzz_options import Options
 
 from wavebatch.cli import main
-from wavebatch.stages.chain_file import effective, load_profile
-from wavebatch.tools.simulate import simulate_strip
 
 KEPT = Path(__file__).with_name("fuzz_regressions.jsonl")
-MOST_SECONDS, MOST_MEMORY = 10, 1 << 30
-"""Per case; memory is what the process takes at most, with Python and NumPy."""
+MOST_SECONDS, MOST_WAITING, MOST_MEMORY = 10, 15, 1 << 30
+"""Per case: of a processor, of a clock while it does nothing, and of memory that the process takes at most,
+with Python and NumPy."""
+GROUP = 40
+"""Cases per process."""
 
 
 class Case(NamedTuple):
     """A damaged input and the command that reads it."""
 
     kind: str
-    command: int
-    """Index into the commands of this kind."""
-    edits: list[list]
-    """Of the sound input: ["set", place, hex], ["insert", place, hex, times], ["delete", place, bytes]."""
-
-
-FAST = ["--profile", "fast", "-q"]
-_STRIP_COMMANDS: list[list[str]] = [
-    ["run", "{input}", "-o", "{out}", *FAST],
-    ["run", "{input}", "-o", "{out}", "--points", "returns", "--keep-packets", "-q"],
-    ["info", "{input}"],
-    ["check", "{input}"],
-    ["survey", "{input}", "-o", "{out}/a.toml"],
-    ["compare", "{input}", "{input}"],
-    ["stats", "{input}", "-o", "{out}/a.csv"],
-    ["slice", "{input}", "-o", "{out}/a.csv", "-q"],
-    ["synthesize", "{input}", "-o", "{out}/a.las", "-q"],
-    ["voxelize", "{input}", "-o", "{out}/a.npz", "--size", "0.5"],
-]
-COMMANDS: dict[str, list[list[str]]] = {
-    "strip.las": _STRIP_COMMANDS,
-    "packed.laz": _STRIP_COMMANDS,
-    "beside.wdp": [[part.replace("{input}", "{base}/beside.las") for part in words] for words in _STRIP_COMMANDS],
-    "cloud.laz": [
-        ["stats", "{input}"], ["compare", "{input}", "{base}/strip.las"], ["compare", "{base}/cloud.laz", "{input}"],
-        ["compare", "{input}", "--truth", "{base}/truth.npz"], ["synthesize", "{input}", "-o", "{out}/a.las", "-q"],
-    ],
-    "chain.toml": [["check", "{input}"], ["run", "{base}/strip.las", "-o", "{out}", "--chain", "{input}", "-q"]],
-    "system.toml": [["run", "{base}/strip.las", "-o", "{out}", "--system", "{input}", *FAST]],
-    "cal.toml": [["run", "{base}/strip.las", "-o", "{out}", "--calibration", "{input}", *FAST]],
-    "trajectory.txt": [
-        ["run", "{base}/strip.las", "-o", "{out}", "--trajectory", "{input}", "-q"],
-        ["run", "{base}/strip.las", "-o", "{out}", "--trajectory", "{input}", "--lever-arm", "1,0,2", "-q"],
-    ],
-    "trajectory.sbet": [
-        ["run", "{base}/strip.las", "-o", "{out}", "--trajectory", "{input}", "--crs", "EPSG:32632", "-q"]
-    ],
-    "targets.geojson": [
-        ["calibrate", "{base}/strip.las", "--targets", "{input}", "-o", "{out}/c.toml", "--flight-height", "500"]
-    ],
-    "targets.csv": [
-        ["calibrate", "{base}/strip.las", "--targets", "{input}", "-o", "{out}/c.toml", "--flight-height", "500"]
-    ],
-    "polygons.geojson": [["stats", "{base}/cloud.laz", "--polygons", "{input}", "-o", "{out}/a.csv"]],
-    "list.txt": [["run", "@{input}", "-o", "{out}", *FAST], ["stats", "@{input}"]],
-    "strip.report.json": [["run", "{base}/strip.las", "-o", "{resumed}", "--profile", "fast", "-q", "--resume"]],
-    "truth.npz": [["compare", "{base}/cloud.laz", "--truth", "{input}"]],
-}  # fmt: skip
-"""Per kind of input. {input}: the damaged file, {base}: the folder of the sound ones, {out}: an empty folder,
-{resumed}: a folder with a finished cloud and the damaged report."""
-
-
-def build_inputs(base: Path) -> None:
-    """Write a sound input of every kind; the same bytes each time."""
-    for name, internal in (("strip.las", True), ("packed.laz", True), ("beside.las", False)):
-        from wavebatch.tools.simulate import StripOptions
-
-        truth = base / "truth.npz" if name == "strip.las" else None
-        options = StripOptions(internal=internal, version="1.4", point_format=9) if name == "packed.laz" else None
-        options = options or StripOptions(internal=internal)
-        simulate_strip("urban", base / name, pulses=120, seed=1, truth=truth, options=options)
-    (base / "chain.toml").write_text(effective(load_profile("accurate")))
-    _sound("survey", base / "strip.las", "-o", base / "system.toml")
-    _sound("run", base / "strip.las", "-o", base / "done", *FAST)
-    (base / "strip.report.json").write_bytes((base / "done" / "strip.report.json").read_bytes())
-    (base / "cloud.laz").write_bytes((base / "done" / "strip.laz").read_bytes())
-    import laspy
-    import numpy as np
-
-    cloud = laspy.read(base / "cloud.laz")
-    (x0, y0, _), (x1, y1, _) = cloud.header.mins, cloud.header.maxs
-    x0, x1, y0, y1 = x0 - 5, x1 + 5, y0 - 5, y1 + 5  # footprints lie wholly inside
-    corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
-    shape = {"type": "Polygon", "coordinates": [corners]}
-    feature = {"type": "Feature", "properties": {"reflectance": 0.3, "name": "all", "incidence": 20}, "geometry": shape}
-    document = json.dumps({"type": "FeatureCollection", "features": [feature]})
-    (base / "targets.geojson").write_text(document)
-    (base / "polygons.geojson").write_text(document)
-    radius = x1 - x0 + y1 - y0
-    heading = "name,reflectance,incidence,x,y,radius"
-    (base / "targets.csv").write_text(f"{heading}\nall,0.3,20,{x0:.2f},{y0:.2f},{radius:.2f}\n")
-    times = [float(cloud.gps_time.min()) + k for k in range(-2, 4)]
-    ray = laspy.read(base / "strip.las")
-    toward = np.stack([ray["x_t"], ray["y_t"], ray["z_t"]], axis=1).astype(float)
-    ray, toward = ray[toward[:, 2] > 0], toward[toward[:, 2] > 0]
-    sensor = (ray.xyz + toward / toward[:, 2:] * (800 - ray.xyz[:, 2:])).mean(axis=0)
-    x, y, z = (float(value) for value in sensor)  # of flights that are simulated: 800 m high, 60 m/s to the east
-    lines = [f"{t!r},{x + 60 * (t - times[2]):.3f},{y:.3f},{z:.3f},0,0,90" for t in times]
-    (base / "trajectory.txt").write_text("\n".join(["time,x,y,z,roll,pitch,heading", *lines]) + "\n")
-    (base / "trajectory.sbet").write_bytes(_sbet(times))
-    (base / "list.txt").write_text("# strips\nstrip.las\nbeside.las\n")
-    (base / "cal.toml").write_text(
-        'schema = "wavebatch.calibration/1"\nconstant = 2.0e-8\nrelative_error = 0.05\nattenuation_db_km = 0.22\n'
-        'divergence_mrad = 0.5\nstrip = "a.las"\n'
-    )
-
-
-def _sbet(times: list[float]) -> bytes:
-    import numpy as np
-
-    from wavebatch.files.trajectory_file import SBET_RECORD
-
-    records = np.zeros(len(times), SBET_RECORD)
-    records["time"], records["latitude"], records["longitude"], records["height"] = times, 0.84, 0.157, 800
-    return records.tobytes()
-
-
-def _sound(*command: object) -> None:
-    done = CliRunner().invoke(main, list(map(str, command)))
-    assert done.exit_code == 0, done.output
-
-
-def apply_edits(data: bytes, edits: list[list]) -> bytes:
-    """Return the damaged bytes."""
-    data = bytearray(data)
-    for name, place, what, *times in edits:
-        if name == "set":
-            data[place : place + len(what) // 2] = bytes.fromhex(what)
-        elif name == "insert":
-            data[place:place] = bytes.fromhex(what) * times[0]
-        else:
-            del data[place : place + what]
-    return bytes(data)
-
-
-_NUMBERS = [
-    b"0", b"-1", b"1e308", b"-1e308", b"1e-320", b"nan", b"inf", b"1" + b"0" * 400, b"9" * 5000, b"0x" + b"f" * 2000,
-    b"true", b'"x"', b"[]", b"{}", b"null", b"9007199254740993", b"-0.0", b"1e400", b"18446744073709551616",
-]  # fmt: skip
-_ODD = [
-    b"\0", b"\xff", b"\x1b[31m", b"\n", b"\r", b'"', b"'", b"[", b"{", b"]", b"}", b",", b".", b"=", b"#", b"\\",
-    b"\xe2\x80\xae", b"a.", b"[[", b'"""', b"@", b"*", b"\xf0\x9f\x98\x80", b"-", b" ",
-]  # fmt: skip
-
-
-def damage(data: bytes, kind: str, rng: random.Random) -> list[list]:
-    """Return random edits of a sound input."""
-    is_text = not kind.endswith((".las", ".laz", ".wdp", ".sbet", ".npz"))
-    make = _damage_text if is_text else _damage_bytes
-    return [make(data, rng) for _ in range(rng.choice([1, 1, 2, 5, 20]))]
-
-
-def _damage_bytes(data: bytes, rng: random.Random) -> list:
-    at = rng.randrange(700 if rng.random() < 0.5 and len(data) > 700 else len(data))
-    choice = rng.random()
-    if choice < 0.05:
-        return ["delete", at, len(data)]
-    if choice < 0.1:
-        return ["delete", at, rng.choice([1, 4, 60])]
-    if choice < 0.15:
-        return ["insert", at, rng.randbytes(rng.choice([1, 4])).hex(), rng.choice([1, 15])]
-    width = rng.choice([1, 2, 4, 8])
-    values = [b"\xff" * width, bytes(width), rng.randbytes(width), bytes(width - 1) + b"\x80", b"\0" * 6 + b"\xf8\x7f"]
-    return ["set", at, rng.choice(values).hex()]
-
-
-def _damage_text(data: bytes, rng: random.Random) -> list:
-    at, choice = rng.randrange(len(data)), rng.random()
-    digits = [place for place in range(len(data)) if data[place : place + 1].isdigit()]
-    if choice < 0.35 and digits:
-        at = rng.choice(digits)
-        return ["set", at, rng.choice(_NUMBERS[:7]).hex()] if choice < 0.1 else [
-            "insert", at, rng.choice(_NUMBERS).hex(), 1]  # fmt: skip
-    if choice < 0.5:
-        return ["delete", at, rng.choice([1, 5, 40, len(data)])]
-    if choice < 0.6:
-        return ["insert", at, rng.choice(_ODD).hex(), rng.choice([500, 5000, 100_000])]
-    if choice < 0.7:
-        part = data[at : at + rng.choice([5, 50, 500])]
-        return ["insert", rng.randrange(len(data)), part.hex(), rng.choice([1, 3])]
-    return [rng.choice(["insert", "set"]), at, rng.choice(_ODD).hex(), 1]
+    """Of the input; "options" for sound inputs and odd options."""
+    command: str
+    """As in a shell, with {input} and other places of `fuzz_inputs`."""
+    edits: list[Edit]
+    """Of the sound input."""
+    variables: dict[str, str] = {}
+    """Of the environment."""
 
 
 class Fuzzer:
@@ -215,88 +66,232 @@ class Fuzzer:
 
     def __init__(self, folder: Path) -> None:
         self.base, self._folder = folder / "base", folder
-        self.last: dict = {}
+        self.last: dict[str, Any] = {}
         """What the last command did."""
         self.base.mkdir()
-        build_inputs(self.base)
-        self.sound = {kind: (self.base / kind).read_bytes() for kind in COMMANDS}
+        _in_child(lambda: build_inputs(self.base))  # the threads that laspy starts here would be missing in forks
+        self.sound = dict(read_sound(self.base))
+        self._options = Options()
+        self._weights = {kind: [weight(command) for command in COMMANDS[kind]] for kind in COMMANDS}
+        self._kept = _state(self.base)
+        for name in ("matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg", "rasterio"):
+            with contextlib.suppress(ImportError):  # once, not in every process
+                importlib.import_module(name)
 
     def draw(self, rng: random.Random) -> Case:
         """Return a random case."""
+        if rng.random() < 0.2:
+            command, variables = self._options.draw(rng)
+            return Case("options", command, [], variables)
         kind = rng.choice(sorted(COMMANDS))
-        return Case(kind, rng.randrange(len(COMMANDS[kind])), damage(self.sound[kind], kind, rng))
+        command = rng.choices(COMMANDS[kind], self._weights[kind])[0]
+        return Case(kind, command, damage(self.sound, kind, rng))
 
     def run(self, case: Case) -> str:
         """Run a case in a process of its own and return what is wrong, on one line."""
-        out = self._folder / "case"
-        _remove(out)
-        words, expect = self._prepare(case, out)
-        report = out / "result.json"
+        return self.run_group([case])[0]
+
+    def run_group(self, cases: Sequence[Case]) -> list[str]:
+        """Run cases in a process, in a new one after each that fails; return what is wrong with each."""
+        wrong: list[str] = []
+        while len(wrong) < len(cases):
+            wrong += self.run_some(cases[len(wrong) :])
+        return wrong
+
+    def run_some(self, cases: Sequence[Case], see: Callable[[Case, dict], object] = lambda case, done: None) -> list[str]:
+        """What is wrong with the first cases, up to one that fails; see: gets each case and what it did."""
+        source, target = os.pipe()
         pid = os.fork()
         if not pid:
-            _run_case(words, report)
-        start = time.monotonic()
-        while True:
-            ended, status, usage = os.wait4(pid, os.WNOHANG)
-            if ended:
-                break
-            if time.monotonic() - start > MOST_SECONDS:
+            os.close(source)
+            self._child(cases, target)
+        os.close(target)
+        wrong, watch = [], _Watch(pid, source)
+        try:
+            for case in cases:
+                line, why = watch.next_line()
+                self.last = json.loads(line) if line else {"code": -1, "out": "", "err": why, "why": why}
+                see(case, self.last)
+                why = self.last["why"]
+                wrong.append(why)
+                if why:
+                    break
+        finally:
+            os.close(source)
+            with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-                os.wait4(pid, 0)
-                return f"ran for more than {MOST_SECONDS} s"
-            time.sleep(0.002)
-        if status or not report.exists():
-            return f"the process ended with status {status}"
-        if usage.ru_maxrss << 10 > MOST_MEMORY:
-            return f"took {usage.ru_maxrss >> 10} MB"
-        self.last = json.loads(report.read_text())
-        return _judge(self.last, out / "out", expect)
+            os.waitpid(pid, 0)
+        changed = _state(self.base) ^ self._kept
+        if changed:
+            raise AssertionError(f"sound inputs were changed by one of {[case.command for case in cases[: len(wrong)]]}: {sorted({one[0] for one in changed})}")
+        return wrong
 
-    def _prepare(self, case: Case, out: Path) -> tuple[list[str], set[str]]:
-        """The command with the damaged input in place, and the names that its folder holds before."""
-        (out / "out").mkdir(parents=True)
-        data = apply_edits(self.sound[case.kind], case.edits)
-        base, places = self.base, {"out": out / "out", "resumed": out / "out", "base": self.base}
-        if case.kind == "strip.report.json":
-            (out / "out" / "strip.laz").write_bytes((base / "done" / "strip.laz").read_bytes())
-            places["input"] = out / "out" / case.kind
-        elif case.kind in ("beside.wdp", "list.txt"):
-            places["base"] = out
-            for name in ("beside.las", "strip.las"):
-                (out / name).write_bytes((base / name).read_bytes())
-            places["input"] = out / case.kind
-            (out / "beside.wdp").write_bytes((base / "beside.wdp").read_bytes())
-        else:
-            places["input"] = out / case.kind
-        places["input"].write_bytes(data)
-        words = [word.format(**places) for word in COMMANDS[case.kind][case.command]]
-        return words, {path.name for path in (out / "out").iterdir()}
+    def _child(self, cases: Sequence[Case], target: int) -> None:
+        """In the forked process: run the cases and write what each did."""
+        try:
+            os.setsid()
+            for case in cases:
+                found = self._run_here(case)
+                os.write(target, json.dumps(found).encode() + b"\n")
+                if found["why"]:
+                    break
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(99)
 
-    def shrink(self, case: Case) -> Case:
-        """Return the case without the edits that do not matter."""
-        edits = list(case.edits)
-        for edit in list(edits):
-            fewer = [other for other in edits if other is not edit]
-            if fewer and self.run(case._replace(edits=fewer)):
-                edits = fewer
-        return case._replace(edits=edits)
-
-
-def _run_case(words: list[str], report: Path) -> None:
-    """In the forked process: run the command, with warnings as errors, and write what it did."""
-    try:
+    def _run_here(self, case: Case) -> dict[str, Any]:
+        folder = self._folder / "case"
+        words, before = self._prepare(case, folder)
+        inputs = _state(folder, below=False)
+        lost: list[str] = []
+        sys.unraisablehook = lambda error: lost.append(repr(error.exc_value))
+        warnings.resetwarnings()
         warnings.simplefilter("error")
-        done = CliRunner().invoke(main, words)
+        warnings.simplefilter("ignore", ResourceWarning)
+        opened = len(os.listdir("/proc/self/fd"))
+        _reset_peak()
+        done = CliRunner().invoke(main, words, env=case.variables)
         is_bug = not isinstance(done.exception, SystemExit | None)
         error = "".join(traceback.format_exception(done.exception)) if is_bug else ""
-        found = {"code": done.exit_code, "out": done.stdout[-5000:], "err": done.stderr[-5000:], "error": error}
-        report.write_text(json.dumps(found))
-        os._exit(0)
-    finally:
-        os._exit(99)
+        found: dict[str, Any] = {"code": done.exit_code, "out": done.stdout[-5000:], "err": done.stderr[-5000:]}
+        found |= {"error": error, "peak": _read_peak(), "wall": "--jobs" in words}
+        why = _judge(found, folder / "out", before, case)
+        if not why and inputs - _state(folder, below=False):
+            why = "changes an input"
+        if not why and lost:
+            why = f"Python dropped {lost[0]}"
+        if not why and os.listdir(folder / "tmp"):
+            why = f"leaves in TMPDIR: {os.listdir(folder / 'tmp')}"
+        del done
+        if not why and len(os.listdir("/proc/self/fd")) > opened + 20:
+            why = "leaves files open"
+        return {**found, "why": why}
+
+    def _prepare(self, case: Case, folder: Path) -> tuple[list[str], set[str]]:
+        """The command with the damaged input in place, and the names that its folder holds before."""
+        _remove(folder)
+        out = folder / "out"
+        out.mkdir(parents=True)
+        (folder / "tmp").mkdir()
+        os.chdir(out)
+        os.environ["TMPDIR"] = tempfile.tempdir = str(folder / "tmp")
+        places = {"out": out, "resumed": out, "base": self.base, "folder": folder, "input": folder / case.kind}
+        if case.kind == "options":
+            _make_odd_places(folder)
+        elif case.kind in IN_RESUMED:
+            for name in ("strip.laz", "strip.report.json"):
+                (out / name).write_bytes((self.base / "done" / name).read_bytes())
+            places["input"] = out / case.kind
+        for name in BESIDE.get(case.kind, ()):
+            (folder / name).write_bytes(self.sound[name])
+        if case.kind == "settings.toml":
+            places |= {"base": folder, "input": folder / "wavebatch.toml"}
+        if case.kind != "options":
+            places["input"].write_bytes(apply_edits(self.sound[case.kind], case.edits, self.sound))
+        words = []
+        for word in shlex.split(case.command):
+            for name, place in places.items():
+                word = word.replace(f"{{{name}}}", str(place))
+            words.append(word)
+        return words, {path.name for path in out.iterdir()}
+
+    def shrink(self, case: Case) -> Case:
+        """Return the case without the edits and words that do not matter."""
+        for edit in list(case.edits):
+            fewer = [other for other in case.edits if other is not edit]
+            if fewer and self.run(case._replace(edits=fewer)):
+                case = case._replace(edits=fewer)
+        for name in list(case.variables):
+            fewer_variables = {other: value for other, value in case.variables.items() if other != name}
+            if self.run(case._replace(variables=fewer_variables)):
+                case = case._replace(variables=fewer_variables)
+        return case
 
 
-def _judge(done: dict, out: Path, before: set[str]) -> str:
+class _Watch:
+    """Reads the lines of a process and looks at its times."""
+
+    def __init__(self, pid: int, source: int) -> None:
+        self._pid, self._source, self._read = pid, source, b""
+
+    def next_line(self) -> tuple[bytes, str]:
+        """The next line, or what is wrong."""
+        used = seen = self._used()
+        busy = time.monotonic()
+        while b"\n" not in self._read:
+            if select.select([self._source], [], [], 0.5)[0]:
+                data = os.read(self._source, 1 << 20)
+                if not data:
+                    return b"", f"the process ended with status {os.waitid(os.P_PID, self._pid, os.WEXITED | os.WNOWAIT).si_status}"
+                self._read += data
+            elif self._used() - used > MOST_SECONDS:
+                return b"", f"ran for more than {MOST_SECONDS} s"
+            elif self._used() - seen > 0.05:
+                seen, busy = self._used(), time.monotonic()
+            elif time.monotonic() - busy > MOST_WAITING:
+                return b"", f"waits for more than {MOST_WAITING} s"
+        line, _, self._read = self._read.partition(b"\n")
+        return line, ""
+
+    def _used(self) -> float:
+        """Seconds of a processor, with those of ended children."""
+        try:
+            with open(f"/proc/{self._pid}/stat") as file:
+                numbers = file.read().rpartition(")")[2].split()[11:15]
+        except OSError:
+            return 0.0
+        return sum(map(int, numbers)) / os.sysconf("SC_CLK_TCK")
+
+
+def _in_child(work: Callable[[], object]) -> None:
+    pid = os.fork()
+    if not pid:
+        try:
+            work()
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(1)
+    assert os.waitpid(pid, 0)[1] == 0, "the sound inputs cannot be made"
+
+
+def _reset_peak() -> None:
+    with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:
+        file.write("5")
+
+
+def _read_peak() -> int:
+    """Most memory that the process took since `_reset_peak` [B]."""
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) << 10 for line in file if line.startswith("VmHWM"))
+
+
+def _make_odd_places(folder: Path) -> None:
+    """A pipe, devices, links and a folder that looks like a strip."""
+    os.symlink("loop", folder / "loop")
+    os.symlink("none", folder / "dangling")
+    (folder / "folder.las").mkdir()
+    for name in ("pipe", "pipe.las"):
+        os.mkfifo(folder / name)
+    for name, minor in (("null", 3), ("zero", 5), ("zero.las", 5), ("full", 7)):
+        with contextlib.suppress(PermissionError):
+            os.mknod(folder / name, stat.S_IFCHR | 0o666, os.makedev(1, minor))
+
+
+def _state(folder: Path, *, below: bool = True) -> set[tuple]:
+    """Names, sizes and times of the files in a folder."""
+    found = set()
+    for path in folder.rglob("*") if below else folder.iterdir():
+        state = path.lstat()
+        if stat.S_ISREG(state.st_mode):
+            found.add((str(path), state.st_size, state.st_mtime_ns, state.st_ino))
+    return found
+
+
+def _judge(done: dict[str, Any], out: Path, before: set[str], case: Case) -> str:
     """What is wrong with the end of a command."""
     code, said = done["code"], done["err"]
     left = {path.name for path in out.iterdir()}
@@ -304,6 +299,8 @@ def _judge(done: dict, out: Path, before: set[str]) -> str:
         return "traceback: " + " ".join(done["error"].split())[-300:]
     if code not in (0, 1, 2, 3, 4):
         return f"exit code {code}"
+    if done["peak"] > MOST_MEMORY:
+        return f"took {done['peak'] >> 20} MB"
     for word in ("this is a bug", "Traceback", "Warning", "not enough memory"):
         if word in said or word in done["out"]:
             return f"says {word}: {' '.join(said.split())[:300]}"
@@ -311,14 +308,88 @@ def _judge(done: dict, out: Path, before: set[str]) -> str:
         return f"control characters: {said[:200]!r}"
     if code and not said.strip() and not done["out"].strip():
         return "fails without a word"
+    lines = [line for line in said.splitlines() if not line.startswith(("settings:", "warning:"))]
+    if code == 2 and len(lines) > 1:
+        return f"wrong usage in {len(lines)} lines: {said[:200]!r}"
     if any(name.startswith(".") for name in left):
         return f"leaves {sorted(left)}"
-    if code in (1, 2, 4) and left - before:
-        return f"exit code {code}, but leaves {sorted(left - before)}: {said[:200]}"
-    reports = {name.removesuffix(".report.json") for name in left - before if name.endswith(".report.json")}
-    if any(f"{name}.laz" not in left for name in reports):
+    new = left - before
+    if code in (1, 2, 4) and new and not _may_leave(case, code):
+        return f"exit code {code}, but leaves {sorted(new)}: {said[:200]}"
+    reports = {name.removesuffix(".report.json") for name in new if name.endswith(".report.json")}
+    if any(not {f"{name}.laz", f"{name}.las"} & left for name in reports):
         return f"a report without its cloud: {sorted(left)}"
+    for name in sorted(new):
+        problem = check_whole(out / name)
+        if problem and not (case.kind == "options" and _is_other(out / name)):
+            return f"{name} is not whole: {problem}"
     return ""
+
+
+def _may_leave(case: Case, code: int) -> bool:
+    """Whether a failing command may keep outputs: `run` with a second output that fails, and one of several strips."""
+    if "--log-file" in case.command or any("LOG_FILE" in name for name in case.variables):
+        return True
+    several = case.kind in ("list.txt", "options") or "{base}/other.las" in case.command
+    if case.command.startswith("compare"):
+        return code == 1  # a threshold
+    return code == 1 and (several or case.command.startswith(("run", "check", "bench")))
+
+
+def check_whole(path: Path) -> str:
+    """What is wrong with an output, by its suffix: it must be readable to its end."""
+    if not path.is_file():
+        return ""
+    try:
+        if path.suffix in (".las", ".laz"):
+            return _check_cloud(path)
+        text = path.read_text(errors="surrogateescape") if path.suffix in (".toml", ".json", ".geojson", ".csv") else ""
+        if path.suffix == ".toml":
+            import tomllib
+
+            tomllib.loads(text)
+        elif path.suffix in (".json", ".geojson"):
+            json.loads(text)
+        elif path.suffix == ".csv" and not text.endswith("\n"):
+            return "the last line has no end"
+        elif path.suffix == ".npz":
+            import numpy as np
+
+            with np.load(path) as file:
+                for name in file.files:
+                    file[name]
+        elif path.suffix == ".tif":
+            import rasterio
+
+            with rasterio.open(path) as file:
+                small = file.width * file.height < 10_000_000
+                file.read() if small else file.read(window=((0, 256), (0, 256)))
+        elif path.suffix == ".png" and not path.read_bytes().endswith(b"IEND\xaeB`\x82"):
+            return "the picture has no end"
+        elif path.suffix == ".svg" and not path.read_bytes().rstrip().endswith(b"</svg>"):
+            return "the picture has no end"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+_BEGIN = {".las": b"LASF", ".laz": b"LASF", ".npz": b"PK", ".png": b"\x89PNG", ".svg": b"<?xml", ".json": b"{",
+          ".tif": b"II*"}  # fmt: skip
+
+
+def _is_other(path: Path) -> bool:
+    """Whether it is of another format than its name says, which the user may choose: a log, a table, an array."""
+    return not path.read_bytes().startswith(_BEGIN.get(path.suffix, b"?"))
+
+
+def _check_cloud(path: Path) -> str:
+    import laspy
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of laspy
+        with laspy.open(path) as file:
+            count, points = file.header.point_count, file.read_points(-1)
+    return "" if len(points) == count else f"{len(points)} points of {count}"
 
 
 def _remove(folder: Path) -> None:
@@ -328,46 +399,81 @@ def _remove(folder: Path) -> None:
         folder.rmdir()
 
 
+class Outcomes:
+    """Counts how cases end, so that one sees that they reach inside."""
+
+    def __init__(self) -> None:
+        self.codes: dict[str, collections.Counter] = collections.defaultdict(collections.Counter)
+        self.texts: dict[str, set[str]] = collections.defaultdict(set)
+        self.count = 0
+
+    def add(self, case: Case, done: dict[str, Any]) -> None:
+        """Count a case and what it did."""
+        words = case.command.split()
+        for name in (" ".join(words[: 1 + (words[0] == "plot")]), f"[{case.kind}]"):
+            self.codes[name][done["code"]] += 1
+            if done["code"]:
+                self.texts[name].add(re.sub(r"'.*?'|/\S*|[\d\W]+", " ", done["err"] or done["out"])[:80])
+        self.count += 1
+
+    def lines(self) -> Iterator[str]:
+        """A table: exit codes per command and per kind of input, and how many different messages."""
+        yield f"{'':24}{'cases':>8}{'0':>8}{'1':>8}{'2':>8}{'3':>8}{'4':>8}{'texts':>8}"
+        for name, codes in sorted(self.codes.items()):
+            numbers = [sum(codes.values()), *(codes[code] for code in range(5)), len(self.texts[name])]
+            yield f"{name:24}" + "".join(f"{number:8}" for number in numbers)
+
+
 def fuzz(
-    folder: Path, seconds: float, seed: int, *, tell: Callable[[str], object] = print
+    folder: Path, seconds: float, seed: int, *, tell: Callable[[str], object] = print, most: int = 1 << 60
 ) -> Iterator[tuple[Case, str]]:
-    """Run random cases for so many seconds; yield the failing ones, made small, each reason once."""
-    fuzzer, rng = Fuzzer(folder), random.Random(seed)
-    end, number, seen = time.monotonic() + seconds, 0, set()
-    while time.monotonic() < end:
-        case = fuzzer.draw(rng)
-        why = fuzzer.run(case)
-        number += 1
-        key = (case.kind, case.command, re.sub(r"[\d\W]+", " ", why)[:40])
-        if why and key not in seen:
-            seen.add(key)
-            yield fuzzer.shrink(case), why
-    tell(f"{number} cases with seed {seed}, {len(seen)} kinds of failure")
+    """Run random cases for so many seconds, or so many; yield the failing ones, made small, each reason once."""
+    fuzzer, rng, outcomes = Fuzzer(folder), random.Random(seed), Outcomes()
+    end, seen = time.monotonic() + seconds, set()
+    while time.monotonic() < end and outcomes.count < most:
+        left = [fuzzer.draw(rng) for _ in range(GROUP)]
+        while left:
+            wrong = fuzzer.run_some(left, outcomes.add)
+            done, left = left[: len(wrong)], left[len(wrong) :]
+            case, why = done[-1], wrong[-1]
+            key = (case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60])
+            if why and key not in seen:
+                seen.add(key)
+                if fuzzer.run(case):
+                    yield fuzzer.shrink(case), why
+                else:
+                    yield case, f"only after {len(done) - 1} other cases: {why}"
+    for line in outcomes.lines():
+        tell(line)
+    tell(f"{outcomes.count} cases with seed {seed}, {len(seen)} kinds of failure")
 
 
 def load_kept(path: Path = KEPT) -> list[Case]:
     """Return the cases that failed once."""
     lines = path.read_text().splitlines() if path.exists() else []
-    return [Case(*json.loads(line)[:3]) for line in lines]
+    return [Case(*json.loads(line)[:4]) for line in lines]
 
 
 def _start() -> int:
-    import tempfile
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--cases", type=int, default=1 << 60, help="stop after so many")
+    parser.add_argument("--no-keep", action="store_true", help="print failures only")
     options = parser.parse_args()
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
-        for case, why in fuzz(Path(folder), 60 * options.minutes, options.seed):
+        for case, why in fuzz(Path(folder), 60 * options.minutes, options.seed, most=options.cases):
             failures += 1
-            print(f"{case.kind}: {' '.join(COMMANDS[case.kind][case.command])}: {why}", flush=True)
-            with open(KEPT, "a") as file:
-                file.write(json.dumps([*case, re.sub(r"/\S*/", "", why)[:100]]) + "\n")
+            line = json.dumps([*case, re.sub(r"/\S*/", "", why)[:100]])
+            print(f"{case.kind}: {case.command[:300]!r}: {why}\n    {line[:2000]}", flush=True)
+            if not options.no_keep and not why.startswith("only after"):
+                with open(KEPT, "a") as file:
+                    file.write(line + "\n")
     return failures > 0
 
 
 if __name__ == "__main__":
+    faulthandler.register(signal.SIGUSR1)
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
     sys.exit(_start())

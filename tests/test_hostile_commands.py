@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import subprocess
 import sys
 import time
 
@@ -170,3 +171,80 @@ def test_names_are_printed_without_escapes_of_the_terminal(tmp_path):
     for words in (["info"], ["check"], ["stats"], ["run", "--dry-run", "-o", str(tmp_path / "out")]):
         done = CliRunner().invoke(main, [*words, str(strip)])
         assert done.exit_code == 0 and "red \\x07\\x1b[31m" in done.stdout, words
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
+@pytest.mark.parametrize("option", ["--trajectory", "--chain", "--system", "--calibration", "--polygon", "--log-file",
+                                    "--report"])  # fmt: skip
+def test_a_pipe_without_another_end_is_refused(tmp_path, option):
+    """Each of them would wait for ever."""
+    strip, pipe = make_raw(60).write(tmp_path / "a.las"), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    words = ["run", str(strip), "-o", str(tmp_path / "out"), option, str(pipe)]
+    start = time.monotonic()
+    done = CliRunner().invoke(main, words if option == "--chain" else [*words, "--profile", "fast"])
+    assert done.exit_code in (1, 2, 4) and "pipe" in done.stderr and time.monotonic() - start < 8, done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX systems")
+def test_a_chain_can_come_through_a_pipe(tmp_path):
+    """As in --chain <(sed ... chain.toml); also from a writer that takes its time."""
+    strip, pipe = make_raw(60).write(tmp_path / "a.las"), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    code = f"import sys, time; f = open({str(pipe)!r}, 'w'); time.sleep(0.3); f.write('x'); f.flush(); time.sleep(0.3);"
+    writer = subprocess.Popen([sys.executable, "-c", f"{code} f.write('y = 1' + '#' * 200_000)"])
+    done = CliRunner().invoke(main, ["check", str(strip), "-q"])  # the command line itself is fine
+    from wavebatch.files.text_file import read_text
+
+    text = read_text(pipe, "chain file")
+    assert writer.wait() == 0 and text.startswith("xy = 1#") and len(text) == 200_006, done.output
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="a device that never ends")
+@pytest.mark.parametrize("words", ["run {a} -o {o} --chain /dev/zero", "run @/dev/zero -o {o}", "info /dev/zero",
+                                   "run {a} -o {o} --trajectory /dev/zero", "stats {a} --polygons /dev/zero"])  # fmt: skip
+def test_a_device_that_never_ends_is_no_input(tmp_path, words):
+    strip = make_raw(60).write(tmp_path / "a.las")
+    done = CliRunner().invoke(main, words.format(a=strip, o=tmp_path / "out").split())
+    assert done.exit_code in (1, 2, 4) and "device" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+
+
+def test_packets_in_a_pipe_are_refused(tmp_path):
+    strip = make_raw(60, internal=False).write(tmp_path / "a.las")
+    strip.with_suffix(".wdp").unlink()
+    os.mkfifo(strip.with_suffix(".wdp"))
+    done = CliRunner().invoke(main, ["info", str(strip)])
+    assert done.exit_code == 1 and "pipe" in done.stderr
+
+
+@pytest.mark.parametrize("text", ["a = " + "9" * 5000, "a." * 5000 + "a = 1", "a = " + "[" * 5000, "a = [", "run = 3"])
+def test_damaged_settings_are_wrong_usage(tmp_path, text):
+    """tomllib would fail in words of Python."""
+    strip = make_raw(60).write(tmp_path / "a.las")
+    (tmp_path / "wavebatch.toml").write_text(text)
+    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "out")])
+    assert done.exit_code == 2 and "wavebatch.toml" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+
+
+def test_damaged_arrays_are_one_line(tmp_path):
+    """Errors of zipfile, zlib and Python's tokenizer came through, and sizes that a damaged header claims were taken."""
+    import io
+    import zipfile
+
+    sound = io.BytesIO()
+    np.savez(sound, values=np.zeros((2, 3, 4), "f4"), time=np.arange(4.0), line=np.arange(2))
+    cube, plain = tmp_path / "cube.npz", sound.getvalue()
+    with zipfile.ZipFile(sound) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    for old, new in (
+        (b"PK\x03\x04", b"PKxx"), (b"(2, 3, 4), }", b"(2, 3, [[[, "), (b"(2, 3, 4)", b"(999999,)"), (b"<f4", b"|O "),
+        (b"'shape': (4,)", b"'shape': (-4)"), (b"(2, 3, 4), }", b"(2, 999999)}"),
+    ):  # fmt: skip
+        assert old in plain
+        with zipfile.ZipFile(cube, "w") as file:  # the checksums are right
+            for name, content in members.items():
+                file.writestr(name, content.replace(old, new))
+        if old.startswith(b"PK"):
+            cube.write_bytes(plain.replace(old, new))
+        done = CliRunner().invoke(main, ["plot", "cube", str(cube), "-o", str(tmp_path / "a.png")])
+        assert done.exit_code == 1 and "holds no cube" in done.stderr and done.stderr.count("\n") == 1, done.stderr

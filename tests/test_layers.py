@@ -15,8 +15,8 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"}, {"explain", "neighbour_pass"},
-        {"report_file"},
+        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"},
+        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"},
         {"strip_task", "processes", "dask_cluster"}, {"preflight"}, {"run"},
     ],
     "surveying": [

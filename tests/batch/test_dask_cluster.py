@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -25,11 +26,12 @@ _SCHEDULER = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
 class Dask:
     """A scheduler and its workers, as processes of their own in a folder of their own."""
 
-    def __init__(self, folder):
-        self.folder, self.processes = folder, []
+    def __init__(self, folder, *more, **env):
+        """more: options of the scheduler; env: variables of all processes."""
+        self.folder, self.processes, self._env = folder, [], env
         file = folder / "scheduler.json"
         self.scheduler = self._start(
-            *_SCHEDULER, "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file)
+            *_SCHEDULER, "--port", "0", "--no-dashboard", "--host", "127.0.0.1", "--scheduler-file", str(file), *more
         )
         self.wait_until(lambda: file.exists() and file.stat().st_size)
         self.address = json.loads(file.read_text())["address"]
@@ -43,7 +45,7 @@ class Dask:
 
     def _start(self, *command, **env):
         with open(self.folder / f"log{len(self.processes)}", "wb") as log:
-            process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env={**os.environ, **env})
+            process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env={**os.environ, **self._env, **env})
         self.processes.append(process)
         return process
 
@@ -322,3 +324,31 @@ def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path, strip
     (event,) = events
     assert event["event"] == "worker" and "another kind of processor" in event["warning"]
     assert event["warning"].endswith("it gets no work")
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="makes a key")
+def test_a_cluster_with_tls_writes_the_same_bytes(tmp_path, strips):
+    """With the keys in dask's variables, as the documentation has it."""
+    key, pem = tmp_path / "key.pem", tmp_path / "cert.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-keyout", key, "-out", pem, "-days", "2",
+         "-subj", "/CN=wavebatch"], check=True, capture_output=True,
+    )  # fmt: skip
+    start = "DASK_DISTRIBUTED__COMM__TLS__"
+    keys = {f"{start}{who}__{what}": str(path) for who in ("SCHEDULER", "WORKER", "CLIENT")
+            for what, path in (("CERT", pem), ("KEY", key))}  # fmt: skip
+    keys[f"{start}CA_FILE"] = str(pem)
+    cluster = Dask(tmp_path, "--protocol", "tls", **keys)
+    command = [sys.executable, "-m", "wavebatch", "run", str(strips / "a.las"), "--profile", "fast", "-q"]
+    try:
+        assert cluster.address.startswith("tls://")
+        cluster.start_worker()
+        far = [*command, "-o", str(tmp_path / "far"), "--scheduler", cluster.address]
+        done = subprocess.run(far, env={**os.environ, **keys}, capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        refused = subprocess.run(far, capture_output=True, text=True, timeout=60)
+        assert refused.returncode == 2 and refused.stderr.count("\n") == 1, refused.stderr
+    finally:
+        cluster.stop()
+    subprocess.run([*command, "-o", str(tmp_path / "near")], check=True)
+    assert (tmp_path / "far" / "a.laz").read_bytes() == (tmp_path / "near" / "a.laz").read_bytes()

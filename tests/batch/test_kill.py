@@ -70,6 +70,14 @@ def _is_alive(pid):
         return False
 
 
+def _is_tracker(pid):
+    try:
+        with open(f"/proc/{pid}/cmdline", "rb") as file:
+            return b"resource_tracker" in file.read()
+    except OSError:
+        return False
+
+
 @pytest.mark.parametrize(("jobs", "pattern"), [("1", "a.report.json"), ("2", DRAFT)])
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, jobs, pattern):
     process = subprocess.Popen(_command(strips, tmp_path, "--jobs", jobs))
@@ -95,14 +103,21 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
-def test_workers_die_with_their_parent(strips, tmp_path):
+@pytest.mark.parametrize("stopped", [False, True])
+def test_workers_die_with_their_parent(strips, tmp_path, stopped):
+    """Also those that are stopped, and cannot see that it is dead."""
     process = subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"))
     _wait_for(tmp_path, DRAFT, process)
     children = _children(process.pid)
     assert children
+    time.sleep(0.5)  # workers have begun
+    if stopped:
+        for child in children:
+            os.kill(child, signal.SIGSTOP)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    deadline = time.monotonic() + 60
+    children = [child for child in children if not _is_tracker(child)]  # it ends when all others have
+    deadline = time.monotonic() + 20
     while any(_is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)

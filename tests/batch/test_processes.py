@@ -1,8 +1,10 @@
 """Worker processes that are killed or stopped at the worst instants: the parent process never waits for them."""
 
+import functools
 import multiprocessing.connection
 import os
 import signal
+import subprocess
 import sys
 import time
 
@@ -92,3 +94,53 @@ def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
             workers.wait([future for future in futures if not future.done()])
         assert time.monotonic() - start < 12
         assert all(isinstance(future.exception(), WorkerDied) for future in futures)
+
+
+_INTERRUPTED = """
+import os, signal, sys, threading, time
+sys.path.insert(0, {tests!r})
+from test_processes import square, stop_later
+from wavebatch.batch.processes import Workers
+from wavebatch.core.interrupts import guard
+
+def interrupt(join=None):
+    os.kill(os.getpid(), signal.SIGINT)
+
+def command():
+    with Workers(2) as workers:
+        workers.wait([workers.submit(stop_later)])
+        workers.wait([workers.submit(square, 5)])
+        time.sleep(1)
+        if {early}:
+            workers._end = interrupt
+        else:
+            threading.Timer(0.5, interrupt).start()
+
+if __name__ == "__main__":
+    guard(command)
+"""
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, early):
+    """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""
+    script = tmp_path / "interrupted.py"
+    script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr
+
+
+def die_elsewhere(parent, number):
+    if os.getpid() != parent and number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def test_map_gives_results_in_order_and_makes_calls_itself_that_kill_a_process():
+    with Workers(2) as workers:
+        call = functools.partial(die_elsewhere, os.getpid())
+        assert list(workers.map(call, range(12))) == [number**2 for number in range(12)]
+        with pytest.raises(ValueError, match="bad 0"):
+            list(workers.map(raise_error, range(3)))
+    with Workers(1) as workers:
+        assert list(workers.map(square, range(3))) == [0, 1, 4]

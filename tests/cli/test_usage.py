@@ -77,3 +77,12 @@ def test_options_that_commands_share_have_one_name():
             for flag in set(option.opts) & set(short):
                 assert short[flag] in option.opts, f"{name}: {option.opts}"
             assert all(opt.startswith("--") or opt in short for opt in option.opts), f"{name}: {option.opts}"
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e999"])
+def test_numbers_of_options_must_be_finite(value):
+    """NaN passes every limit: it is neither below nor above."""
+    for words in (["run", "a.las", "-o", "x", "--attenuation"], ["plot", "section", "a.las", "-o", "x", "--aspect"],
+                  ["stats", "a.las", "--area"], ["simulate", "flat", "-o", "x", "--noise"]):  # fmt: skip
+        done = CliRunner().invoke(main, [*words, value])
+        assert done.exit_code == 2 and "is not" in done.stderr and done.stderr.count("\n") == 1, done.stderr

@@ -74,6 +74,10 @@ class Cluster:
     """
 
     is_remote = True
+    compresses = False
+    """Whether workers compress chunks: here rows would travel back to them."""
+    memory = None
+    """Folder of memory that processes share: those of other machines do not."""
 
     def __init__(
         self,
@@ -115,6 +119,10 @@ class Cluster:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
         return _Promise(functools.partial(self._send, call), self._translate, self._put_aside)
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        """Yield `function(item)` of every item, in this process: short calls are slower on another machine."""
+        return map(function, items)
 
     def _send(self, call: bytes) -> Any:
         """Give the pickled call to a worker; the remote future."""

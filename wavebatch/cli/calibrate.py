@@ -14,6 +14,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
@@ -99,7 +100,7 @@ def calibrate(
         talk(line)
     for note in found.notes:
         talk(f"warning: {note}")
-    numbers = f"constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %"
+    numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
     talk(f"{output}: {numbers}; {found.conditions}")
@@ -134,8 +135,9 @@ def _list_report(flight: FlightCalibration) -> dict[str, Any]:
 
 
 def _describe_strip(row: StripConstant) -> str:
+    constant = format_relative(row.constant, row.relative_error)
     return (
-        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {row.constant:.4g} +- "
+        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {constant} +- "
         f"{100 * row.relative_error:.1f} %, drift {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} %, "
         f"{count(row.ties, 'tie cell')}"
     )
@@ -160,7 +162,8 @@ def _describe_target(target: TargetResult) -> str:
 
 def _describe_channel(channel: ChannelConstant) -> str:
     name = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
-    constant = f"constant {channel.constant:.4g} +- {100 * channel.relative_error:.1f} %"
+    value = format_relative(channel.constant, channel.relative_error)
+    constant = f"constant {value} +- {100 * channel.relative_error:.1f} %"
     if not channel.echoes:
         return f"{name}: no target, by overlap, {constant}"
     scatter = f"spread {100 * channel.spread:.1f} %, from shot to shot {100 * channel.shot_energy:.1f} %"

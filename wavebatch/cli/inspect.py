@@ -5,6 +5,7 @@ Only prints; the facts come from `wavebatch.surveying.inspect_strip`.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -156,8 +157,9 @@ def _point_lines(facts: dict[str, Any]) -> Iterator[str]:
         if bounds:
             step, given = facts["scales"][axis], facts["header_bounds"]
             low, high = bounds["least"][axis], bounds["largest"][axis]
-            wrong = max(abs(given["least"][axis] - low), abs(given["largest"][axis] - high)) > 1.5 * abs(step)
-            said = f"; the header says {given['least'][axis]:.3f} to {given['largest'][axis]:.3f}" if wrong else ""
+            ends = [math.nan if end is None else end for end in (given["least"][axis], given["largest"][axis])]
+            right = max(abs(ends[0] - low), abs(ends[1] - high)) <= 1.5 * abs(step)  # False for NaN
+            said = "" if right else f"; the header says {ends[0]:.3f} to {ends[1]:.3f}"
             yield f"{name}              {low:.3f} to {high:.3f}, steps of {step:g}{said}"
     if time:
         dates = f", {' to '.join(time['dates_gps'])} GPS" if "dates_gps" in time else ""

@@ -160,19 +160,31 @@ def run(**options: Any) -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     _check_options(options)
-    jobs, batch_options = _plan(options)
-    if options["report"] not in (None, "-"):
-        _check_report(Path(options["report"]), jobs, batch_options)
-    if options["html_file"] is not None:
-        _check_report(options["html_file"], jobs, batch_options, "--html")
-        check_html(options["html_file"])
-    if options["dry_run"]:
-        sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
     try:
+        _start_processes(options)
+        jobs, batch_options = _plan(options)
+        if options["report"] not in (None, "-"):
+            _check_report(Path(options["report"]), jobs, batch_options)
+        if options["html_file"] is not None:
+            _check_report(options["html_file"], jobs, batch_options, "--html")
+            check_html(options["html_file"])
+        if options["dry_run"]:
+            sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise Interrupted(text) from None
+
+
+def _start_processes(options: dict[str, Any]) -> None:
+    """Start the worker processes that will surely be needed, before this process imports what it needs itself."""
+    jobs = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
+    # A limit of memory may allow fewer processes, and resume may find nothing to do.
+    if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
+        from wavebatch.batch.processes import end_early, start_early
+
+        click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
+        start_early(jobs)
 
 
 def _check_options(options: dict[str, Any]) -> None:

@@ -21,6 +21,9 @@ ADJUSTED = 1e9
 LONGEST_GAP = 1.0
 """Gaps between two positions up to this are always bridged [s]."""
 
+FARTHEST, LATEST = 1e9, 1e12
+"""Largest coordinate [m] and time [s] of a position; damaged files have larger ones, whose squares overflow."""
+
 GAP_STEPS = 5.0
 """Gaps up to this many usual steps are bridged too."""
 
@@ -42,7 +45,7 @@ class Trajectory:
     def build(
         cls, time: np.ndarray, xyz: np.ndarray, velocity: np.ndarray | None = None, gap: float | None = None
     ) -> Trajectory:
-        """A trajectory from positions in any order; rows with NaN and repeated times are dropped.
+        """A trajectory from positions in any order; rows with NaN, beyond all times and places, and repeated times are dropped.
 
         Parameters
         ----------
@@ -61,7 +64,8 @@ class Trajectory:
             There are fewer than two different times with positions.
         """
         time, xyz = np.asarray(time, np.float64), np.asarray(xyz, np.float64)
-        good = np.flatnonzero(np.isfinite(time) & np.isfinite(xyz).all(axis=1))
+        near = (np.abs(xyz) <= FARTHEST).all(axis=1)  # False for NaN
+        good = np.flatnonzero((np.abs(time) <= LATEST) & near)
         _, first = np.unique(time[good], return_index=True)
         rows = good[first]
         if len(rows) < 2:

@@ -17,9 +17,12 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.area_crs import AreaFile, place_rings, read_area_file
 from wavebatch.files.las.header import LasHeader
-from wavebatch.files.text_file import read_text
+from wavebatch.files.text_file import MOST_LIST, read_text
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
+
+FARTHEST = 1e12
+"""Largest coordinate of a corner; squares and products of larger ones overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,10 +76,10 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     Raises ConfigError if the file cannot be read or holds anything else.
     """
     polygons = []
-    features, file = read_features(read_text(path, "polygon file", 1 << 30), path)
+    features, file = read_features(read_text(path, "polygon file", MOST_LIST), path)
     for number, (properties, rings) in enumerate(features, 1):
         for ring in rings:
-            if len(ring) < 3 or not np.isfinite(ring).all():
+            if len(ring) < 3 or not (np.abs(ring) <= FARTHEST).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")
         polygons.append(Polygon(str(properties.get("name") or number), tuple(rings), file))
     if not polygons:

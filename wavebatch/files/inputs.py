@@ -12,7 +12,7 @@ from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protect
-from wavebatch.files.text_file import read_text
+from wavebatch.files.text_file import MOST_LIST, read_text
 
 SUFFIXES = (".las", ".laz")
 
@@ -102,7 +102,7 @@ def _is_strip(path: Path) -> bool:
 def _read_list(path: Path, recursive: bool) -> Iterator[Path]:
     protect([path])
     empty = True
-    for number, line in enumerate(read_text(path, "the list", 1 << 30).splitlines(), 1):
+    for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):
             if entry.startswith("@"):

@@ -28,6 +28,9 @@ LEAST_KNOWN = 0.5
 NEAR = 0.3
 """A pulse has the energy logged at most this share of the usual interval of the log before or after it."""
 
+LARGEST = 1e30
+"""Energies from here on count as unknown: their squares overflow, and no unit is so small."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PulseEnergy:
@@ -59,7 +62,7 @@ class PulseEnergy:
         if self.field is not None:
             stored = points[self.field]
             values = stored.astype(np.float64) * self.scaling[0] + self.scaling[1]
-            known = np.isfinite(values) & (values > 0) & (True if self.empty is None else stored != self.empty)
+            known = (values < LARGEST) & (values > 0) & (True if self.empty is None else stored != self.empty)
             return np.where(known, values, np.nan)
         time = points["gps_time"].astype(np.float64)
         after = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
@@ -165,7 +168,7 @@ def _parse(lines: Iterable[str], name: str) -> tuple[np.ndarray, np.ndarray]:
     except (IndexError, ValueError) as error:
         raise InputError(f"{name}: a row has no number for time or energy: {error}") from error
     time, energy = columns
-    good = np.isfinite(time) & np.isfinite(energy) & (energy > 0)
+    good = np.isfinite(time) & (energy < LARGEST) & (energy > 0)
     if np.count_nonzero(good) < 2:
         raise InputError(f"{name}: fewer than two rows have a time and a positive energy")
     return time[good], energy[good]

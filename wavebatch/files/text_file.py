@@ -5,13 +5,24 @@ Chain, system and calibration files, lists of strips and reports use it. Large o
 
 from __future__ import annotations
 
+import io
+import os
+import stat
+import time
 from pathlib import Path
+from typing import BinaryIO
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import Draft, is_stream, open_stream, reporting
 
 MOST_BYTES = 4 << 20
 """Largest TOML file that is read: five times a system file with 255 digitizers of 16 Gaussians each."""
+
+MOST_LIST = 64 << 20
+"""Largest list, polygon or target file that is read: a million names or corners."""
+
+_PATIENCE = 2.0
+"""Seconds in which something must write into a pipe that is read."""
 
 
 def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
@@ -21,16 +32,66 @@ def read_text(path: Path | str, what: str, most: int = MOST_BYTES) -> str:
     Raises ConfigError where the file cannot be read, is too large or is not UTF-8 text.
     """
     try:
-        with open(path, "rb") as file:
+        with _open(path) as file:
             data = file.read(most + 1)
-    except OSError as error:
-        raise ConfigError(f"{path}: {what} cannot be read: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{path}: {what} cannot be read: {why}") from error
     if len(data) > most:
         raise ConfigError(f"{path}: {what} is larger than {most >> 20} MiB; name another file")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: {what} is not UTF-8 text (byte {error.start})") from error
+
+
+def _open(path: Path | str) -> BinaryIO:
+    """Open a file or a pipe for reading; OSError for devices, which may never end, and pipes that nothing writes to."""
+    mode = os.stat(path).st_mode
+    if stat.S_ISREG(mode) or stat.S_ISDIR(mode):
+        return open(path, "rb")
+    if not stat.S_ISFIFO(mode):
+        raise OSError("it is a device; give a file")
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else this would wait for a writer, for ever
+    file = os.fdopen(descriptor, "rb")
+    try:
+        begin = _read_first(descriptor)
+    except BaseException:
+        file.close()
+        raise
+    os.set_blocking(descriptor, True)
+    return _Pipe(file, begin)
+
+
+def _read_first(descriptor: int) -> bytes:
+    """The first bytes of a pipe, empty where its writer is there but slow; OSError where nothing comes."""
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            begin = os.read(descriptor, 1 << 16)
+        except BlockingIOError:
+            return b""
+        if begin:
+            return begin
+        if time.monotonic() > deadline:
+            raise OSError("nothing writes into this pipe")
+        time.sleep(0.01)
+
+
+class _Pipe(io.RawIOBase):
+    """A pipe, of which some bytes are read already."""
+
+    def __init__(self, file: BinaryIO, begin: bytes) -> None:
+        self._file, self._begin = file, begin
+
+    def read(self, size: int = -1) -> bytes:
+        """Return at most so many bytes."""
+        return self._begin + self._file.read(size - len(self._begin))
+
+    def close(self) -> None:
+        """Close the pipe."""
+        self._file.close()
+        super().close()
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
-from wavebatch.files.disk.raw_bytes import reporting_reads
+from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 
 SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",
@@ -64,7 +64,7 @@ def read_trajectory(
         If the file cannot be read or does not have what is needed.
     """
     path = Path(path)
-    with reporting_reads(path, "trajectory "), open(path, "rb") as file:
+    with reporting_reads(path, "trajectory "), open_regular(path) as file:
         size, head = path.stat().st_size, file.read(4096)
     if size and size % SBET_RECORD.itemsize == 0 and b"\0" in head:
         columns = _read_sbet(path, size)

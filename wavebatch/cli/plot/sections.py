@@ -49,6 +49,9 @@ def _read_line(context: click.Context, parameter: click.Parameter, text: str | N
 
 def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
     """Clouds, or one file of voxels."""
+    segments = [path for path in clouds if path.suffix.lower() in (".csv", ".geojson")]
+    if segments:
+        raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
     voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
     if voxels and len(clouds) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
@@ -75,7 +78,8 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """Draw a side view of CLOUDs or voxels along a line.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
-    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn.
+    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn. The few points
+    that lie far above or below all others are left out and counted as outside.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
@@ -90,9 +94,12 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     if not options["quiet"]:
         kind = count(found.inside, "voxel" if found.voxel else "point")
-        talk(f"{output}: {kind} of {found.total.values}, {found.total.no_data} without data{_left_out(found.total)}")
+        far = f", {found.outside} outside" if found.outside else ""
+        text = f"{kind} of {found.total.values}, {found.total.no_data} without data{far}"
+        talk(f"{output}: {text}{_left_out(found.total)}")
     if options["as_json"]:
         place = {"line": list(found.line), "width": found.width, "unit": found.unit, "crs": found.crs or None}
+        place |= {"outside": found.outside}
         more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
         print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more})
 
@@ -110,26 +117,36 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
 @shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def profile(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
-    """Draw how many points, or how much of a column, of CLOUDs or voxels lie at each height.
+    """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
-    voxelize`. Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
+    voxelize`; or .csv or .geojson files of `wavebatch slice`, whose segments count in each bin by the share of their
+    height there (columns: length, slope, residual, pulses, weight). Heights are those of the coordinates, not above
+    ground. Far outliers in height are left out and counted.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import measure_profile
+    from wavebatch.tools.slices.read_segments import check_alone, is_segments, profile_segments
 
-    paths = _find(clouds, options)
-    check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    found = measure_profile(paths, select(column, options), statistic, **how)
+    segments = any(map(is_segments, clouds))
+    if segments:
+        check_alone(clouds, options)
+    paths = list(dict.fromkeys(clouds)) if segments else _find(clouds, options)
+    check_picture(output, overwrite=options["overwrite"])
+    if segments:
+        found = profile_segments(paths, column, statistic, **how)
+    else:
+        found = measure_profile(paths, select(column, options), statistic, **how)
     from wavebatch.tools.plots.draw_section import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
     if not options["quiet"]:
         total = found.total
-        text = f"{count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside"
+        kind = "segment" if segments else "value"
+        text = f"{count(total.values, kind)}, {total.no_data} without data, {found.outside} outside"
         talk(f"{output}: {text}{_left_out(total)}")
     if options["as_json"]:
         series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]

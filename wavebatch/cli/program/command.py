@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,6 +13,9 @@ import click
 
 from wavebatch.cli.program.examples import EXAMPLES, FEWEST, GROUPS
 from wavebatch.cli.program.settings import find_settings
+
+MAYBE_NAN = ("no_data",)
+"""Options whose number may be NaN."""
 
 
 class ProgramCommand(click.Command):
@@ -29,6 +33,16 @@ class ProgramCommand(click.Command):
         context = super().make_context(info_name, args, parent, **{**extra, "default_map": settings.values})
         settings.tell(context)
         return context
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parses the arguments; numbers must be finite, because no limit of an option holds for NaN."""
+        rest = super().parse_args(ctx, args)
+        for option in self.params:
+            value = ctx.params.get(option.name or "")
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number) and option.name not in MAYBE_NAN:
+                    raise click.BadParameter(f"{number} is not a finite number.", ctx, option)
+        return rest
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the options by group, then the examples."""

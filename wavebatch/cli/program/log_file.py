@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import os
 import re
 import shlex
+import stat
 import sys
 from pathlib import Path
 from typing import IO
@@ -36,8 +38,11 @@ def open_log(path: Path, level: str, command: str) -> None:
     close_log()
     begin = b""
     try:
-        with contextlib.suppress(FileNotFoundError), open(path, "rb") as old:
-            begin = old.read(20)
+        if os.path.isfile(path):
+            with open(path, "rb") as old:
+                begin = old.read(20)
+        elif stat.S_ISFIFO(_mode(path)):  # opening it would wait for a reader, for ever
+            raise ConfigError(f"--log-file: {path} is a pipe; choose a file")
         if begin and not re.fullmatch(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", begin):
             raise ConfigError(f"--log-file: {path} exists and is no log; choose another name")
         file = open(path, "a", encoding="utf-8", errors="backslashreplace", buffering=1)  # noqa: SIM115
@@ -45,6 +50,13 @@ def open_log(path: Path, level: str, command: str) -> None:
         raise ConfigError(f"--log-file: {path}: cannot be written: {error.strerror or error}") from error
     _log = file, LEVELS.index(level)
     log(f"wavebatch {__version__}: {command}")
+
+
+def _mode(path: Path) -> int:
+    try:
+        return os.stat(path).st_mode
+    except FileNotFoundError:
+        return 0
 
 
 def close_log() -> None:

@@ -122,16 +122,14 @@ def _folder(word: str) -> Path:
 
 def _read_file(path: Path, command: click.Command, options: Mapping[str, click.Option]) -> dict[str, Any]:
     """Values of the command's table in the file, by name of the parameter; ConfigError becomes wrong usage."""
-    import tomllib
-
     from wavebatch.core.suggest import nearest
     from wavebatch.files.text_file import read_text
+    from wavebatch.files.toml_file import parse_toml
 
     try:
-        document = tomllib.loads(read_text(path, "settings file"))
-    except (ConfigError, tomllib.TOMLDecodeError) as error:
-        raise click.UsageError(f"{path}: {error}" if isinstance(error, ValueError) else str(error)) from error
-    table: Any = document
+        table: Any = parse_toml(read_text(path, "settings file"), str(path)).values
+    except ConfigError as error:
+        raise click.UsageError(str(error)) from error
     for part in _title(command).split():
         table = table.get(part, {}) if isinstance(table, dict) else {}
     if not isinstance(table, dict):

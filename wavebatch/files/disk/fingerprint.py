@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from wavebatch.files.disk.raw_bytes import reporting_reads
+from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 
 _ENDS = 1 << 20
 _PIECE = 1 << 14
@@ -29,7 +29,7 @@ def take_fingerprint(path: Path, packet_file: Path | None = None) -> dict[str, A
 
 
 def _sample(path: Path) -> dict[str, Any]:
-    with reporting_reads(path), open(path, "rb") as file:
+    with reporting_reads(path), open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         digest = hashlib.sha256(size.to_bytes(8, "little"))
         digest.update(file.read(_ENDS))

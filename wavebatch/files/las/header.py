@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from laspy import PointFormat
-
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, reporting_reads
+from wavebatch.files.point_dtypes import STANDARD_DTYPES as STANDARD_DTYPES
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}
 """Bytes of the header by LAS version."""
@@ -33,9 +32,6 @@ MAX_FILE = 1 << 54
 WAVES_INTERNAL = 0b10
 WAVES_EXTERNAL = 0b100
 WKT_BIT = 0b1_0000
-
-STANDARD_DTYPES = {number: PointFormat(number).dtype() for number in range(11)}
-"""Record of every point format without extra bytes; fields have the names of laspy's raw arrays."""
 
 EVLR_HEADER_SIZE = 60
 MAX_EVLRS = 4096

@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
-from wavebatch.files.disk.raw_bytes import damaged, read_exactly, reporting_reads
+from wavebatch.files.disk.raw_bytes import damaged, open_regular, read_exactly, reporting_reads
 from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
@@ -153,7 +153,7 @@ def _locate_internal(checked: CheckedHeader) -> PacketPlace:
 
 def _locate_external(checked: CheckedHeader, packet_file: Path, headerless: bool) -> PacketPlace:
     size = packet_file.stat().st_size
-    with open(packet_file, "rb") as file:
+    with open_regular(packet_file) as file:
         head = file.read(EVLR_HEADER_SIZE)
     warnings = []
     if len(head) < EVLR_HEADER_SIZE or not head[2:].startswith(b"LAS") or head[18:20] != b"\xff\xff":

@@ -132,7 +132,8 @@ def _read_strip(
         header = source.reader.facts.header
         targets = [target.place(path, header) for target in targets]
         seen = see_channels(source.reader, source.scan)
-        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen)
+        known = source.reader.facts.digitizers  # points may name others: they have no waveform
+        channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen if digitizer in known)
         others = [box for i, box in enumerate(boxes) if i != number]
         area = _TieArea(
             boxes[number], boxes[0][0], [boxes[number]] if len(channels) > 1 else others, source.scan.packets

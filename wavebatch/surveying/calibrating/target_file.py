@@ -16,12 +16,16 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.area_crs import AreaFile, place_rings
-from wavebatch.files.geojson import find_inside, read_features
+from wavebatch.files.geojson import FARTHEST, find_inside, read_features
 from wavebatch.files.las.header import LasHeader
-from wavebatch.files.text_file import read_text
+from wavebatch.files.text_file import MOST_LIST, read_text
 
 _CORNERS = 64
 """Corners of the polygon that stands for a circle."""
+
+
+LEAST_REFLECTANCE = 1e-6
+"""Of a target: the blackest coatings reflect 100 times as much."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +80,7 @@ def load_targets(path: Path | str) -> list[Target]:
     ConfigError
         In one line, where the file cannot be read, is empty or holds a wrong target.
     """
-    text = read_text(path, "target file", 1 << 30)
+    text = read_text(path, "target file", MOST_LIST)
     lines = io.StringIO(text, newline=None)
     file = None
     try:
@@ -121,8 +125,8 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
         ) from error
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
-    if not 0 < reflectance <= 1.5 or len(corners) < 3 or not np.isfinite(corners).all():
-        raise ConfigError(f"{where}: reflectance must lie in 0 to 1.5, and the outline needs three corners")
+    if not LEAST_REFLECTANCE <= reflectance <= 1.5 or len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
+        raise ConfigError(f"{where}: reflectance must lie in 0 to 1.5 and above {LEAST_REFLECTANCE:g}, and the outline needs three corners")
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
     return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import struct
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -19,6 +17,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.disk.npz_reader import read_header, read_text, reading_npz
 
 ECHO_COLUMNS: dict[str, str] = {
     "waveform": "<u8",
@@ -48,10 +47,10 @@ _META = "meta"
 _PIECE = 1 << 18
 _MOST_TEXT = 4 << 20
 """Most bytes of the description: it takes a few hundred."""
-_DAMAGED = (
-    zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, KeyError, RuntimeError, OverflowError,
-)  # fmt: skip
-"""What zipfile, NumPy and JSON raise for damaged archives; RuntimeError for encrypted and unknown members."""
+
+
+_LARGEST = 1e30
+"""Largest value that is taken for a true one; sums and squares of larger ones overflow."""
 
 
 class TruthWriter(NpzWriter):
@@ -68,6 +67,15 @@ class TruthWriter(NpzWriter):
         super().publish({_META: json.dumps(meta, sort_keys=True)})
 
 
+def _check_meta(meta: Any) -> dict[str, Any]:
+    """The description, if it has the numbers that comparisons need; else ValueError."""
+    for key, least, most in (("noise_std", 0.0, 1e9), ("spacing", 1e-6, 1e6), ("packets", 0, 1 << 40)):
+        value = meta[key]
+        if type(value) not in (int, float) or not least <= value <= most:
+            raise ValueError(f"{key} of its description is {str(value)[:40]}")
+    return meta
+
+
 class TruthReader(Closing):
     """Reads a truth file; raises InputError when `path` is none."""
 
@@ -80,28 +88,16 @@ class TruthReader(Closing):
             if lacking:
                 raise InputError(f"{self.path}: no truth file of wavebatch simulate: lacks {', '.join(lacking)}")
             with self._archive.open(f"{_META}.npy") as member:
-                self.meta: dict[str, Any] = json.loads(self._read_text(member))
+                self.meta: dict[str, Any] = _check_meta(json.loads(self._read_text(member)))
 
-    @contextlib.contextmanager
-    def _reading(self) -> Iterator[None]:
-        """Turn what damaged archives raise into one InputError line."""
-        try:
-            yield
-        except InputError:
-            raise
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be read: {error.strerror or error}; check the name") from error
-        except _DAMAGED as error:
-            raise InputError(
-                f"{self.path}: no truth file of wavebatch simulate, or damaged: {error}; simulate the strip again"
-            ) from error
+    def _reading(self) -> contextlib.AbstractContextManager[None]:
+        return reading_npz(self.path, "truth file of `wavebatch simulate`", "simulate the strip again")
 
     def _read_text(self, member: IO[bytes]) -> str:
-        np.lib.format.read_magic(member)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        shape, _, dtype = read_header(member)
         if shape or dtype.kind != "U" or dtype.itemsize > _MOST_TEXT:
             raise InputError(f"{self.path}: its description is {dtype}, no text; simulate the strip again")
-        return str(np.frombuffer(member.read(dtype.itemsize), dtype)[0])
+        return read_text(member.read(dtype.itemsize), dtype)
 
     def close(self) -> None:
         """Closes the file."""
@@ -127,8 +123,7 @@ class TruthReader(Closing):
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in names}
 
     def _read_length(self, name: str, member: IO[bytes]) -> int:
-        np.lib.format.read_magic(member)
-        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        shape, _, dtype = read_header(member)
         if dtype != np.dtype(_DTYPES[name]) or len(shape) != 1:
             raise InputError(f"{self.path}: column {name} is {dtype}, not {_DTYPES[name]}; simulate the strip again")
         return shape[0]
@@ -138,4 +133,7 @@ class TruthReader(Closing):
         data = member.read(rows * dtype.itemsize)
         if len(data) != rows * dtype.itemsize:
             raise InputError(f"{self.path}: ends too early; simulate the strip again")
-        return np.frombuffer(data, dtype)
+        values = np.frombuffer(data, dtype)
+        if dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
+            raise InputError(f"{self.path}: column {name} holds {np.nanmax(np.abs(values)):g}; simulate the strip again")
+        return values

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.disk.npz_reader import read_npz
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.tools.slices.lines import ScanLine
 
@@ -102,6 +103,9 @@ def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
     start = np.where(known, depth / np.where(known, speed, 1.0), 0.0)
     return np.split(start, np.cumsum([len(line) for line in lines])[:-1])
 
+_LARGEST = 1e30
+"""Largest time [ns] and sample [DN]; damaged files have larger ones."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CubeSlice:
@@ -124,13 +128,13 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
 
     Raises InputError for a file that holds no cube, ConfigError for a slice outside of it.
     """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            values, time, number = (data[name] for name in ("values", "time", "line"))
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path}: holds no cube of `wavebatch slice --cube` ({error})") from error
-    if values.ndim != 3 or not values.size or values.shape[2] != len(time) or values.shape[0] != len(number):
-        raise InputError(f"{path}: holds no cube of `wavebatch slice --cube`: its arrays do not fit")
+    what = "cube of `wavebatch slice --cube`"
+    names = {"values": ("f", 3), "time": ("f", 1), "line": ("iu", 1)}
+    values, time, number = read_npz(path, names, what, "make it again").values()
+    if not values.size or values.shape[2] != len(time) or values.shape[0] != len(number):
+        raise InputError(f"{path}: holds no {what}: its arrays do not fit")
+    if not (np.abs(time) < _LARGEST).all() or (np.abs(values) > _LARGEST).any() or not np.isfinite(values).any() or (len(time) > 1 and not time[0] < time[1]):
+        raise InputError(f"{path}: holds no {what}: its times do not ascend, or its values are none; make it again")
     spacing = float(time[1] - time[0]) if len(time) > 1 else 1.0
     if all(value is None for value in wanted.values()):
         peak = int(np.nanargmax(np.nansum(values, axis=(0, 1))))

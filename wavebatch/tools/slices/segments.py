@@ -115,7 +115,7 @@ class Segment:
 
 def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
     """The slice of a scan line."""
-    limit = options.std * float(line.value.std(dtype=np.float64))
+    limit = np.float64(options.std) * line.value.std(dtype=np.float64)  # no float32 holds the largest --std
     roi = line.value > limit
     zero, start = np.zeros(3), np.zeros(len(line))
     if options.geometry == "time":

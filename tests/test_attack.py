@@ -1,0 +1,73 @@
+"""The attacker of `tests/attacking.py`: it sees what it looks for, and some attacks break no promise."""
+
+import os
+import re
+import signal
+import sys
+import textwrap
+
+import attacking
+import pytest
+from attacking import Attack, Attacker
+
+pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at processes through /proc")
+
+
+@pytest.fixture(scope="module")
+def attacker(tmp_path_factory):
+    return Attacker(tmp_path_factory.mktemp("attack"))
+
+
+def _plant(attacker, monkeypatch, code):
+    """A program in place of `survey`; undisturbed it writes `a.toml` after half a second."""
+    program = f"""
+        import os, pathlib, signal, subprocess, sys, time
+        out = pathlib.Path(sys.argv[-1]); out.mkdir(exist_ok=True)
+        signal.signal(signal.SIGTERM, lambda *_: None)
+        {code}
+    """
+    words = [sys.executable, "-c", textwrap.dedent(program), "spawn_main", str(attacker._folder / "out")]
+    monkeypatch.setattr(attacking.subprocess, "Popen", lambda _, **how: _POPEN(words, **how))
+    monkeypatch.setattr(attacker, "sound", {"survey": {"a.toml": b"whole"}})
+    monkeypatch.setattr(attacker, "seconds", {"survey": 1.0})
+
+
+_POPEN = attacking.subprocess.Popen
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("sys.exit(7)", "exit code 7"),
+        ("time.sleep(6), time.sleep(6)", "hangs"),
+        ("(out / 'a.toml').write_text('who'); sys.exit(130)", "not `interrupted`"),
+        ("(out / 'a.toml').write_text('who'); print('interrupted', file=sys.stderr); sys.exit(130)", "is not that of"),
+        ("(out / '.x.tmp').write_text(''); print('interrupted', file=sys.stderr); sys.exit(130)", "leaves"),
+        ("print('interrupted', file=sys.stderr); open(os.environ['TMPDIR'] + '/x', 'w'); sys.exit(130)", "in TMPDIR"),
+        ("sys.exit(0)", "missing"),
+        ("subprocess.Popen(['sleep', '60'], stderr=subprocess.DEVNULL); (out / 'a.toml').write_text('whole')", "stay"),
+        ("(out / 'a.toml').write_text('whole')", "cannot be run again|other bytes"),
+    ],
+)
+def test_the_attacker_sees_every_kind_of_failure(attacker, monkeypatch, code, why):
+    monkeypatch.setattr(attacking, "LONGEST", 3.0)
+    monkeypatch.setattr(attacking, "STAY", 1.0)
+    _plant(attacker, monkeypatch, code)
+    assert re.search(why, attacker.attack(Attack("survey", "TERM", 0.3)))
+
+
+@pytest.mark.slow
+def test_attacks_break_no_promise(tmp_path):
+    seed = int(os.environ.get("FUZZ_SEED", "1"))
+    assert list(attacking.attack_all(tmp_path, 25, seed)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", attacking.ATTACKS)
+def test_every_kind_of_attack_on_a_batch(attacker, kind):
+    for name, share in (("run, neighbours", 0.7), ("run, flight", 0.5)):
+        assert attacker.attack(Attack(name, kind, share)) == ""
+
+
+def test_attacks_are_those_of_the_document():
+    assert {signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL} == set().union(*attacking.SIGNALS.values())
