@@ -245,7 +245,7 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
             inner += [format_picture(*one) for one in drawn]
             parts.append(markup.section(paper.title, *inner, mark=mark))
     if not drawing:
-        errors = ["no pictures: matplotlib is not installed (pip install 'wavebatch[plot]')"]
+        errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]
     intro = (
         "Every figure with the paper's value, that of a simulation by other code from the same description (spec), "
         f"ours, and the band that is accepted; a dash where there is none. Seed {seed}. The papers' data and pictures "

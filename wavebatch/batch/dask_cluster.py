@@ -31,6 +31,7 @@ from wavebatch.batch.worker_check import (
     travelling_versions,
 )
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
@@ -94,7 +95,7 @@ class Cluster:
 
     def __enter__(self) -> Cluster:
         if importlib.util.find_spec("distributed") is None:
-            raise ConfigError("--scheduler: dask's distributed is not installed; pip install wavebatch[cluster]")
+            raise ConfigError(f"--scheduler: dask's distributed is not installed: {advise_install('distributed')}")
         with contextlib.ExitStack() as stack:
             stack.enter_context(_silent())
             self._client = stack.enter_context(_connected(self.address))

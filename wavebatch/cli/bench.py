@@ -25,12 +25,13 @@ from wavebatch.cli.options import (
     parse_length,
     seed_option,
 )
+from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.core.errors import InputError
 
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
-@click.option("--scene", "scenes", multiple=True, metavar="NAME",
+@click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
 @click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
               help="Simulated waveforms per scene.")

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
+@shared.recursive_option
 @shared.file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV "
                     "with reflectance and x, y, radius or vertices.")
 @shared.output_option("Calibration file to write.", "CAL.toml")
@@ -70,12 +71,11 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
 
-    paths = find_files(map(str, strips))
-    if not paths:
-        raise ConfigError("no strip given")
+    paths = find_files(map(str, strips), recursive=options["recursive"])
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], options["plot"], html_file)):
             refuse_input(target)
+    shared.check_toml(output)
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     if options["plot"] is not None:

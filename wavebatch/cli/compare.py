@@ -122,6 +122,8 @@ def compare(
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     lines = [*_list_lines(between), *(_list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
+    if not between.matched and between.echoes_a and between.echoes_b:
+        talk("warning: A and B have no echo in common; are they results of one strip, in one CRS?")
     broken = _check_thresholds(between, options)
     _write_page(html_file, result, broken)
     for line in broken:

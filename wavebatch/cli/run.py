@@ -47,6 +47,7 @@ from wavebatch.cli.options import (
     system_option,
     where_option,
 )
+from wavebatch.cli.program.completion import complete_flags, complete_written
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
@@ -98,15 +99,16 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
 @where_option("Write only points")
-@click.option("--drop-flags", metavar="NAMES",
+@click.option("--drop-flags", metavar="NAMES", shell_complete=complete_flags,
               help="Leave out points with one of these flags, e.g. RINGING_SUSPECT,WEAK; return numbers are counted "
               "without them.")
 @click.option("--classes", callback=_read_classes, metavar="LIST", help="Write only points of these classes, e.g. 2,6.")
 @click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
               help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
 @file_option("--polygon", metavar="FILE.geojson",
-             text="Write only points inside these polygons, in the coordinates of the strips.")
-@click.option("--columns", metavar="LIST",
+             text="Write only points inside these polygons, in WGS 84, in the CRS that the file names, or in the "
+                  "coordinates of the strips.")
+@click.option("--columns", metavar="LIST", shell_complete=complete_written,
               help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
               "shipped ones get the stages that make them.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",

@@ -15,6 +15,7 @@ import click
 
 from wavebatch.cli.messages import count, counting, print_summary
 from wavebatch.cli.options import common_options, from_options, given_options, output_option, seed_option
+from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.simulate import (
     CANOPIES,
     PULSES,
@@ -50,7 +51,7 @@ _internal = click.option("--internal/--external", default=True,
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
-@click.argument("scene")
+@click.argument("scene", shell_complete=complete_scenes)
 @_output
 @output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")

@@ -16,6 +16,7 @@ import click
 from wavebatch.cli.messages import count, one_line, print_result, talk
 from wavebatch.cli.options import (
     check_html,
+    check_toml,
     common_options,
     html_option,
     output_option,
@@ -78,6 +79,7 @@ def survey(
     overwrite = options["overwrite"]
     paths = find_files(strips, recursive=options["recursive"])
     for target in (output, chain_file):
+        check_toml(target)
         if target is not None:
             check_target(target, overwrite=overwrite)
     check_html(html_file)

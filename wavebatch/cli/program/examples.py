@@ -72,6 +72,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
          "two bands for GIS"),
         ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
+        ("wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif",
+         "without points of noise"),
     ),
     "calibrate": (
         ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",

@@ -138,8 +138,11 @@ class WrittenColumn:
 
 
 def normalise(name: str) -> str:
-    """Return the form in which names are compared: without case, spaces, underscores and hyphens."""
-    return re.sub(r"[\s_\-]", "", name.casefold())
+    """Return the form in which names are compared: without case, spaces, underscores and other signs.
+
+    PDAL makes `_` of every sign, and takes names that differ in case only as one.
+    """
+    return re.sub(r"[\W_]", "", name.casefold())
 
 
 def describe(column: Column, unit: str | None = None) -> str:

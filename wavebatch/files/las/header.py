@@ -188,12 +188,26 @@ def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
         return read_header_of(file, path, least)
 
 
+def _guess(path: Path, front: bytes) -> str:
+    """What a file is that is no LAS file, and what to give in its place; empty where that is not known."""
+    beside = (path.with_suffix(end) for end in (".las", ".laz", ".LAS", ".LAZ"))
+    strip = next((one for one in beside if one.is_file()), None)
+    if front.startswith(b"PulseWaves"):
+        return "; it is PulseWaves, which wavebatch does not read" + f": give {strip}" * (strip is not None)
+    if path.suffix.lower() == ".wdp":
+        return f"; it has the packets of {strip or path.with_suffix('.las')}: give that file"
+    text = path.suffix.lower() in (".txt", ".lst", ".list", ".csv") or not front
+    if text and b"\0" not in front:
+        return f"; if it is a list of files, write @{path}" if front else "; it is empty"
+    return ""
+
+
 def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
     """Return header and VLRs of an open LAS or LAZ file; `path` is its name in messages."""
     file.seek(0)
     front = file.read(_FRONT.size)
     if len(front) < _FRONT.size or front[:4] != b"LASF":
-        raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF)")
+        raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF){_guess(path, front)}")
     (_, source_id, encoding, project, major, minor, system, software, day, year, size, offset, n_vlrs,
      point_format, length, count, *rest) = _FRONT.unpack(front)  # fmt: skip
     standard = HEADER_SIZES.get((major, minor))

@@ -17,6 +17,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
+from wavebatch.core.optional import advise_install
 from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
 
 try:
@@ -113,7 +114,7 @@ class _LazrsEncoder(PointEncoder):
         if np.any(channels != self._channel):
             raise InputError(
                 "points of several scanner channels with packets cannot be written as LAZ by lazrs; "
-                "pip install laszip, write LAS, or leave --keep-packets out"
+                f"{advise_install('laszip')}, write LAS, or leave --keep-packets out"
             )
 
     def finish(self) -> None:

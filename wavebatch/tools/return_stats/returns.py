@@ -128,8 +128,9 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
     with ReturnReader(path) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         select_points(reader, where)
-        areas = [AreaTally(division) for division in divisions]
-        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
+        placed = [division.place(path) for division in divisions]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
+        tally.misses = [line for division in placed for line in [division.miss(path)] if line]
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count)
@@ -190,6 +191,8 @@ class _Tally:
     least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
+    misses: list[str] = field(default_factory=list)
+    """Lines that say that no area lies in the cloud."""
 
     def add_points(self, rows: np.ndarray) -> None:
         """Adds return numbers and flags of some points."""
@@ -271,7 +274,7 @@ class _Tally:
         return table
 
     def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
-        lines = []
+        lines = list(self.misses)
         if self.left_out:
             lines.append(
                 f"--where: {self.left_out} of {self.points + self.left_out} points are left out; pulses and distances "
