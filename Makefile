@@ -56,7 +56,7 @@ demo: $(VENV)/.run
 readers: $(VENV)/.test
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: copclib
 	-command -v npm >/dev/null && npm install --silent --no-save --no-audit --no-fund --prefix $(VENV)/npm \
-	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.5.1 @loaders.gl/las@4.5.1
+	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.4.5 @loaders.gl/las@4.5.1
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto -m 'not slow'
