@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import click
@@ -100,6 +99,7 @@ CASES = {
     "bench --scene empty --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability": "bench/1",
     "bench --real STRIP --no-stability": "bench-real/1",
     "bench --against ROOT --scene flat --pulses 300 --repeat 1": "bench-against/1",
+    "bench --jobs-model --scene flat --pulses 300 --repeat 1": "bench-jobs/1",
     "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
@@ -145,17 +145,6 @@ def test_every_command_with_json_is_in_the_page_and_tested():
     for path in paths:
         assert re.search(rf"`{path}(?: [^`]*)? ?--json`", text), path
         assert any(line == path or line.startswith(f"{path} ") for line in CASES), path
-
-
-def test_the_model_of_jobs():
-    """Measuring it takes half a minute; its document is made of two dataclasses."""
-    from wavebatch.tools.bench.paired.jobs import Lap, Parts, to_document
-
-    def fill(kind):
-        return kind(**{one.name: 1000 if one.type in (int, "int") else 0.5 for one in fields(kind)})
-
-    document = to_document("a.las", fill(Parts), {1: [fill(Lap)], 2: [fill(Lap)]})
-    _hold({"schema": "wavebatch.bench-jobs/1", **json.loads(json.dumps(document))}, "wavebatch.bench-jobs/1")
 
 
 def test_only_one_document_goes_to_stdout(riegl, tmp_path):
