@@ -147,7 +147,7 @@ class Attacker:
         words = [sys.executable, "-m", "wavebatch", *self._words(name, out)]
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            start_new_session=True, env={**os.environ, "TMPDIR": str(temporary)},
+            start_new_session=True, env={**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"},
         )  # fmt: skip
 
     def _words(self, name: str, out: Path) -> list[str]:
@@ -170,7 +170,7 @@ class Attacker:
         try:
             said = process.communicate(timeout=LONGEST)[1]
         except subprocess.TimeoutExpired:
-            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid)))
+            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid))) + _stacks(process)
         return is_ready, process.returncode, said
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
@@ -240,10 +240,10 @@ class Attacker:
 
     def _judge_again(self, name: str, out: Path) -> str:
         """The same command again ends as if nothing had happened."""
-        again = "--resume" if name.startswith("run") else "--overwrite"
+        again = ["--resume", "--jobs", "1"] if name.startswith("run") else ["--overwrite"]
 
         def work() -> None:
-            done = CliRunner().invoke(main, [*self._words(name, out), again])
+            done = CliRunner().invoke(main, [*self._words(name, out), *again])
             assert done.exit_code == 0, done.output
 
         try:
@@ -335,6 +335,18 @@ def _describe(pid: int) -> str:
     return " ".join(found)
 
 
+def _stacks(process: subprocess.Popen) -> str:
+    """Where the threads of a process that hangs are, as faulthandler writes it."""
+    for pid in _session(process.pid):
+        if pid != process.pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    process.send_signal(signal.SIGABRT)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.communicate(timeout=10)[1][-3000:]
+    return ""
+
+
 def _session(number: int) -> list[int]:
     """Living processes of a session."""
     found = []
@@ -347,14 +359,18 @@ def _session(number: int) -> list[int]:
     return found
 
 
-def attack_all(folder: Path, runs: int, seed: int) -> Iterator[tuple[Attack, str]]:
-    """Run so many attacks; yield those that break a promise, then say how all ended."""
+def attack_all(folder: Path, runs: int, seed: int, minutes: float = 1e9) -> Iterator[tuple[Attack, str]]:
+    """Run so many attacks, or so long; yield those that break a promise, then say how all ended."""
     attacker, rng = Attacker(folder), random.Random(seed)
+    end = time.monotonic() + 60 * minutes
     for _ in range(runs):
+        if time.monotonic() > end:
+            break
         attack = attacker.draw(rng)
         why = attacker.attack(attack)
         if why:
             yield attack, why
+    print(f"{sum(attacker.ended.values())} attacks with seed {seed}")
     for (kind, code), number in sorted(attacker.ended.items(), key=str):
         print(f"{kind:20} exit code {code!s:25} {number:6}")
 
@@ -363,13 +379,14 @@ def _start() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     options = parser.parse_args()
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
-        for attack, why in attack_all(Path(folder), options.runs, options.seed):
+        for attack, why in attack_all(Path(folder), options.runs, options.seed, options.minutes):
             failures += 1
             print(f"{attack.name}, {attack.kind}, at {attack.share:.3f} of its time: {why}", flush=True)
-    print(f"{options.runs} attacks with seed {options.seed}, {failures} failures")
+    print(f"{failures} failures")
     return failures > 0
 
 

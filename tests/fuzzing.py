@@ -155,7 +155,7 @@ class Fuzzer:
         done = CliRunner().invoke(main, words, env=case.variables)
         is_bug = not isinstance(done.exception, SystemExit | None)
         error = "".join(traceback.format_exception(done.exception)) if is_bug else ""
-        found: dict[str, Any] = {"code": done.exit_code, "out": done.stdout[-5000:], "err": done.stderr[-5000:]}
+        found: dict[str, Any] = {"code": done.exit_code, "out": done.stdout, "err": done.stderr}
         found |= {"error": error, "peak": _read_peak(), "wall": "--jobs" in words}
         why = _judge(found, folder / "out", before, case)
         if not why and inputs - _state(folder, below=False):
@@ -167,7 +167,7 @@ class Fuzzer:
         del done
         if not why and len(os.listdir("/proc/self/fd")) > opened + 20:
             why = "leaves files open"
-        return {**found, "why": why}
+        return {**found, "out": found["out"][-5000:], "err": found["err"][-5000:], "why": why}
 
     def _prepare(self, case: Case, folder: Path) -> tuple[list[str], set[str]]:
         """The command with the damaged input in place, and the names that its folder holds before."""

@@ -45,7 +45,7 @@ class Trajectory:
     def build(
         cls, time: np.ndarray, xyz: np.ndarray, velocity: np.ndarray | None = None, gap: float | None = None
     ) -> Trajectory:
-        """A trajectory from positions in any order; rows with NaN, beyond all times and places, and repeated times are dropped.
+        """A trajectory from positions in any order; rows with NaN, beyond FARTHEST and LATEST, and of equal times go.
 
         Parameters
         ----------
