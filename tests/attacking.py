@@ -63,7 +63,15 @@ SIGNALS: dict[str, tuple[int, ...]] = {
     "INT INT": (signal.SIGINT, signal.SIGINT), "TERM INT TERM": (signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
     "INT KILL": (signal.SIGINT, signal.SIGKILL),
 }  # fmt: skip
-ATTACKS = (*SIGNALS, "group INT", "group TERM", "worker KILL", "worker STOP CONT", "worker STOP INT", "worker STOP KILL")
+ATTACKS = (
+    *SIGNALS,
+    "group INT",
+    "group TERM",
+    "worker KILL",
+    "worker STOP CONT",
+    "worker STOP INT",
+    "worker STOP KILL",
+)
 
 
 class Attack(NamedTuple):
@@ -234,7 +242,9 @@ class Attacker:
         if code == 0 and whole.keys() != sound.keys():
             return f"exit code 0, but {sorted(sound.keys() - whole.keys())} are missing"
         for name in whole:
-            if name.endswith(".report.json") and not {name.replace(".report.json", s) for s in (".laz", ".las")} & set(whole):
+            if name.endswith(".report.json") and not {name.replace(".report.json", s) for s in (".laz", ".las")} & set(
+                whole
+            ):
                 return f"{name} without its cloud"
         return ""
 
@@ -253,7 +263,9 @@ class Attacker:
         found = {**_contents(out), "all.json": self.sound[name].get("all.json")}  # it says what is new
         if found["all.json"] is None:
             del found["all.json"]
-        different = sorted(key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key))
+        different = sorted(
+            key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key)
+        )
         return f"run again: other bytes in {different}" if different else ""
 
 

@@ -138,7 +138,8 @@ def test_an_interrupt_at_any_line_of_a_wait_leaves_no_lock_taken():
     try:
         for number in range(1, 200):
             future: Future = Future()
-            thread = threading.Thread(target=lambda future=future: (time.sleep(0.01), future.set_result(1)), daemon=True)
+            thread = threading.Timer(0.01, future.set_result, (1,))
+            thread.daemon = True
             thread.start()
             seen = _interrupt_at(number, workers.wait, [future])
             thread.join(5)
