@@ -3,6 +3,7 @@
 #   make test      the fast tests          make test-all   all of them
 #   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
+#   make readers   other programs' LAS readers, from PyPI and npm as far as these have them, for `make test`
 #   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
@@ -18,7 +19,7 @@ MINUTES ?= 10
 RUNS   ?= 1000
 SEED   ?= 1
 
-.PHONY: demo test test-all papers bench fuzz attack docs man lint clean
+.PHONY: demo test test-all readers papers bench fuzz attack docs man lint clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -51,6 +52,11 @@ demo: $(VENV)/.run
 	@echo
 	@echo "cloud:  $(DEMO)/out/forest.laz"
 	@echo "report: $(DEMO)/out/forest.report.json"
+
+readers: $(VENV)/.test
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: copclib
+	-command -v npm >/dev/null && npm install --silent --no-save --no-audit --no-fund --prefix $(VENV)/npm \
+	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.5.1 @loaders.gl/las@4.5.1
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto -m 'not slow'

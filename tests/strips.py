@@ -8,7 +8,7 @@ from pathlib import Path
 import lazrs
 import numpy as np
 
-from wavebatch.files.las.header import STANDARD_DTYPES, read_header
+from wavebatch.files.las.header import STANDARD_DTYPES, Vlr, read_header
 from wavebatch.files.strip.reader import StripReader
 
 HEADER_SIZES = {3: 235, 4: 375, 5: 393}
@@ -144,6 +144,19 @@ def make_raw(
     minor = minor or (3 if point_format < 9 else 4)
     packets = bytes(first_offset - 60) + samples.tobytes()
     return Raw(points, packets, point_format, minor, internal, [descriptor(1, bits=bits, samples=n_samples)])
+
+
+def add_record(path: Path, record: Vlr) -> None:
+    """Puts a record before those that the header of a LAS file has."""
+    content = bytearray(path.read_bytes())
+    size = struct.unpack_from("<H", content, 94)[0]
+    new = vlr(record.user_id, record.record_id, record.payload)
+    places = [("<I", 96)] + [("<Q", place) for place in (227, 235) if place < size]
+    for kind, place in places:  # points, packets and extended records move
+        (start,) = struct.unpack_from(kind, content, place)
+        struct.pack_into(kind, content, place, start + len(new) if start else 0)
+    struct.pack_into("<I", content, 100, struct.unpack_from("<I", content, 100)[0] + 1)
+    path.write_bytes(content[:size] + new + content[size:])
 
 
 def cut_strip(source: Path, target: Path, points: int) -> Path:

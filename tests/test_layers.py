@@ -15,8 +15,8 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"}, {"explain", "neighbour_pass"},
-        {"report_file"},
+        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"},
+        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"},
         {"strip_task", "processes", "dask_cluster"}, {"preflight"}, {"run"},
     ],
     "surveying": [
@@ -149,7 +149,8 @@ def test_no_other_dependency_at_run_time():
     for path in MODULES:
         peers = {"gdecomp"} if path.name == "peers.py" else set()
         peers |= {"matplotlib", "mpl_toolkits"} if _part(path) == "tools" or path.name == "figure_file.py" else set()
-        peers |= {"pyproj"} if path.name in ("trajectory_file.py", "geotiff_wkt.py", "geojson_crs.py") else set()
+        projecting = ("trajectory_file.py", "geotiff_wkt.py", "geojson_crs.py", "area_crs.py")
+        peers |= {"pyproj"} if path.name in projecting else set()
         peers |= {"dask", "distributed"} if path.name in ("dask_cluster.py", "worker_check.py") else set()
         peers |= {"rasterio"} if path.name == "geotiff_file.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path

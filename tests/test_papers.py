@@ -1,6 +1,9 @@
 """The examples of the papers: every one runs, and at full size meets what is accepted, whatever the seed."""
 
 import importlib
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,15 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from html_tools import Page
 
 from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.physics import radar, radiometry
 from wavebatch.stages.attribute import width_angle
 from wavebatch.stages.decompose import models, skew
-from wavebatch.tools.simulate import from_returns
+from wavebatch.tools.simulate import from_returns, return_light
 from wavebatch.tools.slices import segments
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "papers"
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
 
@@ -86,9 +91,24 @@ def double_amplitudes(monkeypatch, load):
 
 
 def double_strengths(monkeypatch, load):
-    measured = from_returns._measure_strength
-    monkeypatch.setattr(from_returns, "_measure_strength", lambda *a: 2 * measured(*a))
+    measured = return_light.LightModel.measure
+    double = lambda *a: replace((light := measured(*a)), strength=2 * light.strength)  # noqa: E731
+    monkeypatch.setattr(return_light.LightModel, "measure", double)
     return load("s4_ussyshkin").table_of_synthesis(3000, 0)
+
+
+def fill_the_beam_twice(monkeypatch, load):
+    """Each return takes the whole beam, whatever the others take."""
+    monkeypatch.setattr(return_light, "share_equally", lambda total, starts: np.ones(len(total)))
+    return load("s4_ussyshkin").table_of_footprints(3000, 0)
+
+
+def forget_a_power_of_the_range(monkeypatch, load):
+    """Received powers that fall with R instead of R^2."""
+    right = return_light._receive
+    monkeypatch.setattr(return_light, "_receive", lambda rho, rows, radar, path: right(rho, rows, radar, path) * (
+        radar.height - rows["xyz"][:, 2]) / 1000.0)  # fmt: skip
+    return load("s4_ussyshkin").table_of_footprints(3000, 0)
 
 
 def double_distances(monkeypatch, load):
@@ -181,7 +201,8 @@ RIGHT = {
 WRONG = [
     double_amplitudes, double_strengths, double_distances, leave_the_pulse_in, zero_the_heights, drop_from_equation(2),
     drop_from_equation(4), drop_from_footprint, drop_from_backscatter, drop_from_section, forget_the_skew,
-    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times,
+    zero_the_heights_of_a_strip, forget_where_windows_open, stretch_the_times, fill_the_beam_twice,
+    forget_a_power_of_the_range,
 ]  # fmt: skip
 
 
@@ -213,14 +234,66 @@ def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
     tables = [{"title": "one <table>", "rows": rows}]
     monkeypatch.setattr(page, "measure", lambda script, *rest: (tables, script != "s2_jutzi"))
     monkeypatch.setattr(page, "run_command", lambda words, folder: _fake(words, folder))
-    text, fine = page.build(None, 1000, 0)
+    parts, fine = page.build(None, 1000, 0)
     assert not fine, "a script whose figures are not accepted is a failure"
-    assert text.count("<table>") == len(SCRIPTS) == len(page.PAPERS)
+    page.write_page(tmp_path / "papers.html", "Papers", parts)
+    shown = Page(tmp_path / "papers.html").check()
+    text = shown.source
+    assert text.count("<table>") == 1 + len(SCRIPTS) == 1 + len(page.PAPERS)
     assert [paper.script for paper in page.PAPERS] == SCRIPTS
     pictures = sum(len(paper.pictures) for paper in page.PAPERS)
-    assert text.count("<figure>") == pictures and text.count("data:image/png") == pictures - 1
+    assert text.count("<figure ") == pictures and text.count("data:image/png") == pictures - 1
     assert "not drawn: error: no &lt;pulse&gt;" in text and "one &lt;table&gt;" in text
-    assert "http" not in text.replace("http-equiv", ""), "the page needs no network"
+    assert text.count('<span class="mark">FAIL</span>') == len(SCRIPTS)
+    for paper in page.PAPERS:
+        assert next(row for row in shown.rows if row[0] == paper.title)[1:3] == ["2", "1"]
+        assert paper.title in shown.headings
+        notes = page.read_notes()[paper.script]
+        assert len(notes) > 1 and all(len(note) > 40 and "|" not in note for note in notes)
+
+
+@pytest.mark.slow
+def test_the_page_is_shown_by_a_browser_without_complaints(load, tmp_path, monkeypatch):
+    """With real pictures of small strips: every one is loaded, as wide as the window or less, and nothing is wider."""
+    pytest.importorskip("matplotlib")
+    if BROWSER is None:
+        pytest.skip("no headless browser is installed")
+    page = load("page")
+    rows = [[f"figure {n}", "1.0000", "-", "2.0000", "100.0000..200.0000", "ok"] for n in range(3)]
+    monkeypatch.setattr(page, "measure", lambda *rest: ([{"title": "t", "rows": rows}, {"text": "| ### " * 40}], True))
+    parts, fine = page.build(None, 500, 0)
+    assert fine, [part for part in parts if "warning" in part]
+    page.write_page(tmp_path / "papers.html", "Papers", parts)
+    Page(tmp_path / "papers.html").check()
+    probe = (
+        "<script>addEventListener('load', () => { const p = [...document.querySelectorAll('img')];"
+        "document.title = [p.length, p.every((i) => i.naturalWidth > 300 && i.clientWidth > 100),"
+        "Math.max(...p.map((i) => i.getBoundingClientRect().right)) <= innerWidth,"
+        "document.documentElement.scrollWidth <= innerWidth].join(' '); });</script>"
+    )
+    opened = re.sub(r"script-src '[^']+'", "script-src 'unsafe-inline'", (tmp_path / "papers.html").read_text())
+    (tmp_path / "probe.html").write_text(opened.replace("</body>", f"{probe}</body>"))
+    command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
+               f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
+    pictures = sum(len(paper.pictures) for paper in page.PAPERS)
+    for name, width in (("papers", 1300), ("probe", 1300), ("probe", 520)):
+        target = (tmp_path / f"{name}.html").as_uri()
+        shown = subprocess.run(
+            [*command, f"--window-size={width},900", target], capture_output=True, text=True, timeout=90
+        )
+        assert shown.returncode == 0 and "CONSOLE" not in shown.stderr, shown.stderr
+        if name == "probe":
+            assert re.search(r"<title>(.*?)</title>", shown.stdout)[1] == f"{pictures} true true true"
+
+
+def test_an_older_page_is_replaced_and_another_file_is_kept(load, tmp_path, monkeypatch):
+    page = load("page")
+    monkeypatch.setattr(page, "build", lambda *rest: (["<p>x</p>"], True))
+    monkeypatch.setattr("sys.argv", ["page.py", "-o", str(tmp_path / "p.html")])
+    assert page.main() == page.main() == 0 and "<p>x</p>" in (tmp_path / "p.html").read_text()
+    (tmp_path / "p.html").write_text("mine")
+    with pytest.raises(page.ConfigError, match="is no report"):
+        page.main()
 
 
 def _fake(words, folder):
@@ -235,7 +308,7 @@ def test_commands_of_the_page_are_those_of_wavebatch(load):
     from wavebatch.cli import main
 
     for picture in [picture for paper in load("page").PAPERS for picture in paper.pictures]:
-        words = picture.command.split()
+        words = shlex.split(picture.command)
         command = main
         while hasattr(command, "commands") or command is main:
             command = command.get_command(None, words.pop(0))

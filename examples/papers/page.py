@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import argparse
 import base64
-import html
 import importlib.util
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -21,6 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from table import HEADS
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.tools.html import markup
+from wavebatch.tools.html.page import check_page, write_page
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -64,29 +68,57 @@ PAPERS = (
         Picture("Coefficients of the B3-spline wavelet, in which echoes are searched, with the threshold.",
                 "plot waveform forest.laz --packet 17:21 --profile balanced --show wavelet"),
     )),
-    Paper("s2_jutzi", "Jutzi, Stilla", "6, 8", (
+    Paper("s2_jutzi", "Jutzi, Stilla (2005)", "6, 8", (
         Picture("The waveform deconvolved with the system pulse: the signal of the surfaces along the ray.",
                 "plot waveform forest.laz --packet 17:21 --profile balanced --show deconvolved"),
-        Picture("Slices of the data cube of an urban scene: x, y and t.", "plot cube cube.npz"),
-        Picture("Straight segments of surfaces in all its scan lines, in plan and in 3D.",
-                "slice urban.laz --lines 0:40", "--overview"),
+        Picture("Slices of the data cube of a village: x across the scan lines, y one scan line over a row of roofs, t "
+                "one time, at which the roofs are missing in the ground.",
+                "plot cube cube.npz --x 980 --y 5 --t 154.5"),
+        Picture("Straight segments of the ground and of the roofs in all scan lines, in plan and in 3D.",
+                "slice village.laz --most 60", "--overview"),
+        Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
+                "plot profile segments.csv --column length --log"),
     )),
-    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert et al. (2024)", "3, 4, 5, 6", (
-        Picture("Echo widths in plan.", "plot map out/urban.laz --column echo_width --statistic median --size 2"),
-        Picture("Echo widths from the side.", "plot section out/urban.laz --column echo_width --width 4"),
-        Picture("Echo widths by the number of returns of their pulse, with means.",
-                "plot histogram out/urban.laz out/forest.laz --column echo_width --each"),
+    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "3, 4, 5, 6", (
+        Picture("Echo widths in plan: roofs of 0 to 60 degrees on level ground.",
+                "plot map out/village.laz --column echo_width --statistic median --size 2"),
+        Picture("Angles of incidence from these widths.",
+                "plot map out/village.laz --column incidence_angle --statistic median --size 2"),
+        Picture("Echo widths from the side, across a row of roofs.",
+                "plot section out/village.laz --column echo_width --line 500006,5399890,500006,5400110 --width 3"),
+        Picture("Which width means which angle, and how sure that is.",
+                "survey village.laz --divergence 1.1", "--angles"),
+        Picture("Angles on the roofs, from widths and from the normals of surfaces, with means; roofs of 60 degrees "
+                "give few normals.", "plot histogram out/village.laz --column incidence_angle --column "
+                "incidence_angle_normals --where 'z > 123.5'"),
     )),
-    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2010)", "1, 2, 4, 6, 7", (
+    Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2, 4, 6, 7", (
         Picture("Amplitudes by the number of returns of the pulse.",
                 "plot histogram out/forest.laz --column amplitude --by number_of_returns"),
         Picture("Amplitudes by return number.", "plot histogram out/forest.laz --column amplitude --by return_number"),
-        Picture("Returns of the vendor and of the waveforms per height.",
+        Picture("Returns of the vendor and echoes of the waveforms per height.",
                 "plot profile forest.laz out/forest.laz --each --size 1"),
-        Picture("Density of the returns of the urban strip.", "plot map out/urban.laz --statistic density --size 2"),
+        Picture("Density of the echoes of the village.", "plot map out/village.laz --statistic density --size 2"),
     )),
 )  # fmt: skip
 """Every paper with its pictures. The chains and strips that the commands name are made by `prepare`."""
+
+_VILLAGE = """[[chain]]
+stage = "noise.pooled"
+[[chain]]
+stage = "detect.maximum"
+[[chain]]
+stage = "decompose.adaptive"
+[[chain]]
+stage = "attribute.echo_width"
+[[chain]]
+stage = "attribute.position"
+[[chain]]
+stage = "attribute.incidence_angle_normals"
+[[chain]]
+stage = "attribute.incidence_angle"
+divergence = 1.1
+"""
 
 _ASDF = """[[chain]]
 stage = "noise.pooled"
@@ -111,14 +143,16 @@ def run_command(words: Sequence[str], folder: Path) -> str:
 def prepare(folder: Path, pulses: int, seed: int) -> list[str]:
     """Simulates the strips of the pictures and makes their clouds; the errors."""
     (folder / "asdf.toml").write_text(_ASDF)
+    (folder / "village.toml").write_text(_VILLAGE)
     more = ["--pulses", str(pulses), "--seed", str(seed)]
-    # Scan lines have some 2,500 pulses: the maps and the cube need many lines.
-    many = ["--pulses", str(12 * pulses), "--seed", str(seed)]
+    # Scan lines have 2,000 pulses: the maps and the cube need many lines.
+    many = ["--pulses", str(24 * pulses), "--seed", str(seed)]
     commands = [
-        ["simulate", "forest", "-o", "forest.laz", *more], ["simulate", "urban", "-o", "urban.laz", *many],
+        ["simulate", "forest", "-o", "forest.laz", *more], ["simulate", "village", "-o", "village.laz", *many],
         ["simulate", "forest", "-o", "leica.laz", "--pulse", "leica", *more],
-        ["run", "forest.laz", "urban.laz", "-o", "out", "--profile", "balanced", "-q"],
-        ["slice", "urban.laz", "--lines", "0:40", "--cube", "cube.npz", "-q"],
+        ["run", "forest.laz", "-o", "out", "--profile", "balanced", "-q"],
+        ["run", "village.laz", "-o", "out", "--chain", "village.toml", "-q"],
+        ["slice", "village.laz", "--most", "60", "--cube", "cube.npz", "-o", "segments.csv", "-q"],
     ]  # fmt: skip
     return [f"wavebatch {' '.join(words)}: {error}" for words in commands if (error := run_command(words, folder))]
 
@@ -142,42 +176,53 @@ def measure(script: str, number: int | None, seed: int, folder: Path) -> tuple[l
 def format_table(table: dict) -> str:
     """A table as HTML; text of a script as it is."""
     if "text" in table:
-        return f"<pre>{html.escape(table['text'])}</pre>"
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in [table["title"], *HEADS[1:]])
+        return markup.code(table["text"])
+    head = f'<th scope="col">{markup.text(table["title"])}</th>'
+    head += "".join(f'<th scope="col" class="n">{markup.text(name)}</th>' for name in HEADS[1:])
     rows = []
-    for row in table["rows"]:
-        kind = ' class="fail"' if row[-1] == "FAIL" else ""
-        rows.append(f"<tr{kind}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>")
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    for name, *cells in table["rows"]:
+        texts = [f'<span class="mark">{cell}</span>' if cell == "FAIL" else markup.text(cell) for cell in cells]
+        values = "".join(f'<td class="n">{one}</td>' for one in texts)
+        rows.append(f"<tr><td>{markup.text(name)}</td>{values}</tr>")
+    body = "\n".join(rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
 
 def format_picture(picture: Picture, image: bytes | None, error: str) -> str:
     """A picture with its caption and its command."""
-    command = html.escape(f"wavebatch {picture.command} {picture.option} picture.png")
-    text = f"<figcaption>{html.escape(picture.caption)}<br><code>{command}</code></figcaption>"
+    command = markup.text(f"wavebatch {picture.command} {picture.option} picture.png")
+    caption = markup.text(picture.caption)
+    below = f"<figcaption>{caption}<br><code>{command}</code></figcaption>"
     if image is None:
-        return f'<figure><p class="fail">not drawn: {html.escape(error)}</p>{text}</figure>'
+        return f'<figure class="wide">{markup.paragraph(f"not drawn: {error}", "warning")}{below}</figure>'
     data = base64.b64encode(image).decode()
-    return f'<figure><img alt="{html.escape(picture.caption)}" src="data:image/png;base64,{data}">{text}</figure>'
+    shown = f'<img class="picture" alt="{caption}" src="data:image/png;base64,{data}">'
+    return f'<figure class="wide">{shown}{below}</figure>'
 
 
-STYLE = """
-:root { color-scheme: light dark; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums; }
-th, td { padding: .15rem .7rem; border-bottom: 1px solid #8885; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
-.fail { color: #c33; font-weight: bold; }
-figure { margin: 1.5rem 0; } img { max-width: 100%; background: #fff; border-radius: 4px; }
-figcaption { font-size: .9em; } code { font-size: .85em; overflow-wrap: anywhere; }
-@media print { figure { break-inside: avoid; } }
-"""
+def read_notes() -> dict[str, list[str]]:
+    """The paragraphs of README.md about each script, without its table."""
+    parts = re.split(r"(?m)^## `python examples/papers/(\w+)\.py`$", (FOLDER / "README.md").read_text("utf-8"))
+    notes = {}
+    for script, text in zip(parts[1::2], parts[2::2], strict=True):
+        paragraphs = [" ".join(one.split()) for one in text.split("\n\n") if not one.lstrip().startswith("|")]
+        # The first one begins with the authors, who stand in the heading.
+        first, *rest = [one.replace("`", "") for one in paragraphs if one]
+        lead = first.split(": ", 1)[-1]
+        notes[script] = [lead[:1].upper() + lead[1:], *rest]
+    return notes
 
 
-def build(number: int | None, pulses: int, seed: int) -> tuple[str, bool]:
-    """The page, and whether all went well."""
+def count_accepted(tables: Sequence[dict]) -> tuple[int, int]:
+    """How many figures have a band, and how many of these lie in theirs."""
+    verdicts = [row[-1] for table in tables for row in table.get("rows", ())]
+    return verdicts.count("ok") + verdicts.count("FAIL"), verdicts.count("ok")
+
+
+def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
+    """The parts of the page, and whether all went well."""
     drawing = importlib.util.find_spec("matplotlib") is not None
-    parts, fine = [], True
+    parts, rows, notes, fine = [], [], read_notes(), True
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         errors = prepare(folder, pulses, seed) if drawing else []
@@ -185,22 +230,30 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[str, bool]:
             print(f"== {paper.script}", flush=True)
             tables, accepted = measure(paper.script, number, seed, folder)
             drawn = list(draw(paper.pictures, folder)) if drawing else []
-            fine &= accepted and bool(tables) and not any(error for _, _, error in drawn)
-            parts.append(f"<h2>{html.escape(paper.title)}</h2>")
-            parts += map(format_table, tables)
+            failed = sum(bool(error) for _, _, error in drawn)
+            fine &= accepted and bool(tables) and not failed
+            banded, inside = count_accepted(tables)
+            mark = markup.identifier(paper.script)
+            link = markup.Cell(f'<a href="#{mark}">{markup.text(paper.title)}</a>')
+            rows.append([link, banded, inside, len(drawn) - failed])
+            inner = [markup.paragraph(one) for one in notes.get(paper.script, ())]
+            inner += [format_table(table) for table in tables]
+            if not tables:
+                inner.append(markup.paragraph(f"{paper.script}.py printed no table; run it to see why", "warning"))
             if drawn:
-                parts.append(f"<p>In place of the paper's figures {paper.figures}, on simulated strips:</p>")
-            parts += [format_picture(*one) for one in drawn]
-    notes = [f'<p class="fail">{html.escape(error)}</p>' for error in errors]
+                inner.append(markup.paragraph(f"In place of the paper's figures {paper.figures}, on simulated strips:"))
+            inner += [format_picture(*one) for one in drawn]
+            parts.append(markup.section(paper.title, *inner, mark=mark))
     if not drawing:
-        notes.append("<p>No pictures: matplotlib is not installed (pip install 'wavebatch[plot]').</p>")
+        errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]
     intro = (
-        "<p>Every figure with the paper's value, that of a simulation by other code from the same description (spec), "
-        f"ours, and the band that is accepted. Seed {seed}. The papers' data and pictures are not used.</p>"
+        "Every figure with the paper's value, that of a simulation by other code from the same description (spec), "
+        f"ours, and the band that is accepted; a dash where there is none. Seed {seed}. The papers' data and pictures "
+        "are not used: a figure can agree by chance."
     )
-    head = f'<meta charset="utf-8"><title>The papers, reproduced</title><style>{STYLE}</style>'
-    body = "\n".join(["<h1>The papers, reproduced</h1>", intro, *notes, *parts])
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>\n', fine and not errors
+    head = ["paper", "figures with a band", "of these accepted", "pictures"]
+    front = [markup.paragraph(intro), markup.bullets(errors, "warning"), markup.table(head, rows)]
+    return [*front, *parts], fine and not (drawing and errors)
 
 
 def main() -> int:
@@ -211,11 +264,15 @@ def main() -> int:
     parser.add_argument("--number", type=int, help="waveforms per script (default: each script's)")
     parser.add_argument("--pulses", type=int, default=5000, help="pulses of the strips in the pictures (default 5000)")
     options = parser.parse_args()
-    page, fine = build(options.number, options.pulses, options.seed)
-    options.output.write_text(page, "utf-8")
+    check_page(options.output)
+    parts, fine = build(options.number, options.pulses, options.seed)
+    write_page(options.output, "The papers, reproduced", parts)
     print(f"{options.output}: written" + ("" if fine else "; it names what failed"))
     return 0 if fine else 1
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except (ConfigError, InputError) as error:
+        raise SystemExit(f"error: {error}") from error

@@ -25,6 +25,7 @@ from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, Recording, simulate_returns
 from wavebatch.tools.simulate.from_returns import SynthesisOptions, synthesize_strip
 from wavebatch.tools.simulate.render import paint_echoes
+from wavebatch.tools.simulate.return_light import Radar
 
 CORN = {0.64: (1.13, 0.90), 0.67: (1.15, 0.92)}
 """Mean separation of the first and the second, the second and the third return [m], by dead zone [m]."""
@@ -136,6 +137,37 @@ def table_of_synthesis(number: int, seed: int) -> Table:
     return table
 
 
+def table_of_footprints(number: int, seed: int) -> Table:
+    """Partial footprints A_i: energies of `synthesize --shares equal` over those of the lidar equation, short form."""
+    table = Table("partial footprints: energy of waveforms over the lidar equation's", 4)
+    height, power, aperture, efficiency, attenuation, gain = 1200.0, 4000.0, 0.1, 0.5, 0.22, 5e10
+    radar = Radar(height, power=power, aperture=aperture, efficiency=efficiency, attenuation=attenuation)
+    with TemporaryDirectory() as folder:
+        cloud, strip = Path(folder) / "cloud.las", Path(folder) / "strip.las"
+        simulate_returns("canopy.orion-6", cloud, pulses=max(number // 10, 300), seed=seed)
+        options = SynthesisOptions("reflectance", gain, radar, shares="equal", bits=16, baseline=100.0)
+        summary = synthesize_strip(cloud, strip, options)
+        points = wb.read_cloud(cloud, ["z", "intensity", "scan_angle_rank"])
+        distance = (height - points["z"]) / np.cos(np.radians(points["scan_angle_rank"]))
+        air = 10.0 ** (-2.0e-4 * attenuation * distance)
+        peak = power * aperture**2 * points["intensity"] / 65535 * efficiency * air / (4.0 * distance**2)
+        energy = np.sqrt(2.0 * np.pi) * options.sigma * gain * peak
+        ratios: dict[int, list[float]] = {}
+        with wb.open_strip(strip) as made:
+            for block in made.blocks():
+                found = options.spacing * (block.samples - 100.0).sum(axis=1)
+                count = np.bincount(block.returns.waveform, minlength=len(block))
+                whole = np.bincount(block.returns.waveform, energy[block.returns.point], len(block))
+                for several in (1, 2, 3):
+                    rows = count == several
+                    ratios.setdefault(several, []).extend((found[rows] * several / whole[rows]).tolist())
+    for several, values in ratios.items():
+        table.near(f"pulses of {several}, shares of 1/{several}", float(np.median(values)), 1.0, within=0.01)
+    table.near("share of the beam that the returns take", summary.light_used, 1.0, within=1e-9)
+    table.near("energy in the samples over that modelled", summary.energy_recorded / summary.energy, 1.0, within=0.005)
+    return table
+
+
 def returns_of(waveform: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The returns of some waveforms, in order."""
     return np.flatnonzero(np.isin(waveform, rows))
@@ -168,6 +200,7 @@ def measure(number: int, seed: int) -> list[Table]:
         table_of_separations(number, seed),
         table_of_the_equation(),
         table_of_synthesis(number, seed),
+        table_of_footprints(number, seed),
         table_of_models(number, seed),
     ]
 

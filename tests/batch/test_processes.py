@@ -1,5 +1,6 @@
 """Worker processes that are killed or stopped at the worst instants: the parent process never waits for them."""
 
+import functools
 import multiprocessing.connection
 import os
 import signal
@@ -172,3 +173,19 @@ def _interrupt_at(number, function, *arguments):
     finally:
         sys.settrace(None)
     return count >= number
+
+
+def die_elsewhere(parent, number):
+    if os.getpid() != parent and number == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2
+
+
+def test_map_gives_results_in_order_and_makes_calls_itself_that_kill_a_process():
+    with Workers(2) as workers:
+        call = functools.partial(die_elsewhere, os.getpid())
+        assert list(workers.map(call, range(12))) == [number**2 for number in range(12)]
+        with pytest.raises(ValueError, match="bad 0"):
+            list(workers.map(raise_error, range(3)))
+    with Workers(1) as workers:
+        assert list(workers.map(square, range(3))) == [0, 1, 4]

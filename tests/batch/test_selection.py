@@ -94,7 +94,9 @@ def test_a_point_counts_for_the_first_reason_that_leaves_it_out(riegl, full, tmp
     box = _box(las)
     some, report = _run(riegl, tmp_path, where="z < 0", bbox=box, drop_flags="weak")
     weak = (_bits(las) & EchoFlag.WEAK) > 0
-    inside = (las.x >= box[0]) & (las.x <= box[2]) & (las.y >= box[1]) & (las.y <= box[3])
+    # As numbers: laspy compares its views by rounded record values, in which a point beyond a border may lie on it.
+    x, y = np.asarray(las.x), np.asarray(las.y)
+    inside = (x >= box[0]) & (x <= box[2]) & (y >= box[1]) & (y <= box[3])
     expected = {"drop_flags": weak.sum(), "bbox": (~weak & ~inside).sum(), "where": (~weak & inside).sum()}
     assert {name: n for name, n in report["counts"]["left_out"].items() if n} == expected
     assert len(some.points) == 0

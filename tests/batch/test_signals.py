@@ -178,7 +178,7 @@ def test_a_signal_while_a_worker_starts_leaves_no_process_that_complains(strip, 
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 130, done.stderr
     assert done.stderr.startswith("interrupted: finished") and done.stderr.count("\n") == 1
-    assert list(out.iterdir()) == []
+    assert not out.exists() or list(out.iterdir()) == []  # processes start before anything else
 
 
 def test_hardly_anything_is_imported_before_signals_are_handled():

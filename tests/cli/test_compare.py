@@ -1,12 +1,16 @@
 """`wavebatch compare`: figures, thresholds and exit codes."""
 
+import csv
 import json
 
 import pytest
 from click.testing import CliRunner
+from html_tools import Page
 
 from wavebatch.cli.compare import compare
 from wavebatch.tools.simulate import simulate_strip
+
+NAMES = ("median", "mean", "rms", "nmad")
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +85,26 @@ def test_wrong_usage_has_exit_code_2(strips, arguments, words):
     result = run(*(strips / a if a.endswith(("las", "npz")) else a for a in arguments))
     assert result.exit_code == 2
     assert words in result.stderr
+
+
+def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, tmp_path):
+    """Ground and plants of two simulated strips: the same figures everywhere."""
+    files = ("-o", tmp_path / "t.csv", "--html", tmp_path / "p.html")
+    result = run(strips / "a.las", strips / "b.las", "--json", *files)
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    text = run(strips / "a.las", strips / "b.las").stdout
+    shown = Page(tmp_path / "p.html").check()
+    with (tmp_path / "t.csv").open(newline="") as file:
+        rows = {tuple(row.values())[:5]: row["value"] for row in csv.DictReader(file)}
+    assert "A - B by class " in text and "A - B by echoes" in text
+    for kind, groups in document["differences_by"].items():
+        assert len(groups) > 1 and sum(one["time"]["number"] for one in groups.values()) == document["matched"]
+        for group, quantities in groups.items():
+            one = quantities["time"]
+            title = f"{group}, time ns" if kind == "class" else f"{group} of the pulse, time ns"
+            (line,) = [line for line in text.splitlines() if line.startswith(title)]
+            assert line.removeprefix(title).split() == [str(one["number"]), *(f"{one[name]:.4f}" for name in NAMES)]
+            assert rows[f"differences by {kind}", "", group, "time", "number"] == str(one["number"])
+            row = next(row for row in shown.rows if row[:3] == [kind, group, "time"])
+            assert row[3] == f"{one['number']:,}"

@@ -15,14 +15,32 @@ ROW = re.compile(r"(?m)^\| `(\w+)` \| ([^|]+) \| ([^|]*) \|$")
 KINDS = {"text": str, "list": list, "object": dict, "true or false": bool, "null": type(None)}
 
 
+def _read_table(text):
+    """Keys of a table: types, and whether the key may be missing."""
+    return {key: (kind.split(" or ") if kind != "true or false" else [kind], meaning.startswith("optional"))
+            for key, kind, meaning in ROW.findall(text)}  # fmt: skip
+
+
 def _schemas():
-    """Keys of each schema: types, and whether the key may be missing."""
+    """Tables of each schema by the place of their objects in the document; its own is at the place ""."""
     parts = re.split(r"(?m)^## (wavebatch\.\S+)$", PAGE.read_text())[1:]
-    return {
-        name: {key: (kind.split(" or ") if kind != "true or false" else [kind], meaning.startswith("optional"))
-               for key, kind, meaning in ROW.findall(text)}
-        for name, text in zip(parts[::2], parts[1::2], strict=True)
-    }  # fmt: skip
+    found = {}
+    for name, text in zip(parts[::2], parts[1::2], strict=True):
+        first, *more = re.split(r"(?m)^### `(\S+)`$", text)
+        found[name] = {"": _read_table(first), **dict(zip(more[::2], map(_read_table, more[1::2]), strict=True))}
+    return found
+
+
+def _find(value, place):
+    """All objects at a place such as `scenes[].rows[].figures.*`; none where a key on the way is missing or null."""
+    for step in re.findall(r"\w+|\[\]|\*", place):
+        if step == "[]":
+            value = [one for many in value for one in many]
+        elif step == "*":
+            value = [one for many in value for one in many.values()]
+        else:
+            value = [one[step] for one in value if one.get(step) is not None]
+    return value
 
 
 def _is(value, kind):
@@ -32,12 +50,13 @@ def _is(value, kind):
 
 
 def _hold(document, schema):
-    keys = _schemas()[schema]
     assert document["schema"] == schema
-    needed = {key for key, (_, optional) in keys.items() if not optional}
-    assert needed <= set(document) <= set(keys), (needed ^ set(document)) & (needed | set(document) - set(keys))
-    for key, value in document.items():
-        assert any(_is(value, kind) for kind in keys[key][0]), (key, value)
+    for place, keys in _schemas()[schema].items():
+        needed = {key for key, (_, optional) in keys.items() if not optional}
+        for found in _find([document], place):
+            assert needed <= set(found) <= set(keys), (place, (needed ^ set(found)) & (needed | set(found) - set(keys)))
+            for key, value in found.items():
+                assert any(_is(value, kind) for kind in keys[key][0]), (place, key, value)
 
 
 def _print(*words):
@@ -53,6 +72,8 @@ def folder(riegl, tmp_path_factory):
     columns = "+incidence_angle,+incidence_angle_normals"
     document = _print("run", riegl, "-o", place, "--profile", "fast", "--columns", columns, "-q")
     (place / "run.json").write_text(json.dumps(document))
+    _print("slice", riegl, "-o", place / "s.csv", "--cube", place / "cube.npz", "-q")
+    _print("voxelize", riegl, "--size", 3, "-o", place / "voxels.npz", "-q")
     _print("simulate", "mixed", "-o", place / "sim.las", "--pulses", 300, "-q")
     return place
 
@@ -67,6 +88,17 @@ CASES = {
     "plot histogram CLOUD --column z -o h.png -q": "plot-histogram/1",
     "plot histogram CLOUD --column echo_flags -o f.png -q": "plot-histogram/1",
     "plot map CLOUD --statistic count -o m.png -q": "plot-map/1",
+    "plot section CLOUD -o s.png -q": "plot-section/1",
+    "plot section VOXELS -o sv.png -q": "plot-section/1",
+    "plot profile CLOUD -o p.png -q": "plot-profile/1",
+    "plot profile CLOUD --column echo_width --statistic mean -o pm.png -q": "plot-profile/1",
+    "plot cube CUBE -o c.png -q": "plot-cube/1",
+    "grid CLOUD --statistic density --size 5 -o d.tif -q": "grid/1",
+    "grid CLOUD --column z --column echo_width --no-data nan --where z>0 -o w.tif -q": "grid/1",
+    "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --no-peers --hazard H5 --tolerance 2cm": "bench/1",
+    "bench --scene empty --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability": "bench/1",
+    "bench --real STRIP --no-stability": "bench-real/1",
+    "bench --against ROOT --scene flat --pulses 300 --repeat 1": "bench-against/1",
     "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
@@ -88,7 +120,10 @@ CASES = {
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
-    names = {"STRIP": riegl, "CLOUD": folder / f"{riegl.stem}.laz", "SIM": folder / "sim.las"}
+    names = {"STRIP": riegl, "CLOUD": folder / f"{riegl.stem}.laz", "ROOT": PAGE.parents[1],
+             "SIM": folder / "sim.las", "CUBE": folder / "cube.npz", "VOXELS": folder / "voxels.npz"}  # fmt: skip
+    if line.startswith("grid"):
+        pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     found = _print(*(names.get(word, word) for word in line.split()))
     for document in found if isinstance(found, list) else [found]:
         _hold(document, f"wavebatch.{CASES[line]}")
@@ -105,10 +140,10 @@ def _with_json(command, path):
 def test_every_command_with_json_is_in_the_page_and_tested():
     context, text = click.Context(main), PAGE.read_text()
     paths = {path for name in COMMANDS for path in _with_json(main.get_command(context, name), name)}
-    assert {"run", "plot map"} <= paths
+    assert {"run", "plot map", "plot section", "plot profile", "plot cube", "grid", "bench"} <= paths
     for path in paths:
         assert re.search(rf"`{path}(?: [^`]*)? ?--json`", text), path
-        assert path == "bench" or any(line == path or line.startswith(f"{path} ") for line in CASES), path
+        assert any(line == path or line.startswith(f"{path} ") for line in CASES), path
 
 
 def test_only_one_document_goes_to_stdout(riegl, tmp_path):

@@ -173,7 +173,7 @@ def test_sbet_without_pyproj_or_crs_is_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="but the strip has no CRS"):
         read_trajectory(path)
     monkeypatch.setitem(__import__("sys").modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"pip install 'wavebatch\[gis\]'"):
+    with pytest.raises(InputError, match=r"pip install 'pyproj>=3.6'"):
         read_trajectory(path, crs="EPSG:32632")
 
 

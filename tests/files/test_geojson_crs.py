@@ -64,7 +64,7 @@ def test_what_cannot_be_placed_is_said(monkeypatch):
         plan_crs("a.las", None, "wgs84")
     assert plan_crs("a.las", None, "keep").member is None
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    with pytest.raises(ConfigError, match="needs pyproj: pip install .wavebatch.gis.*; or write .csv"):
+    with pytest.raises(ConfigError, match="needs pyproj: .*pip install .pyproj>=3.6.; or write .csv"):
         plan_crs("a.las", "EPSG:32632", "wgs84")
     with pytest.raises(ConfigError, match="must be one of wgs84, keep"):
         plan_crs("a.las", None, "epsg")

@@ -1,7 +1,10 @@
 """Which strips an argument list means."""
 
+import click
 import pytest
+from click.testing import CliRunner
 
+from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_files, find_strips
 
@@ -60,7 +63,9 @@ def test_a_named_file_that_is_missing_fails_later_and_alone(folder):
         (["*.laz2"], "matches no"),
         (["@none.txt"], "list cannot be read: No such file"),
         (["@loop.txt"], "line 1: a list cannot name another list"),
-        (["@blank.txt"], "no strip given"),
+        (["@blank.txt"], "blank.txt: the list names no file; write one"),
+        (["b.las", "@blank.txt"], "the list names no file"),
+        ([], "no file given; name files"),
         (["b.las", "sub/b.laz"], "both outputs would be named b"),
     ],
 )
@@ -73,3 +78,32 @@ def test_what_means_nothing_is_refused_in_one_line(folder, monkeypatch, argument
     with pytest.raises(ConfigError, match=words) as caught:
         find_strips(arguments)
     assert "\n" not in str(caught.value)
+
+
+def test_every_command_that_takes_lists_refuses_an_empty_one_in_one_line(tmp_path):
+    """A command that takes `@list.txt` reads it with `find_files`: it must neither crash nor end well on nothing."""
+    (tmp_path / "empty.txt").write_text("# nothing yet\n\n")
+    (tmp_path / "targets.csv").write_text("name,x,y,radius,reflectance\na,0,0,1,0.5\n")
+    given = f"@{tmp_path / 'empty.txt'}"
+    more = {"run": ["-o", tmp_path / "out"], "calibrate": ["--targets", tmp_path / "targets.csv", "-o", tmp_path / "c"],
+            "slice": ["-o", tmp_path / "s.csv"], "voxelize": ["--size", "1", "-o", tmp_path / "v.npz"],
+            "grid": ["--column", "z", "-o", tmp_path / "g.tif"], "plot histogram": ["--column", "z"],
+            "plot map": ["--column", "z"], "plot section": ["--column", "z"]}  # fmt: skip
+    takers = list(_list_takers(main))
+    assert {"run", "info", "check", "stats", "plot histogram", "plot profile", *more} <= set(takers)
+    for words in takers:
+        rest = [*more.get(words, []), *(["-o", tmp_path / "p.png"] if words.startswith("plot") else [])]
+        result = CliRunner().invoke(main, [*words.split(), given, *map(str, rest)])
+        assert result.exit_code == 2, (words, result.output, result.exception)
+        (line,) = result.stderr.splitlines()
+        assert line == f"error: {given[1:]}: the list names no file; write one file, folder or pattern per line", words
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.txt", "targets.csv"]
+
+
+def _list_takers(command, path=""):
+    """Paths of the commands with an argument whose help says `@list.txt`."""
+    if isinstance(command, click.Group):
+        for name in command.list_commands(click.Context(command)):
+            yield from _list_takers(command.get_command(click.Context(command), name), f"{path} {name}".strip())
+    elif "@list.txt" in (command.help or ""):
+        yield path

@@ -110,3 +110,20 @@ def test_samples_outside_say_nothing():
     start = np.array([[[60.0], [18.4], [2.2], [0.0]]])
     found = fit_skews(windows._replace(y=spoiled, x=position), start, BOX, prior=FREE, tolerance=1e-9)
     np.testing.assert_allclose(found.parameters[0, :, 0], [70, 18, 2, 0.2], atol=2e-3)
+
+
+@pytest.mark.parametrize(("origin", "skew"), [(11.0, 0.2), (9.0, 0.5)])
+def test_errors_with_an_origin_cover_the_scatter(origin, skew):
+    """The skew follows from width and time there, so that all derivatives have a part of it."""
+    rng = np.random.default_rng(5)
+    n, x = 1200, np.arange(60.0)
+    z = np.maximum(x - origin, 1e-9)
+    middle = 15.0 + rng.uniform(-0.5, 0.5, n)
+    y = 90 * np.exp(-0.5 * ((np.log(z) - np.log(middle)[:, None]) / skew) ** 2) + rng.standard_normal((n, 60))
+    width = skew * middle
+    true = np.stack([np.full(n, 90.0), origin + middle, width], axis=1)
+    start = np.concatenate([true, np.zeros((n, 1))], axis=1)[:, :, None]
+    box = Limits(*(np.array(edge)[None, :, None] for edge in ((0, -3, 0.5, -np.inf), (1e6, 90, 30, np.inf))))
+    found = fit_skews(windows_of(y, 1.0), start, box, origin=np.full(n, origin), tolerance=1e-6)
+    off = found.parameters[:, :3, 0] - true
+    assert np.std(off / found.errors[:, :3, 0], axis=0) == pytest.approx(np.ones(3), abs=0.08)

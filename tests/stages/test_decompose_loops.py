@@ -245,3 +245,17 @@ def test_long_waveforms_are_rendered_in_pieces_that_do_not_depend_on_other_wavef
         np.testing.assert_allclose(whole[row], dense, rtol=1e-4, atol=1e-3)
         alone = render.render_echoes(shape, 1, s, np.zeros(len(own), np.int32), *(values[own] for values in columns))
         np.testing.assert_array_equal(alone[0], whole[row])
+
+
+@pytest.mark.parametrize("std", [1.0, 4.0])
+def test_the_stop_rule_in_counts_does_not_depend_on_the_noise(std):
+    """A second echo of 20 counts is added by a limit of 14 counts, whatever the noise is said to be, and not by 26."""
+    recording = replace(RECORDING, noise_std=0.1)
+    block, _ = simulate_echoes(recording, np.tile([20.0, 32.0], (40, 1)), np.array([200.0, 20.0]), 2.0,
+                               np.random.default_rng(1))  # fmt: skip
+    noise = replace(known_noise(recording, 40), std=np.full(40, std, np.float32))
+    first = EchoTable.build(np.arange(40), np.full(40, 20.0), np.full(40, 200.0), np.full(40, 2.0))
+    loop = STAGES["decompose.residual_loop"].function
+    for limit, expected in ((14.0, 2), (26.0, 1)):
+        found = loop(block, noise, SYSTEM, first, t_diff=limit, t_unit="count", significance=0.0)
+        assert (found.count(40) == expected).all(), limit

@@ -204,3 +204,25 @@ def test_tables_of_wagner_et_al():
     identical, difference = differences(mean, asdf)
     assert identical >= 0.98
     assert np.sqrt(np.mean(difference**2)) < 0.05
+
+
+@pytest.mark.parametrize("apart", [7.5, 8.0])
+@pytest.mark.parametrize("threshold", [3.0, 4.0])
+def test_the_absolute_rule_asks_for_the_depth_that_noise_in_the_correlation_makes(apart, threshold):
+    """Two equal echoes: the wall between their minima rises with the square of the height, noise with the height."""
+    taps = reference_pulse(SYSTEM, 1.0, "gaussian", 5.0).taps
+    pair, edge = gauss(90, (1.0, 40.0, 2.0), (1.0, 40.0 + apart, 2.0)), np.zeros(len(taps))
+    wave = np.concatenate([edge, pair, edge])
+    height = wave.max()
+    # The definition of R, sample by sample, for a waveform of height 1.
+    depth = [np.sum((wave[t : t + len(taps)] - height * taps) ** 2) for t in range(len(wave) - len(taps))]
+    low = [t for t in range(1, len(depth) - 1) if depth[t - 1] > depth[t] <= depth[t + 1]]
+    first, second = sorted(sorted(low, key=lambda t: depth[t])[:2])
+    wall = max(depth[first:second]) - max(depth[first], depth[second])
+    # Noise of 1 moves the correlation by the root of the pulse's energy, and R by twice the height times that.
+    least = 2.0 * threshold * np.sqrt(np.sum(taps**2)) * height / wall
+    for factor, expected in ((0.85, 1), (1.15, 2)):
+        amplitude = factor * least
+        y = gauss(90, (amplitude, 40.0, 2.0), (amplitude, 40.0 + apart, 2.0))
+        found = detect("asdf", y, threshold=threshold)
+        assert len(found) == expected, (factor, found.time)

@@ -1,5 +1,7 @@
 """Wavelets and deconvolution: Wang's cases (T7), the numbers of docs/algorithms.md 1.2 and 2.5, plain twins."""
 
+from dataclasses import replace
+
 import naive
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from wavebatch.kernels.signal.deconvolve import (
 )
 from wavebatch.kernels.signal.wavelet import b3_detail, b3_gain, b3_level
 from wavebatch.stages.chain import STAGES
+from wavebatch.stages.detect.wavelet import transform
 from wavebatch.tools.simulate import FINE, fine_recording, known_noise, known_system, simulate_echoes
 
 GAUSS = np.exp(-0.5 * (np.arange(-6, 7) / 2) ** 2)
@@ -176,3 +179,34 @@ def test_times_are_in_ns_at_any_spacing():
     system = SystemPulse(1.0, baseline=5000.0, noise_std=30.0)
     for name in ("wavelet", "richardson_lucy"):
         assert STAGES[f"detect.{name}"].function(block, noise, system).time == pytest.approx([15.0], abs=0.02)
+
+
+CASES = [("wavelet", {}), ("wavelet", {"wavelet": "mexican_hat"}), ("richardson_lucy", {"reference": "gaussian"})]
+
+
+@pytest.mark.parametrize(("name", "parameters"), CASES)
+def test_amplitudes_are_those_of_the_echoes(name, parameters):
+    """Of the samples, not of the coefficients, which are a third as high."""
+    block, noise, _ = record([(100.0, 0.0)], 2.0, 1.0, 300)
+    found = STAGES[f"detect.{name}"].function(block, noise, SystemPulse(2.0, noise_std=FINE), **parameters)
+    assert np.median(found.amplitude[found.amplitude > 30 * FINE]) / FINE == pytest.approx(100.0, rel=0.08)
+
+
+@pytest.mark.parametrize("threshold", [3.5, 6.0])
+@pytest.mark.parametrize(("name", "parameters"), CASES)
+def test_thresholds_are_standard_deviations_of_what_is_searched(name, parameters, threshold):
+    """Echoes without noise, in units of the noise that white noise leaves in the same filter."""
+    pulse = np.exp(-0.5 * (np.arange(-40, 41) / 2.0) ** 2)[:, None]
+    if name == "wavelet":
+        how = (2.0, parameters.get("wavelet", "b3"), 0.0, 1.0)
+        white = np.random.default_rng(0).standard_normal((4000, 20))
+        spread = np.std(transform(white, *how)[0][100:-100])
+        least = threshold * spread / transform(pulse, *how)[0].max()
+    else:
+        least = threshold / np.sqrt(np.sum(pulse**2))
+    for factor, expected in ((0.88, 0), (1.12, 1)):
+        block, noise, _ = record([(10.0 * factor * least, 0.0)], 2.0, 0.0, 1)
+        noise = replace(noise, std=np.full(1, 10.0 * FINE, np.float32))
+        system = SystemPulse(2.0, noise_std=10.0 * FINE)
+        found = STAGES[f"detect.{name}"].function(block, noise, system, threshold=threshold, **parameters)
+        assert len(found) == expected, factor

@@ -572,3 +572,34 @@ def test_attributes_read_widths_as_the_pulse_that_was_fitted():
     )
     found = parse_chain(text, "c").run(block, SKEWED)
     np.testing.assert_allclose(found.attributes["echo_width"], 2.354820 * found.sigma, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.2, 0.4])
+def test_the_light_of_a_skewed_echo_is_its_integral_over_that_of_a_facing_surface(kappa):
+    """Skew adds area: a strip's skew counts for all of its echoes alike, that of one echo only as it differs."""
+    block = WaveformBlock.from_samples(np.zeros((1, 80), np.uint8), bits=8, spacing=0.5)
+    system = replace(SYSTEM, kappa=kappa)
+    time = np.linspace(-40.0, 120.0, 400_001)
+
+    def area(skew):
+        inside = 1.0 + skew * time / 3.0
+        level = np.log(np.maximum(inside, 1e-300)) / skew if skew else time / 3.0
+        return np.sum(np.where(inside > 0, np.exp(-0.5 * level**2), 0.0))
+
+    plain = EchoTable.build([0], [20.0], [50.0], [3.0])
+    assert echo_light(block, system, plain) == pytest.approx([150.0], rel=1e-6)
+    for skew in (0.1, 0.5):
+        own = plain.with_attributes(skew=np.array([skew], np.float32))
+        assert echo_light(block, system, own) == pytest.approx([150.0 * area(skew) / area(kappa)], rel=2e-4)
+
+
+@pytest.mark.parametrize("power", [1.4, 2.0, 3.0])
+def test_the_light_of_a_generalized_echo_is_its_integral(power):
+    """exp(-|z|^p / 2) with the same width at half height: its area over that of the Gaussian."""
+    block = WaveformBlock.from_samples(np.zeros((1, 80), np.uint8), bits=8, spacing=0.5)
+    time = np.linspace(-300.0, 300.0, 600_001)
+    half = 3.0 * np.sqrt(2.0 * np.log(2.0))
+    unit = half / (2.0 * np.log(2.0)) ** (1.0 / power)
+    area = np.sum(np.exp(-0.5 * np.abs(time / unit) ** power)) / np.sum(np.exp(-0.5 * (time / 3.0) ** 2))
+    echoes = EchoTable.build([0], [20.0], [50.0], [3.0]).with_attributes(power=np.array([power], np.float32))
+    assert echo_light(block, SYSTEM, echoes) == pytest.approx([150.0 * area], rel=2e-4)

@@ -261,6 +261,11 @@ def test_table_text_and_json_say_the_same(tmp_path):
         for k in range(1, 5):
             assert float(row[f"return_{k}"]) == pytest.approx(area["by_number"].get(str(k), 0), abs=1e-9)
             assert float(row[f"pulses_with_{k}"]) == pytest.approx(area["by_count"].get(str(k), 0), abs=1e-9)
+    for pair, name in (("", "all"), ("_1_2", "1-2"), ("_2_3", "2-3"), ("_3_4", "3-4"), ("_4", "4-")):
+        zone = document["files"][0]["dead_zones"].get(name, {"size": None, "error": None})
+        for column, key in (("dead_zone_m", "size"), ("dead_zone_err_m", "error")):
+            assert rows[0][column + pair] == ("" if zone[key] is None else f"{zone[key]:.10g}")
+            assert rows[1][column + pair] == ""  # areas have none
     again = CliRunner().invoke(stats, arguments)
     assert again.exit_code != 0 and "exists already" in again.stderr
     out = CliRunner().invoke(stats, [*arguments, "--overwrite"]).stdout

@@ -24,6 +24,7 @@ from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
 from wavebatch.tools.bench.cases import CASES, list_cases, make_scene
 from wavebatch.tools.bench.command import BenchOptions, run_bench
 from wavebatch.tools.bench.paired.compare import compare_runs, format_paired, simulate_strips
+from wavebatch.tools.bench.paired.jobs import Parts
 from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
 from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures
@@ -127,7 +128,7 @@ def test_command_writes_what_it_prints(tmp_path, monkeypatch):
     assert json.loads(result.stdout) == document
     mine = find_row(document, "mine")
     assert mine["figures"]["time_calibration_isolated"]["value"] is None and mine["file"]["median"] is None
-    assert "wavebatch[plot]" in result.stderr
+    assert "pip install 'matplotlib>=3.8'" in result.stderr
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["bench.json", "bench.txt"]
     assert "accurate" in (tmp_path / "out" / "bench.txt").read_text()
 
@@ -333,6 +334,36 @@ def test_two_checkouts_take_turns(tmp_path, checkout):
         middle, low, high = ratios[name]
         assert 0 < low <= middle <= high
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
+
+
+def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path):
+    options = ["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")]
+    two = CliRunner().invoke(main, ["bench", "--jobs-model", "a.las", "b.las", *options])
+    assert two.exit_code == 2 and "one strip" in two.stderr
+    result = CliRunner().invoke(main, ["bench", "--jobs-model", "--json", *options])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    parts = document["parts"]
+    assert 2900 < parts["waveforms"] <= 3000
+    assert all(parts[name] > 0 for name in ("start", "start_worker", "prepare", "single", "write", "strip"))
+    text = (tmp_path / "out" / "jobs.txt").read_text()
+    assert [line.split()[0] for line in text.splitlines()[10:15]] == ["1", "2", "4", "16", "64"]
+    assert json.loads((tmp_path / "out" / "jobs.json").read_text())["parts"] == parts
+
+
+def test_the_slowest_part_bounds_many_jobs():
+    """A strip that is prepared alone; one process that writes; many strips hide the preparation."""
+    parts = Parts(1_000_000, start=0.25, start_worker=0.5, prepare=1.0, single=10e-6, work=10e-6, write=0.5e-6,
+                  strip=0.0, tail=0.0)  # fmt: skip
+    assert parts.predict(1) == pytest.approx(0.25 + 1 + 10)
+    assert parts.predict(2) == pytest.approx(0.5 + 1 + 5)
+    assert parts.predict(64) == pytest.approx(0.5 + 1 + 0.5)
+    assert parts.predict(1, 100) == pytest.approx(0.25 + 1100)
+    assert parts.predict(10, 100) == pytest.approx(0.5 + 110 + 1)
+    assert parts.predict(64, 100) == pytest.approx(0.5 + 50 + 1)
+    assert parts.most == pytest.approx(22)
+    assert replace(parts, strip=1.0).predict(64, 100) == pytest.approx(0.5 + 150 + 1)
+    assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 1 + 5 + 0.2)
 
 
 def test_of_two_checkouts_the_slower_one_is_seen(tmp_path, checkout):

@@ -334,19 +334,22 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
     flags = np.where(far, EchoFlag.WEAK | EchoFlag.OVERLAPPED, np.where(rng.random(len(times)) < 0.3, 32, 0))
     amplitude = np.exp(rng.uniform(-1, 6, len(times))).astype("f4")
     amplitude[:9] = np.nan
+    kinds = rng.choice([1, 2, 5, 64], len(times))
     write_cloud(tmp_path / "a.las", times[keep], moved[keep], echo_flags=flags[keep].astype("u2"))
     write_cloud(tmp_path / "b.las", times, xyz, amplitude=amplitude)
     for name, these in (("a.las", keep), ("b.las", np.ones(len(keep), bool))):
         cloud = laspy.read(tmp_path / name)
         cloud.return_number, cloud.number_of_returns = number[these], total[these]
         cloud.intensity = np.full(these.sum(), 9)
+        cloud.classification = kinds[these]
         cloud.write(tmp_path / name)
     monkeypatch.setattr(buckets, "BUCKET_ROWS", 900)
     result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
     missed, extra = far | ~keep, far & keep
-    naive = {"return": {}, "amplitude": {}, "flag": {}}
+    naive = {"return": {}, "amplitude": {}, "flag": {}, "class": {}}
+    names = {1: "1 unclassified", 2: "2 ground", 5: "5 high vegetation", 64: "64"}
     for echo in range(len(times)):
-        classes = {"return": f"{number[echo]} of {total[echo]}"}
+        classes = {"return": f"{number[echo]} of {total[echo]}", "class": names[kinds[echo]]}
         if not np.isnan(amplitude[echo]):
             n = int(np.floor(np.log2(amplitude[echo])))
             classes["amplitude"] = "below 1" if n < 0 else f"{2**n}-{2 ** (n + 1)}"
@@ -356,7 +359,8 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
     assert (result.missed, result.extra) == (missed.sum(), extra.sum())
     assert result.missed_by["return"] == naive["return"]
     assert result.missed_by["amplitude"] == naive["amplitude"]
-    assert set(result.missed_by) == {"return", "amplitude", *(["pulse"] if by == "time" else [])}
+    assert result.missed_by["class"] == naive["class"]
+    assert set(result.missed_by) == {"return", "class", "amplitude", *(["pulse"] if by == "time" else [])}
     of = keep & ~far & (flags == 32)
     weak = {"WEAK": (extra.sum(), extra.sum() + of.sum()), "OVERLAPPED": (extra.sum(), extra.sum())}
     assert result.extra_by["flag"] == {**weak, "none": (0, (keep & (flags == 0)).sum())}
@@ -372,3 +376,54 @@ def test_missed_and_extra_are_broken_down_as_a_loop_does_it(tmp_path, monkeypatc
     both = 2 * result.matched / (result.echoes_a + result.echoes_b)
     assert result.identical == pytest.approx(both) and result.to_json()["identical"] == result.identical
     assert result.gain == pytest.approx(keep.sum() / len(times) - 1)
+
+
+def _set_fields(path, **fields):
+    cloud = laspy.read(path)
+    for name, values in fields.items():
+        cloud[name] = values
+    cloud.write(path)
+
+
+@pytest.mark.parametrize("point_format", [1, 6])
+@pytest.mark.parametrize("classified", ["a", "b", "both"])
+def test_differences_by_class_and_by_number_of_echoes(tmp_path, classified, point_format):
+    """Each class has its own shift; the classes of b count, and those of a only where b has none."""
+    pulse, times, xyz, ray = make_pulses(1500, seed=3)
+    kinds = np.random.default_rng(4).choice([1, 2, 6], len(times))
+    total = np.bincount(pulse)[pulse]
+    shift = 0.1 * kinds + 0.01 * total
+    place = xyz + (shift * SPEED)[:, None] * ray
+    for name, where in (("a", place), ("b", xyz)):
+        write_cloud(tmp_path / f"{name}.las", times, where, point_format=6)
+        _set_fields(tmp_path / f"{name}.las", number_of_returns=total, return_number=np.ones(len(times), int))
+        if point_format == 1:
+            cloud = laspy.convert(laspy.read(tmp_path / f"{name}.las"), point_format_id=1, file_version="1.2")
+            cloud.synthetic = np.ones(len(times), int)  # a flag in the byte of the class
+            cloud.write(tmp_path / f"{name}.las")
+        if classified in (name, "both"):
+            # Where both have classes, those of a are wrong on purpose.
+            _set_fields(
+                tmp_path / f"{name}.las",
+                classification=np.full(len(kinds), 9) if (name, classified) == ("a", "both") else kinds,
+            )
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "b.las")
+    assert list(result.differences_by) == ["class", "echoes"]
+    names = {1: "1 unclassified", 2: "2 ground", 6: "6 building"}
+    for kind, values, titles in (("class", kinds, names), ("echoes", total, {1: "1", 2: "2", 3: "3"})):
+        groups = result.differences_by[kind]
+        assert list(groups) == list(titles.values())
+        for value, title in titles.items():
+            lag, found = shift[values == value], groups[title]["time"]
+            assert found.number == len(lag)
+            assert (found.median, found.mean) == pytest.approx((np.median(lag), lag.mean()), abs=2e-3)
+            assert found.rms == pytest.approx(np.sqrt(np.mean(lag**2)), abs=2e-3)
+    document = result.to_json()["differences_by"]
+    assert document["class"]["2 ground"]["time"]["number"] == (kinds == 2).sum()
+
+
+def test_clouds_without_classes_have_no_table_of_them(tmp_path):
+    _, times, xyz, _ = make_pulses(50)
+    write_cloud(tmp_path / "a.las", times, xyz)
+    result = compare_clouds(tmp_path / "a.las", tmp_path / "a.las")
+    assert "class" not in result.differences_by and "class" not in result.missed_by

@@ -39,6 +39,16 @@ def test_rows_are_the_figures_of_the_document(tmp_path, tiny_strip):
         assert float(found["differences", "", "", name, "rms"] or "nan") == pytest.approx(
             float("nan") if spread["rms"] is None else spread["rms"], nan_ok=True
         )
+    assert set(between["differences_by"]["echoes"]) >= {"1", "2"}
+    for group, quantities in between["differences_by"]["echoes"].items():
+        for quantity, spread in quantities.items():
+            rows = {
+                key[4]: value
+                for key, value in found.items()
+                if key[:4] == ("differences by echoes", "", group, quantity)
+            }
+            assert int(rows["number"]) == spread["number"]
+            assert float(rows["mean"]) == pytest.approx(spread["mean"])
     assert not any("(" in value for value in found.values())
     refused = run("fast", "balanced", "--strip", tiny_strip, "--limit", 200, "-o", target)
     assert refused.exit_code == 2 and "--overwrite" in refused.stderr

@@ -15,7 +15,7 @@ from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.compare.clouds import compare_clouds
-from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, simulate_returns
+from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, return_light, simulate_returns
 from wavebatch.tools.simulate.from_returns import Radar, SynthesisOptions, synthesize_strip
 
 
@@ -187,3 +187,142 @@ def test_command_line(cloud, tmp_path):
     radar = run(cloud, "-o", tmp_path / "r.las", *figures)
     assert radar.exit_code == 0, radar.output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["r.las", "s.las"]
+
+
+FIGURES = {"gain": 1e11, "radar": Radar(1200.0, power=4000.0), "bits": 16, "spacing": 0.5, "width": 5.0}
+
+
+def add_columns(path, target, **columns):
+    """The cloud with extra bytes; a name with a unit in brackets gets it as its description."""
+    cloud = laspy.read(path)
+    for name, values in columns.items():
+        cloud.add_extra_dim(laspy.ExtraBytesParams(name.split("[")[0], "f4", description=name))
+        cloud[name.split("[")[0]] = values
+    cloud.write(target)
+    return target
+
+
+def energies(path, spacing=0.5, baseline=12.0):
+    """Energy of each pulse's samples above the baseline by GPS time [DN ns]."""
+    found = {}
+    for block in read_blocks(path):
+        found |= dict(zip(block.gps_time.tolist(), spacing * (block.samples - baseline).sum(axis=1), strict=True))
+    return np.array([found[key] for key in sorted(found)])
+
+
+def pulses_of(path):
+    """Pulse of each point, from 0 in the order of the times, and returns per pulse."""
+    times = np.unique(laspy.read(path).gps_time, return_inverse=True)[1]
+    return times, np.bincount(times)
+
+
+def test_each_return_sends_back_its_share_of_the_light(cloud, tmp_path):
+    """Energies of pulses with shares are those sums of the energies of the returns alone."""
+    pulse, number = pulses_of(cloud)
+    share = np.random.default_rng(1).uniform(0.2, 0.9, len(pulse)).astype("f4") / number[pulse]
+    given = add_columns(cloud, tmp_path / "c.las", footprint=share)
+    whole = synthesize_strip(given, tmp_path / "w.las", SynthesisOptions("reflectance", **FIGURES))
+    part = synthesize_strip(given, tmp_path / "s.las", SynthesisOptions("reflectance", shares="footprint", **FIGURES))
+    even = synthesize_strip(given, tmp_path / "e.las", SynthesisOptions("reflectance", shares="equal", **FIGURES))
+    ones = number == 1
+    ratio = energies(tmp_path / "s.las")[ones] / energies(tmp_path / "w.las")[ones]
+    assert ratio == pytest.approx(share[ones[pulse]], rel=0.02)
+    assert energies(tmp_path / "e.las") == pytest.approx(energies(tmp_path / "w.las") / number, rel=0.02)
+    assert part.light.own_share == len(pulse) and part.light.assumed_share == part.light.over_one == 0
+    assert part.light_used == pytest.approx(np.bincount(pulse, share).mean()) and even.light_used == pytest.approx(1)
+    assert np.isnan(whole.light_used)
+    for summary, name in ((whole, "w"), (part, "s"), (even, "e")):
+        assert summary.saturated == 0
+        assert summary.energy_recorded == pytest.approx(energies(tmp_path / f"{name}.las").sum(), rel=1e-9)
+        assert summary.energy_recorded == pytest.approx(summary.energy, rel=0.003)
+
+
+def test_shares_of_a_pulse_are_at_most_one_and_gaps_take_the_rest():
+    starts = np.array([0, 2, 5, 7, 8, 10])
+    share = np.array([0.3, np.nan, 0.2, np.nan, np.nan, 0.9, 0.6, np.nan, 1.0, np.nan, 1.00005])
+    filled, over = return_light.fill_shares(share, starts)
+    assert filled == pytest.approx([0.3, 0.7, 0.2, 0.4, 0.4, 0.6, 0.4, 1.0, 1.0, 0.0, 1.0])
+    assert over == 1  # float32 dust above 1 is none
+    rng = np.random.default_rng(0)
+    count = rng.integers(1, 6, 500)
+    starts = np.cumsum(count) - count
+    share = np.where(rng.random(count.sum()) < 0.3, np.nan, rng.random(count.sum()))
+    filled, _ = return_light.fill_shares(share, starts)
+    assert filled.min() >= 0 and np.add.reduceat(filled, starts).max() < 1 + 1e-12
+    for start, n in zip(starts, count, strict=True):
+        part = share[start : start + n]
+        known = part[~np.isnan(part)]
+        if len(known) == n and known.sum() <= 1:
+            assert filled[start : start + n] == pytest.approx(part)
+
+
+def test_a_wide_echo_is_lower_and_has_the_same_energy(cloud, tmp_path):
+    pulse, number = pulses_of(cloud)
+    width = np.where(pulse % 2, 10.0, 5.0).astype("f4")
+    width[::7] = np.nan  # those of the pulse
+    given = add_columns(cloud, tmp_path / "c.las", **{"their width[ns]": width})
+    synthesize_strip(given, tmp_path / "p.las", SynthesisOptions("reflectance", **FIGURES))
+    options = SynthesisOptions("reflectance", widths="their width", **FIGURES)
+    summary = synthesize_strip(given, tmp_path / "w.las", options)
+    assert energies(tmp_path / "w.las") == pytest.approx(energies(tmp_path / "p.las"), rel=0.02)
+    assert summary.light.own_width == np.isfinite(width).sum() and summary.light.limited_width == 0
+    peaks = {}
+    for name in ("p", "w"):
+        for block in read_blocks(tmp_path / f"{name}.las"):
+            top = block.samples.max(axis=1) - 12.0
+            peaks |= {(name, time): height for time, height in zip(block.gps_time.tolist(), top, strict=True)}
+    times = np.unique(laspy.read(cloud).gps_time)
+    ratio = np.array([peaks["w", time] / peaks["p", time] for time in times.tolist()])
+    lone = number == 1
+    expected = np.where(width[lone[pulse]] == 10.0, 0.5, 1.0)
+    assert ratio[lone] == pytest.approx(expected, rel=0.03)
+
+
+def test_energy_says_what_saturation_loses(cloud, tmp_path):
+    options = {**FIGURES, "bits": 8, "gain": 2e12}
+    summary = synthesize_strip(cloud, tmp_path / "s.las", SynthesisOptions("reflectance", **options))
+    assert summary.saturated > 100 and summary.energy_recorded < 0.9 * summary.energy
+
+
+def test_wrong_shares_and_widths_are_one_line(cloud, tmp_path):
+    points = len(laspy.read(cloud))
+    columns = {"percent": np.full(points, 40.0), "share[%]": np.full(points, 0.4), "minus": np.full(points, -0.1)}
+    given = add_columns(cloud, tmp_path / "c.las", **columns, **{"w[ps]": np.full(points, 4000.0)},
+                        footprint=np.full(points, 0.9))  # fmt: skip
+    figures = ("--intensity", "reflectance", "--sensor-height", "1200", "-o", tmp_path / "s.las")
+    for words, code, part in (
+        (("--shares", "percent"), 1, "holds 40, which is no share"),
+        (("--shares", "minus"), 1, "holds -0.1"),
+        (("--shares", "share"), 2, "is in [%], needed is [-]"),
+        (("--widths", "w"), 2, "is in [ps], needed is [ns]"),
+        (("--shares", "footprnt"), 2, "did you mean 'footprint'"),
+        (("--widths", "nothing"), 2, "has no column 'nothing'"),
+    ):
+        result = run(given, *figures, *words)
+        assert (result.exit_code, result.stderr.count("\n")) == (code, 1) and part in result.stderr, result.stderr
+        assert not (tmp_path / "s.las").exists()
+    peaks = run(given, "-o", tmp_path / "s.las", "--shares", "footprint")
+    assert peaks.exit_code == 2 and "need --intensity reflectance" in peaks.stderr
+    over = run(given, *figures, "--shares", "footprint")
+    assert "with shares above 1 together, scaled to 1" in over.stderr and "energy: " in over.stderr
+    document = json.loads(run(given, *figures, "--shares", "footprint", "--json", "-q", "--overwrite").stdout)
+    assert document["light"]["over_one"] == np.count_nonzero(pulses_of(cloud)[1] > 1)
+    assert document["light_used"] < 1
+
+
+def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_path):
+    """First returns alone keep the energy that they have in the whole cloud."""
+    las = laspy.read(cloud)
+    las.points = las.points[np.array(las.return_number) == 1]
+    las.write(tmp_path / "first.las")
+    options = SynthesisOptions("reflectance", shares="equal", **FIGURES)
+    whole = synthesize_strip(cloud, tmp_path / "w.las", options)
+    first = synthesize_strip(tmp_path / "first.las", tmp_path / "f.las", options)
+    number = np.array(las.number_of_returns)
+    assert whole.light_used == pytest.approx(1) and first.light_used == pytest.approx(np.mean(1 / number))
+    assert first.scattered == np.count_nonzero(number > 1)
+    starts = np.array([0, 2, 3])
+    assert return_light.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
+    said = run(tmp_path / "first.las", "-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200,
+               "--shares", "equal")  # fmt: skip
+    assert "shares of incomplete pulses" in said.stderr

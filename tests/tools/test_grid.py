@@ -76,7 +76,7 @@ def test_without_rasterio_one_line_says_what_to_install(rng, tmp_path, monkeypat
     _cloud(tmp_path / "a.las", rng, 10)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
-    assert "pip install rasterio" in result.stderr and result.stderr.count("\n") == 1
+    assert "pip install" in result.stderr and "'rasterio>=1.3'" in result.stderr and result.stderr.count("\n") == 1
 
 
 @pytest.fixture

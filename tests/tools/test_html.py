@@ -78,6 +78,9 @@ def test_pages_of_survey_and_compare(flight, tiny_strip, tmp_path):
     assert shown.row("noise")[1] == f"{document['system']['noise_std_dn']:.3f} DN"
     assert all(one["reason"] in shown.text for one in document["decisions"])
     assert 'aria-label="System pulse"' in shown.source
+    digits = [part.lstrip("-0.").replace(".", "").replace(",", "") for row in shown.rows for part in row
+              if part.replace(",", "").replace(".", "").lstrip("-").isdigit() and "." in part]  # fmt: skip
+    assert digits and max(map(len, digits)) <= 5 and "1 gaussians" not in shown.text
     found = _run("compare", cloud, tiny_strip, "--html", tmp_path / "c.html", "--json")
     shown, document = Page(tmp_path / "c.html").check(), json.loads(found.stdout)
     assert shown.row("identical")[1] == f"{document['matched']:,}" and "does not add up" not in shown.text

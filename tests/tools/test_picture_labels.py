@@ -12,6 +12,7 @@ from wavebatch.cli import main
 from wavebatch.files import figure_file
 from wavebatch.files.figure_file import open_picture
 from wavebatch.kernels.fit.pulse_shape import PulseShape
+from wavebatch.tools.plots import labels
 from wavebatch.tools.plots.draw_waveform import draw_waveforms
 from wavebatch.tools.plots.labels import fit_parts, fit_text, place_labels, text_width
 from wavebatch.tools.plots.waveform import build_views
@@ -150,3 +151,22 @@ def test_texts_are_shortened_to_their_room_and_labels_cover_nothing(tmp_path):
             assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
             for other in boxes[number + 1 :]:
                 assert box.intersection(box, other) is None or box.intersection(box, other).width < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "most", "expected"),
+    [
+        (112.0, 145.0, 2, [120, 140]), (112.0, 145.0, 1, [120]), (-0.3, 0.2, 2, [-0.2, 0.2]),
+        (350.1, 350.2, 1, [350.15]), (5.0, 5.0, 2, [5.0]), (0.0, 1.0, 2, [0, 1.0]),
+    ],
+)  # fmt: skip
+def test_short_axes_have_one_or_two_round_ticks(low, high, most, expected):
+    assert labels._round_places(low, high, most) == pytest.approx(expected)
+
+
+def test_short_axes_always_have_a_tick_inside():
+    rng = np.random.default_rng(0)
+    for low, span in zip(rng.normal(0, 1000, 2000), 10.0 ** rng.uniform(-4, 4, 2000), strict=True):
+        for most in (1, 2):
+            places = labels._round_places(low, low + span, most)
+            assert 1 <= len(places) <= most and all(low - 1e-9 <= place <= low + span + 1e-9 for place in places)

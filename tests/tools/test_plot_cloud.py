@@ -493,7 +493,8 @@ def test_wrong_usage(cloud, tmp_path, monkeypatch, words, message):
 def test_without_matplotlib_a_line_says_what_to_install(cloud, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     result = run("histogram", cloud, "--column", "z", "-o", tmp_path / "p.png")
-    assert result.exit_code == 2 and "pip install 'wavebatch[plot]'" in result.stderr
+    assert result.exit_code == 2 and "pictures need matplotlib: " in result.stderr
+    assert "pip install" in result.stderr and "'matplotlib>=3.8'" in result.stderr
 
 
 def test_a_matplotlib_that_does_not_work_is_one_line(cloud, tmp_path, monkeypatch):

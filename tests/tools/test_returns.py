@@ -15,7 +15,7 @@ from wavebatch.files.disk.publish import publish_together
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.return_stats import returns
+from wavebatch.tools.return_stats import dead_zones, returns
 from wavebatch.tools.return_stats.returns import count_returns
 from wavebatch.tools.simulate import DiscreteReceiver, simulate_returns
 
@@ -159,3 +159,62 @@ def test_text_has_every_figure(tmp_path):
     other = write_cloud(tmp_path / "d.las", **SMALL)
     assert "total" in CliRunner().invoke(stats, [str(path), str(other)]).stdout
     assert "total" not in CliRunner().invoke(stats, [str(path), str(path)]).stdout  # one file counts once
+
+
+def _write_pairs(path, zones, pairs, rng, duplicates=0):
+    """Pulses of four returns; returns k and k + 1 are at least zones[k - 1] apart."""
+    apart = np.asarray(zones) + rng.exponential(3.0, (pairs, 3))
+    apart[:duplicates] = 0.0
+    z = 500.0 - np.concatenate([np.zeros((pairs, 1)), np.cumsum(apart, axis=1)], axis=1)
+    number = np.tile([1, 2, 3, 4], pairs)
+    return write_cloud(path, np.repeat(1.0 + np.arange(pairs), 4), z.ravel(), number, np.full(4 * pairs, 4))
+
+
+@pytest.mark.parametrize("pairs", [150, 3000, 40_000])
+def test_dead_zones_by_return_number_are_those_of_the_receiver(tmp_path, rng, pairs):
+    """The true distance lies between the size less three errors and the size."""
+    zones = (0.64, 1.5, 2.2)
+    duplicates = pairs // 3000
+    found = count_returns([_write_pairs(tmp_path / "c.las", zones, pairs, rng, duplicates)])[1].dead_zones
+    assert list(found) == ["all", "1-2", "2-3", "3-4"]
+    for name, true in zip(found, (0.64, *zones), strict=True):
+        one = found[name]
+        assert one.pairs == (3 * pairs if name == "all" else pairs)
+        assert one.size - 3 * one.error - 0.01 <= true <= one.size + 0.01
+        assert one.error < max(100 / pairs, 0.03)
+
+
+@pytest.mark.parametrize(("pairs", "mean"), [(400, 2.0), (5000, 20.0)])
+def test_error_of_a_dead_zone_is_the_size_of_its_miss(rng, pairs, mean):
+    """Over many samples the misses are as large as the errors say; of 5000 pairs the edge is the sixth distance."""
+    misses = []
+    for _ in range(300):
+        distance = np.minimum(0.7 + rng.exponential(mean, pairs), 99.0)
+        bins = np.bincount((100 * distance).astype(int), minlength=dead_zones.BINS)
+        found = dead_zones.find_zone(bins[: dead_zones.BINS])
+        misses.append((found.size - 0.7) / found.error)
+    assert 0.4 < np.sqrt(np.mean(np.square(misses))) < 1.6
+    assert np.min(misses) > -1.01
+
+
+def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
+    path = _write_pairs(tmp_path / "c.las", (1, 1, 1), 40, rng)
+    result = CliRunner().invoke(stats, [str(path), "--json"])
+    zones = json.loads(result.stdout)["total"]["dead_zones"]
+    assert zones["1-2"] == {"pairs": 40, "size": None, "error": None}
+    assert zones["all"]["pairs"] == 120 and zones["all"]["size"] > 0.9
+    text = CliRunner().invoke(stats, [str(path)]).stdout
+    assert text.count("no-data: fewer than 100 pairs") == 3
+    far = _write_pairs(tmp_path / "f.las", (150, 150, 150), 200, rng)
+    assert CliRunner().invoke(stats, [str(far)]).stdout.count("no-data: all far") == 4
+
+
+def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp_path):
+    """Distances at least 1 m, 300 per metre up to 2 m and 100 per metre beyond: the zone hides 300 of 1000 pulses."""
+    apart = np.concatenate([np.linspace(1.0, 1.999, 300), np.linspace(2.0, 8.999, 700)])
+    time, number = np.repeat(1.0 + np.arange(1000), 2), np.tile([1, 2], 1000)
+    z = 100.0 - np.stack([np.zeros(1000), apart], axis=1).ravel()
+    found = count_returns([write_cloud(tmp_path / "c.las", time, z, number, np.full(2000, 2))])[1]
+    assert found.dead_zone == pytest.approx(1.0, abs=0.011)
+    assert found.hidden == pytest.approx(0.3, abs=0.006)
+    assert any(line.startswith("dead zone") and "0.30" in line for line in found.warnings)

@@ -16,6 +16,9 @@ from wavebatch.tools.plots.section_data import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
 from wavebatch.tools.slices.cube import build_cube, cut_cube
 from wavebatch.tools.slices.lines import read_scan_lines
+from wavebatch.tools.slices.output import SegmentWriter
+from wavebatch.tools.slices.read_segments import profile_segments
+from wavebatch.tools.slices.segments import Segment
 from wavebatch.tools.voxels.grid import COLUMNS
 
 LINE = (500_005.0, 5_400_003.0, 500_030.0, 5_400_020.0)
@@ -94,6 +97,8 @@ def test_sections_of_voxels(voxels):
         ("section {voxels} --flags-with WEAK", 2, "no echo_flags"), ("profile {cloud} --size -1", 2, "above 0"),
         ("profile {cloud} --size 1e-9", 2, "more than 5000 bins"),
         ("profile {cloud} --statistic sum", 2, "needs a --column"),
+        ("section {cloud} --where z<-99", 1, "5000 of 5000 points are left out by --where"),
+        ("section s.csv", 2, "segments have no side view"),
         ("section {cube}", 1, "holds no voxels"), ("cube {voxels}", 1, "holds no cube"),
     ],
 )  # fmt: skip
@@ -181,3 +186,122 @@ def test_slice_writes_cube_and_overview_once(riegl, tmp_path):
     assert (tmp_path / "c.npz").read_bytes() == first, "the same input gives the same bytes"
     assert run("slice", riegl, "--cube", tmp_path / "c.txt").exit_code == 2
     assert sorted(path.name for path in Path(tmp_path).iterdir()) == ["c.npz", "o.png"]
+
+
+def _write_segments(path, heights, lengths):
+    """Segments as `wavebatch slice` writes them."""
+    segments = [
+        Segment(line=0, segment=n, start=(0.0, 0.0, float(a)), end=(1.0, 1.0, float(b)), ends=((0, 0), (1, 1)),
+                length=float(length), slope=0.0, residual=0.1, pulses=5, first_pulse=0, last_pulse=4, first_point=0,
+                theta=0.0, rho=0.0, weight=2.0)
+        for n, ((a, b), length) in enumerate(zip(heights, lengths, strict=True))
+    ]  # fmt: skip
+    with SegmentWriter(path, overwrite=True) as writer:
+        writer.write(segments)
+        writer.commit()
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".geojson"])
+def test_segments_count_at_their_heights(tmp_path, suffix):
+    """A segment gives each bin the share of its height: as many small pieces of it would."""
+    rng = np.random.default_rng(2)
+    low = rng.uniform(100, 140, 300)
+    heights = np.stack([low, low + rng.choice([0.0, 0.0, 0.3, 7.0, -5.0], 300)], axis=1).round(4)
+    lengths = rng.uniform(1, 9, 300).round(5)
+    path = _write_segments(tmp_path / f"s{suffix}", heights, lengths)
+    found = profile_segments([path], None, "count", size=2.0)
+    fine = (np.arange(4000) + 0.5) / 4000
+    pieces = heights[:, :1] + fine * (heights[:, 1] - heights[:, 0])[:, None]
+    expected = np.histogram(pieces.ravel(), found.edges)[0] / 4000
+    assert found.values[0] == pytest.approx(expected, abs=0.02) and found.values.sum() == pytest.approx(300)
+    assert found.label == "segments per height [-]" and found.outside == 0
+    sums = profile_segments([path], "length", "sum", size=2.0)
+    expected = np.histogram(pieces.ravel(), found.edges, weights=np.repeat(lengths, 4000))[0] / 4000
+    assert sums.values[0] == pytest.approx(expected, abs=0.1)
+    mean = profile_segments([path, path], "length", "mean", size=2.0, each=True)
+    full = found.values[0] > 0.1
+    for row in mean.values:
+        assert row[full] == pytest.approx((sums.values / found.values)[0][full])
+
+
+def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
+    pytest.importorskip("matplotlib")
+    assert run("slice", riegl, "-o", tmp_path / "s.csv", "--lines", "0:20", "-q").exit_code == 0
+    result = run("plot", "profile", tmp_path / "s.csv", "--column", "length", "-o", tmp_path / "p.svg")
+    number = (tmp_path / "s.csv").read_text().count("\n") - 1
+    assert result.exit_code == 0 and f"{number} segments" in result.stderr, result.output
+    assert "sum of length" in (tmp_path / "p.svg").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("s.csv c.las", 2, "without clouds"), ("s.csv --where z<3", 2, "--where selects points"),
+        ("s.csv --flags-with WEAK", 2, "--flags-with selects points"), ("s.csv --column lenght", 2, "'length'"),
+        ("s.csv --statistic mean", 2, "needs a --column"), ("empty.csv", 1, "holds no segment"),
+        ("other.csv", 1, "'z1' is missing"), ("bad.csv", 1, "holds no segments"), ("nan.csv", 1, "segment 1 holds"),
+        ("bad.geojson", 1, "holds no segments"), ("list.geojson", 1, "holds no segments"), ("none.csv", 1, "none.csv"),
+        ("flat.geojson", 1, "holds no segments"),
+    ],
+)  # fmt: skip
+def test_wrong_segments_are_one_line(cloud, tmp_path, monkeypatch, words, code, message):
+    monkeypatch.chdir(tmp_path)
+    _write_segments(tmp_path / "s.csv", [(1, 2), (3, 4)], [1, 2])
+    head = (tmp_path / "s.csv").read_text().splitlines()[0]
+    row = (tmp_path / "s.csv").read_text().splitlines()[1].split(",")
+    texts = {"empty.csv": head + "\n", "other.csv": "a,b\n1,2\n", "bad.geojson": "{", "list.geojson": "[1]",
+             "bad.csv": f"{head}\n" + ",".join([*row[:4], "x", *row[5:]]) + "\n",
+             "nan.csv": f"{head}\n" + ",".join([*row[:4], "nan", *row[5:]]) + "\n",
+             "flat.geojson": '{"features": [{"properties": {}, "geometry": {"coordinates": [[1, 2], [3, 4]]}}]}',
+             }  # fmt: skip
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    result = run("plot", "profile", *words.split(), "-o", "p.png")
+    assert result.exit_code == code and message in result.stderr, result.output
+    assert result.stderr.count("\n") == 1 and not (tmp_path / "p.png").exists()
+
+
+@pytest.mark.parametrize("many", [40, 3000, 30_000])
+def test_far_points_leave_the_frame_of_a_section_and_are_counted(tmp_path, monkeypatch, many):
+    """One point 116 m below pressed the others into a line; what is near the others stays."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(section_data, "MOST_POINTS", 20_000)
+    rng = np.random.default_rng(1)
+    las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+    las.header.scales = [0.001] * 3
+    height = rng.normal(350.0, 0.3, many)
+    height[0], height[1] = 353.0, 234.0
+    las.x, las.y, las.z = np.linspace(0.0, 80.0, many), rng.uniform(0, 1, many), height
+    las.write(tmp_path / "c.las")
+    found = cut_section([tmp_path / "c.las"], Selection("z"), line=(0, 0.5, 80, 0.5), width=2.0)
+    assert (found.inside, found.outside) == (many, 1)
+    assert found.height.min() > 345 and found.height.max() == pytest.approx(353.0)
+    result = run("plot", "section", tmp_path / "c.las", "-o", tmp_path / "s.svg")
+    assert "1 outside" in result.stderr and "1 outside" in (tmp_path / "s.svg").read_text("utf-8")
+
+
+def test_a_tower_and_a_few_points_stay_in_the_section():
+    ground = np.random.default_rng(1).normal(0, 0.2, 2000)
+    for heights, far in ((np.linspace(0, 90, 30), 0), ([9.0], 0), ([90.0, -90.0], 2)):
+        every = np.append(ground, heights)
+        low, high = section_data.choose_frame(every, 100.0)
+        assert np.count_nonzero((every < low) | (every > high)) == far
+    assert section_data.choose_frame(np.append(ground[:15], 90.0), 100.0) == (-np.inf, np.inf)
+
+
+def test_logarithmic_profiles_have_plain_labels(cloud, tmp_path):
+    """Math text is off, so that a $ in a name is a $: powers of ten would show as source text."""
+    pytest.importorskip("matplotlib")
+    assert run("plot", "profile", cloud, "--log", "-o", tmp_path / "p.svg").exit_code == 0
+    text = (tmp_path / "p.svg").read_text("utf-8")
+    assert "mathdefault" not in text and ">100<" in text.replace("\n", "")
+
+
+def test_level_segments_on_an_edge_lie_above_it(tmp_path):
+    """As points do: a bin holds its lower edge."""
+    heights = [(100.0, 100.0), (102.0, 102.0), (104.0, 104.0), (104.0, 106.0)]
+    found = profile_segments([_write_segments(tmp_path / "s.csv", heights, [1, 2, 4, 8])], "length", "sum", size=2.0)
+    sums = dict(zip(found.edges[:-1].tolist(), found.values[0].tolist(), strict=True))
+    assert [sums[edge] for edge in (100.0, 102.0, 104.0)] == pytest.approx([1, 2, 12])
+    assert found.values.sum() == pytest.approx(15)

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli.slice import slice_
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
@@ -271,3 +272,29 @@ def test_both_geometries_find_the_ground_of_a_strip(tmp_path_factory):
     assert len(found["time"]) >= 0.8 * len(found["plane"]) > 10
     level = [segment for segment in found["time"] if abs(segment.slope) < 1 and segment.length > 10]
     assert len(level) > 5
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, 1.0])
+def test_the_residual_of_a_time_slice_is_the_scatter_of_times(slope):
+    """Echoes `slope` samples later per pulse and 0.6 ns early and late in turn: the residual is 0.6 ns at any slope."""
+    n, count, off = 60, 100, 0.6
+    time = 20.0 + slope * np.arange(n) + off * np.where(np.arange(n) % 2, 1.0, -1.0)
+    row, sample = np.repeat(np.arange(n), count), np.tile(np.arange(count), n)
+    value = (100 * np.exp(-0.5 * ((sample - time[row]) / 2.0) ** 2)).astype(np.float32)
+    down = np.tile([0.0, 0.0, -0.149896], (n, 1))
+    origin = np.stack([0.5 * np.arange(n), np.zeros(n), np.full(n, 100.0)], axis=1)
+    line = ScanLine(0, np.arange(n), np.arange(n) * 1e-5, origin, down, 1.0, row, sample.astype(float), value)
+    options = SliceOptions(geometry="time", sigma=2.0)
+    (segment,) = find_segments(cut_slice(line, options), options)
+    # Only samples above the threshold count, which draws the centroids together a little.
+    assert segment.residual == pytest.approx(off, rel=0.1) and segment.pulses == n
+
+
+@pytest.mark.parametrize("filled", [0.1, 0.4, 0.7])
+def test_the_level_is_that_without_signal_where_signal_fills_most_of_the_waveform(filled):
+    """A wall of echoes fills up to 70 % of the samples: values above the level are those of the signal."""
+    samples = np.full((3, 100), 12, np.uint8)
+    samples[:, 100 - round(100 * filled) :] = 60
+    block = WaveformBlock.from_samples(samples, bits=8, spacing=1.0)
+    values = lines._shape(block).values.reshape(3, 100)
+    assert values[:, 0].tolist() == [0.0] * 3 and values[:, -1].tolist() == [48.0] * 3

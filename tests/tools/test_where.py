@@ -139,3 +139,28 @@ def test_plots_and_stats_take_it_on_the_command_line(cloud, split, tmp_path):
     words = ["plot", "map", str(cloud), "--column", "z", "--where", "z > 1e6", "-o", str(tmp_path / "none.png")]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 1 and f"{total} of {total} points are left out by --where" in result.output
+
+
+def test_grids_are_of_them(cloud, split, tmp_path):
+    rasterio = pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    path, number, total = split
+    for source, name, more in ((cloud, "some", ["--where", TEXT]), (path, "same", [])):
+        words = ["grid", source, "--column", "amplitude", "--size", 3, "-o", tmp_path / f"{name}.tif", "--json", *more]
+        result = CliRunner().invoke(main, list(map(str, words)))
+        assert result.exit_code == 0, result.output
+        found = json.loads(result.stdout)
+        assert found["points"] - found["left_out"] == number and found["left_out"] == (total - number) * bool(more)
+    with rasterio.open(tmp_path / "some.tif") as some, rasterio.open(tmp_path / "same.tif") as same:
+        np.testing.assert_array_equal(some.read(), same.read())
+        assert some.transform == same.transform  # the extent, too, is that of the chosen points
+
+
+@pytest.mark.parametrize(("where", "words"), [
+    ("echo_width > 900", "no raster: no point has a position and what --where asks for"),
+    ("echo_wdth > 9", "character 1: "),
+])  # fmt: skip
+def test_a_grid_of_no_point_says_why(cloud, tmp_path, where, words):
+    pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
+    target = tmp_path / "x.tif"
+    result = CliRunner().invoke(main, ["grid", str(cloud), "--column", "z", "--where", where, "-o", str(target)])
+    assert result.exit_code in (1, 2) and words in result.stderr and not target.exists()

@@ -31,6 +31,7 @@ from wavebatch.batch.worker_check import (
     travelling_versions,
 )
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, reporting
 from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
@@ -73,6 +74,10 @@ class Cluster:
     """
 
     is_remote = True
+    compresses = False
+    """Whether workers compress chunks: here rows would travel back to them."""
+    memory = None
+    """Folder of memory that processes share: those of other machines do not."""
 
     def __init__(
         self,
@@ -94,7 +99,7 @@ class Cluster:
 
     def __enter__(self) -> Cluster:
         if importlib.util.find_spec("distributed") is None:
-            raise ConfigError("--scheduler: dask's distributed is not installed; pip install wavebatch[cluster]")
+            raise ConfigError(f"--scheduler: dask's distributed is not installed: {advise_install('distributed')}")
         with contextlib.ExitStack() as stack:
             stack.enter_context(_silent())
             self._client = stack.enter_context(_connected(self.address))
@@ -114,6 +119,10 @@ class Cluster:
         """Return the future result of `function(*arguments)`; both must be picklable."""
         call = pickle.dumps((_work, (self._scratch, function, arguments)), pickle.HIGHEST_PROTOCOL)
         return _Promise(functools.partial(self._send, call), self._translate, self._put_aside)
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        """Yield `function(item)` of every item, in this process: short calls are slower on another machine."""
+        return map(function, items)
 
     def _send(self, call: bytes) -> Any:
         """Give the pickled call to a worker; the remote future."""

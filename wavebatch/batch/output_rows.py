@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from wavebatch.batch.counts import RunReport, count_flags
-from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable
+from wavebatch.core.echoes import COLUMNS, EchoFlag, EchoTable, find_order
 from wavebatch.core.errors import StageError
 from wavebatch.core.no_data import count_reasons
 from wavebatch.core.units import PS_PER_NS
@@ -258,7 +258,8 @@ def _place_rows(
     owner = owner[np.concatenate([table.waveform, members.packet[passed]])]
     source = np.concatenate([members.find(point), passed])
     owner = np.where(owner < 0, source, owner)
-    order = np.lexsort((np.concatenate([table.time, _locations(members.source[passed])]), owner))
+    order = find_order(owner, np.concatenate([table.time, _locations(members.source[passed])]))
+    order = slice(None) if order is None else order
     return _Rows(
         echo=np.concatenate([np.arange(len(table)), np.full(len(passed), -1)])[order],
         source=source[order],

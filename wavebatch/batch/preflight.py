@@ -55,7 +55,10 @@ def plan_memory(options_jobs: int, memory: int | None) -> tuple[int, int | None]
     if memory is None:
         return options_jobs, None
     if memory < LEAST_MEMORY:
-        raise ConfigError(f"--memory: {memory >> 20} MB is too little, one job needs {LEAST_MEMORY >> 20} MB")
+        given = f"{memory >> 20} MB" if memory >> 20 else f"{memory} bytes"
+        raise ConfigError(
+            f"--memory: {given} is too little, one job needs {LEAST_MEMORY >> 20} MB; write for example 500M or 4G"
+        )
     processes = max(min(memory // LEAST_MEMORY, options_jobs + (options_jobs > 1)), 1)
     jobs = max(processes - 1, 1) if options_jobs > 1 else 1
     processes = jobs + (jobs > 1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib
 import multiprocessing
 import os
 import pickle
@@ -19,6 +20,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, wait
 from multiprocessing import resource_tracker
@@ -28,7 +30,7 @@ from typing import Any
 
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
-from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
+from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, remove_memory_orphans, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
@@ -42,6 +44,8 @@ _NAME = "wavebatch"
 _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
 
+_FIRST_MODULE = "wavebatch.batch.row_transfer"
+"""What a new process imports while it waits: with it comes nearly all that calls need."""
 _PATIENCE = 3.0
 """Seconds that processes have to end by themselves."""
 
@@ -73,8 +77,14 @@ class Workers:
         self._workers: list[_Worker] = []
         self._stack = contextlib.ExitStack()
         self._scratch: Path | None = None
+        self.compresses = jobs > 1
+        """Whether the processes compress chunks for this one."""
+        self.memory: Path | None = None
+        """Folder of memory that the processes share."""
 
     def __enter__(self) -> Workers:
+        if self.jobs > 1:
+            self.memory = self._stack.enter_context(owning_memory())
         self._scratch = self._stack.enter_context(owning_scratch())
         return self
 
@@ -87,12 +97,34 @@ class Workers:
         if self.jobs == 1:
             return settle(Future(), function, *arguments)
         self._workers = [worker for worker in self._workers if worker.serves]
-        with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
-            while len(self._workers) < self.jobs:
-                self._workers.append(_Worker(self._calls, self._scratch))
+        if len(self._workers) < self.jobs:
+            with uninterrupted():
+                start_early(self.jobs - len(self._workers))
+                while len(self._workers) < self.jobs:
+                    self._workers.append(_Worker(_early.pop(0), self._calls, self._scratch))
+                end_early()
         call = _Call(pickle.dumps((function, arguments), pickle.HIGHEST_PROTOCOL))
         self._calls.put(call)
         return call.future
+
+    def map(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        """Yield `function(item)` of every item, in order; here, where a process died of it."""
+        waiting: deque[tuple[Any, Future]] = deque()
+        for item in items:
+            waiting.append((item, self.submit(function, item)))
+            if len(waiting) >= self.limit:
+                yield self._take_first(function, waiting)
+        while waiting:
+            yield self._take_first(function, waiting)
+
+    def _take_first(self, function: Callable[[Any], Any], waiting: deque[tuple[Any, Future]]) -> Any:
+        item, future = waiting.popleft()
+        while not future.done():
+            self.wait([future])
+        try:
+            return future.result()
+        except WorkerDied:
+            return function(item)
 
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those that are done."""
@@ -114,6 +146,7 @@ class Workers:
     def _end(self) -> None:
         """End all processes: those that wait for a call by themselves, all others at once."""
         try:
+            end_early()
             for worker in self._workers:
                 if worker.call is not None:
                     worker.process.kill()
@@ -137,10 +170,48 @@ def _kill_all() -> None:
             process.kill()
 
 
+def start_early(jobs: int) -> None:
+    """Start processes that the next Workers will take: they import their modules while this process imports its own."""
+    with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
+        while len(_early) < jobs:
+            _early.append(_Process())
+
+
+@atexit.register  # after that of multiprocessing, and so called before it: it would wait for stopped processes
+def end_early() -> None:
+    """End the processes that no Workers took."""
+    while _early:
+        _early.pop().end()
+
+
 class _Call:
     def __init__(self, pickled: bytes) -> None:
         self.pickled = pickled
         self.future: Future = Future()
+
+
+class _Process:
+    """A process that waits for calls at the other end of a pipe."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, there = context.Pipe()
+        self.process = context.Process(target=_work, args=(there,), daemon=True)
+        self.process.name = f"{_NAME}-{self.process.name}"
+        try:
+            self.process.start()
+        finally:
+            there.close()  # else a dead process would leave the pipe open
+
+    def end(self) -> None:
+        """End it at once."""
+        self.process.kill()
+        self.process.join(_PATIENCE)
+        self.pipe.close()
+
+
+_early: list[_Process] = []
+"""Started, and not taken yet."""
 
 
 class _Worker:
@@ -149,39 +220,38 @@ class _Worker:
     One pipe per process: a process that dies in the middle of a result cannot block the results of the others.
     """
 
-    def __init__(self, calls: queue.SimpleQueue[_Call | None], scratch: Path | None) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, there = context.Pipe()
+    def __init__(self, started: _Process, calls: queue.SimpleQueue[_Call | None], scratch: Path | None) -> None:
+        self.process, self._pipe = started.process, started.pipe
         self._calls = calls
-        self.call: _Call | None = None
+        self.call: _Call | None = _Call(pickle.dumps((use_scratch, (scratch,))))
         """The call under way."""
         self.serves = True
         """Whether it takes calls."""
         self._seen_dead = False
-        self.process = context.Process(target=_work, args=(there, scratch), daemon=True)
-        self.process.name = f"{_NAME}-{self.process.name}"
-        try:
-            self.process.start()
-        finally:
-            there.close()  # else a dead process would leave the pipe open
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
         try:
+            self._ask(self.call.pickled)
+            self.call = None
             while (call := self._calls.get()) is not None:
                 if not call.future.set_running_or_notify_cancel():
                     continue
                 self.call = call
-                self._pipe.send_bytes(call.pickled)
-                result, error = _unpack(self._pipe.recv_bytes())
+                result, error = self._ask(call.pickled)
                 self.call = None
                 _settle(call.future, result, error)
         except (EOFError, OSError):  # the process is dead
             self.serves = False
-            _settle(call.future, error=WorkerDied())
+            if self.call is not None:
+                _settle(self.call.future, error=WorkerDied())
         finally:
             self.serves = False
             self._pipe.close()
+
+    def _ask(self, call: bytes) -> tuple[Any, BaseException | None]:
+        self._pipe.send_bytes(call)
+        return _unpack(self._pipe.recv_bytes())
 
     def look(self) -> None:
         """Give the call of a dead process up, where another process still holds its end of the pipe open."""
@@ -261,13 +331,14 @@ def _ctrl_c_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(pipe: Connection, scratch: Path | None) -> None:
+def _work(pipe: Connection) -> None:
     """In a new process: make calls until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     _die_with_parent()
-    use_scratch(scratch)
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+    with contextlib.suppress(Exception):  # the call that needs it reports the error
+        importlib.import_module(_FIRST_MODULE)
     with contextlib.suppress(EOFError, OSError):
         while True:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
@@ -301,4 +372,5 @@ def _pickle_error(error: Exception) -> bytes:
 
 def _end_with(parent: Any) -> None:
     parent.join()
+    remove_memory_orphans()  # what the parent shared would take memory until the next run
     os._exit(1)

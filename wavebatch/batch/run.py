@@ -10,7 +10,7 @@ import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor
+from concurrent.futures import BrokenExecutor, Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -130,7 +130,7 @@ def run_batch(
             options.folder.mkdir(parents=True, exist_ok=True)
         remove_stale(options.folder)
         if any(job.request.flight for job in jobs):
-            jobs = with_flight(jobs, saved or _survey_flight(jobs, options, on_event))
+            jobs = with_flight(jobs, saved or _survey_flight(jobs, options, workers, on_event))
         with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
             batch.run()
         outcomes = tuple(batch.outcomes[job.path] for job in jobs)
@@ -138,15 +138,19 @@ def run_batch(
 
 
 def _survey_flight(
-    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None
+    jobs: Sequence[StripJob],
+    options: BatchOptions,
+    workers: Workers | Cluster,
+    on_event: Callable[[dict[str, Any]], None] | None,
 ) -> SavedSurvey | None:
     """Survey all strips together and keep the result; None where no strip can be read: each fails in its turn."""
     first = jobs[0].options
-    samples = read_samples([job.path for job in jobs], direction=first.direction, headerless=first.headerless)
+    reading = {"direction": first.direction, "headerless": first.headerless}
+    samples = read_samples([job.path for job in jobs], **reading, spread=workers.map)
     if not samples:
         return None
     path = flight_path(options.folder)
-    flight = survey_flight(samples)
+    flight = survey_flight(samples, spread=workers.map)
     try:
         write_text(path, format_survey(flight.saved), overwrite=options.overwrite)
     except InputError:
@@ -183,14 +187,14 @@ class _Batch:
         """Work until every strip has an outcome."""
         while self._submit() or self._active:
             interrupts.check()
-            heads = {strip.pending[0]: strip for strip in self._active if strip.pending}
+            heads = {future: strip for strip in self._active for future in strip.heads}
             try:
                 done = self._workers.wait(heads)
             except BrokenExecutor as error:
                 self._give_up(error)
             else:
                 for future in done:
-                    self._take(heads[future])
+                    self._take(heads[future], future)
 
     def close(self) -> None:
         """Remove what unfinished strips have left."""
@@ -200,13 +204,13 @@ class _Batch:
 
     def _submit(self) -> bool:
         """Submit calls up to the workers' limit; return whether any is under way."""
-        while sum(len(strip.pending) for strip in self._active) < self._workers.limit:
+        while sum(strip.under_way for strip in self._active) < self._workers.limit:
             strip = next((strip for strip in self._active if strip.has_more), None) or self._start_next()
             if strip is None:
                 break
             with self._failing(strip):
                 strip.submit(self._workers)
-        return any(strip.pending for strip in self._active)
+        return any(strip.under_way for strip in self._active)
 
     def _start_next(self) -> StripTask | None:
         """Start the next strip that needs work; None where no other strip may start now."""
@@ -228,12 +232,12 @@ class _Batch:
                 self._end(strip, Outcome(strip.job, "skipped", report))
         return None
 
-    def _take(self, strip: StripTask) -> None:
+    def _take(self, strip: StripTask, future: Future) -> None:
         if strip not in self._active:
             return
         with self._failing(strip):
             before = strip.written
-            strip.take()
+            strip.take(future, self._workers)
             done, units = strip.written, strip.prepared.units
             if done > before:
                 self._tell({"event": "unit", "strip": str(strip.job.path), "done": done, "of": units})

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,12 @@ from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.flag_names import read_flags
 from wavebatch.core.suggest import nearest
+from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.cloud.column_names import normalise
 from wavebatch.files.cloud.echo_reader import describe_dimension, list_fields, read_dimension, read_field
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
+from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.point_formats import ANGLE_UNIT
 from wavebatch.stages.chain import STAGES, Chain
 
@@ -50,12 +52,25 @@ class Selection:
     polygon: str | None = None
     """The file of `polygons`."""
     polygons: tuple[Polygon, ...] = ()
-    """Rows must lie in one of them."""
+    """Rows must lie in one of them; in the coordinates of the file."""
+    placed: tuple[Polygon, ...] | None = None
+    """The same in the coordinates of the strip; None: not yet placed."""
     where: Condition | None = None
     """Rows must meet this."""
 
     def __bool__(self) -> bool:
         return self != Selection()
+
+    def place(self, facts: CheckedHeader) -> Selection:
+        """Return the selection with its polygons in the coordinates of a strip; raises as `Polygon.place`."""
+        if not self.polygons:
+            return self
+        return replace(self, placed=tuple(one.place(facts.path, facts.header) for one in self.polygons))
+
+    @property
+    def areas(self) -> tuple[Polygon, ...]:
+        """The polygons to test rows with."""
+        return self.polygons if self.placed is None else self.placed
 
     def describe(self) -> dict[str, Any]:
         """Return plain values for the report and for --resume, with the polygons' corners as a hash."""
@@ -110,7 +125,8 @@ class RowSelector:
         return self.layout.extended(self.needed) if self.needed else self.layout
 
     def check(self) -> None:
-        """Raise ConfigError where --where names a column that the strip's rows do not have."""
+        """Raise ConfigError where --where names a column that the rows do not have, and as `Selection.place`."""
+        self.selection.place(self.layout.source)
         where = self.selection.where
         for name in () if where is None else where.columns:
             if not self._find(name)[0]:
@@ -169,9 +185,9 @@ class RowSelector:
                 return None
             west, south, east, north = chosen.bbox
             return (x >= west) & (x <= east) & (y >= south) & (y <= north)
-        if not chosen.polygons:
+        if not chosen.areas:
             return None
-        return np.logical_or.reduce([find_inside(polygon.rings, x, y) for polygon in chosen.polygons])
+        return np.logical_or.reduce([find_inside(polygon.rings, x, y) for polygon in chosen.areas])
 
     def _names(self) -> dict[str, dict[str, str]]:
         """Names that --where may use, by kind, each with what it stands for; the first kind that has a name counts."""
@@ -234,7 +250,7 @@ def build_selection(
     bbox : sequence of float, optional
         West, south, east, north.
     polygon : path, optional
-        GeoJSON file with the areas, in the coordinates of the strips.
+        GeoJSON file with the areas.
 
     Returns
     -------
@@ -265,14 +281,6 @@ def build_selection(
 def describe_extent(layout: OutputLayout, selection: Selection) -> str:
     """Say that the areas lie outside the strip by its header; empty where they do not, or where there is none."""
     header = layout.source.header
-    (west, south, _), (east, north, _) = header.mins, header.maxs
-    corners = [ring for polygon in selection.polygons for ring in polygon.rings]
-    boxes = [(*np.concatenate(corners).min(axis=0), *np.concatenate(corners).max(axis=0))] if corners else []
-    boxes += [] if selection.bbox is None else [selection.bbox]
-    for left, low, right, high in boxes:
-        if left > east or right < west or low > north or high < south:
-            return (
-                f"the area ({left:.10g} to {right:.10g}, {low:.10g} to {high:.10g}) lies outside the strip "
-                f"({west:.10g} to {east:.10g}, {south:.10g} to {north:.10g}); is it in another CRS?"
-            )
-    return ""
+    areas = [[ring for polygon in selection.areas for ring in polygon.rings]]
+    areas += [] if selection.bbox is None else [[np.array(selection.bbox).reshape(2, 2)]]
+    return next(filter(None, (describe_miss(area, header) for area in areas if area)), "")

@@ -22,11 +22,13 @@ from wavebatch.batch.dask_cluster import Cluster
 from wavebatch.batch.explain import find_remarks, find_warnings
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.processes import Workers
-from wavebatch.batch.unit import Prepared, StripJob, prepare_strip, process_unit
+from wavebatch.batch.row_transfer import RowStream, process_unit_shared
+from wavebatch.batch.unit import Prepared, StripJob, prepare_strip
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.disk.publish import Claim, check_target
+from wavebatch.files.disk.shared_rows import Rows, discard_rows, read_rows
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.text_file import draft_text
 
@@ -72,6 +74,7 @@ class StripTask:
         self._blob = b""
         self._claim: Claim | None = None
         self._writer: CloudWriter | None = None
+        self._rows: RowStream | None = None
         self._second: SecondPass | None = None
         self._report = RunReport()
         self._described: dict[str, Any] = {}
@@ -129,9 +132,23 @@ class StripTask:
         return self._second is not None and self._second.has_more
 
     @property
+    def heads(self) -> list[Future]:
+        """The calls of which `take` can use the result next."""
+        return [queue[0] for queue in self._queues if queue]
+
+    @property
+    def under_way(self) -> int:
+        """Number of calls whose results are not used yet."""
+        return sum(map(len, self._queues))
+
+    @property
+    def _queues(self) -> list[deque[Future]]:
+        return [self.pending] if self._rows is None else [self.pending, self._rows.pending]
+
+    @property
     def is_complete(self) -> bool:
-        """Whether all units are written and all tiles of a second pass are done."""
-        if self.prepared is None or self.written < self.prepared.units:
+        """Whether all units and all tiles of a second pass are done, and all rows are in the cloud that can be."""
+        if self.prepared is None or self.written < self.prepared.units or self._rows.pending:
             return False
         return self._second is None or self._second.is_complete
 
@@ -143,35 +160,52 @@ class StripTask:
         if self._submitted == self.prepared.units:
             self.pending.append(workers.submit(process_tile, *self._second.next_tile()))
             return
-        self.pending.append(workers.submit(process_unit, self._blob, self._submitted, self._options.block_size))
+        arguments = self._blob, self._submitted, self._options.block_size, self._rows.folder
+        self.pending.append(workers.submit(process_unit_shared, *arguments))
         self._submitted += 1
 
-    def take(self) -> None:
-        """Wait for the oldest call and use its result: open the output, or write rows."""
+    def take(self, future: Future, workers: Workers | Cluster) -> None:
+        """Use the result of one of the `heads`: open the output, take rows, or write a chunk of them."""
+        if self._rows is not None and self._rows.pending and future is self._rows.pending[0]:
+            start = time.perf_counter()
+            seconds = self._rows.take()
+            self._report += RunReport(timing={"write": seconds + time.perf_counter() - start})
+            return
         result = self.pending.popleft().result()
         start = time.perf_counter()
         if self.prepared is None:
             self.prepared = result
             self._report += result.report
-            self._open()
+            self._open(workers)
         elif self.written == self.prepared.units:
             self._report += self._second.take(result)
             return
         else:
             rows, report = result
-            (self._writer.write if self._second is None else self._second.add)(rows)
+            self._add(rows)
             self.written += 1
             self._report += report + RunReport(timing={"write": time.perf_counter() - start})
-        if self._second is not None and self.written == self.prepared.units:
-            self._report += self._second.cut()
+        if self.written == self.prepared.units:
+            if self._second is None:
+                self._rows.end()
+            else:
+                self._report += self._second.cut()
 
-    def _open(self) -> None:
+    def _add(self, rows: Rows) -> None:
+        if self._second is None:
+            self._rows.add(rows)
+        else:
+            self._second.add(read_rows(rows))
+            discard_rows(rows)
+
+    def _open(self, workers: Workers | Cluster) -> None:
         options, prepared = self._options, self.prepared
         self._blob = pickle.dumps(prepared, pickle.HIGHEST_PROTOCOL)
         provenance = {**self._described, **report_file.describe_chain(prepared)}
         provenance |= report_file.describe_strip(prepared, self._described)
         cloud, overwrite = report_file.cloud_path(self.job, options.folder), options.overwrite or options.resume
         self._writer = CloudWriter(prepared.layout, cloud, provenance=provenance, overwrite=overwrite)
+        self._rows = RowStream(self._writer, workers.submit if workers.compresses else None, workers.memory)
         if prepared.second_step is not None:
             layout = prepared.selector.carrying
             self._second = SecondPass(prepared.second_step, layout, cloud, late=prepared.late_steps)
@@ -229,6 +263,7 @@ class StripTask:
         finally:
             draft.discard()
         self.warnings = document["warnings"]
+        self._rows.close()
         self.prepared.scan.close()
         return self._report
 
@@ -238,6 +273,8 @@ class StripTask:
             if not future.cancel() and self.prepared is None:
                 future.add_done_callback(_close_scan)
         self.pending.clear()
+        if self._rows is not None:
+            self._rows.close()
         if self._writer is not None:
             self._writer.abort()
         if self._second is not None:

@@ -278,6 +278,7 @@ def prepare_strip(job: StripJob) -> Prepared:
     with job.open() as reader:
         facts = reader.facts
         RowSelector(job.selection, job.chain, plan_layout(job, facts)).check()
+        job = replace(job, selection=job.selection.place(facts))
         scan = reader.scan()
         try:
             scanned = time.perf_counter()

@@ -25,12 +25,16 @@ from wavebatch.cli.options import (
     parse_length,
     seed_option,
 )
+from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.core.errors import InputError
+
+SMALL_PULSES = 1_000
+"""Of the strips that show what a strip costs, however small."""
 
 
 @click.command()
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path), metavar="[STRIP...] [CHAIN...]")
-@click.option("--scene", "scenes", multiple=True, metavar="NAME",
+@click.option("--scene", "scenes", multiple=True, metavar="NAME", shell_complete=complete_scenes,
               help="Simulate this scene: mixed, open, forest, empty, flat or stiff; may be repeated.")
 @click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
               help="Simulated waveforms per scene.")
@@ -56,6 +60,9 @@ from wavebatch.core.errors import InputError
 @click.option("--against", type=click.Path(exists=True, file_okay=False, path_type=Path), metavar="DIR",
               help="Time whole runs of each STRIP or scene by the wavebatch in DIR, the top folder of another "
               "checkout, and by this one, in turn; print the ratios and their range.")
+@click.option("--jobs-model", is_flag=True,
+              help="Measure what each part of a run costs in each process, with one and with two jobs, and print what "
+              "up to 64 jobs reach on as many cores.")
 @output_option("Folder for bench.json, bench.txt and the plots. Existing files are replaced.", "DIR", required=False,
                folder=True)
 @html_option
@@ -72,6 +79,8 @@ def bench(
 
     With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
     The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
+
+    With --jobs-model runs of STRIP, or of one scene, take turns with one and with two jobs.
 
     With --against nothing but speed is measured, of this wavebatch and another: speeds of a shared machine change,
     ratios of runs that take turns hardly do.
@@ -95,6 +104,11 @@ def bench(
         if html_file is not None:
             raise click.UsageError("--against has no page: leave --html out; -o writes its table")
         _bench_against(against, strips, files, output, options, say)
+        return
+    if options["jobs_model"]:
+        if html_file is not None or len(files) > 1 or len(strips) < len(files):
+            raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
+        _bench_jobs(strips, output, options, say)
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
@@ -148,6 +162,31 @@ def _bench_against(
         (output / "against.json").write_text(json.dumps(document, indent=2) + "\n")
         talk(f"wrote {output / 'against.txt'} and {output / 'against.json'}")
     print_result(options["as_json"], document, [text], "against")
+
+
+def _bench_jobs(
+    strips: Sequence[Path], output: Path | None, options: Mapping[str, Any], say: Callable[[str], None]
+) -> None:
+    """Times the parts of a run, and predicts what many jobs reach."""
+    from wavebatch.tools.bench.paired.compare import simulate_strips
+    from wavebatch.tools.bench.paired.jobs import format_jobs, measure_jobs, to_document
+
+    if not strips and not options["pulses"]:
+        raise click.UsageError("--jobs-model times strips: --pulses must be more than 0")
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
+        folder = Path(name)
+        scene = (options["scenes"] or ("mixed",))[0]
+        strip = strips[0] if strips else simulate_strips([scene], options["pulses"], options["seed"], folder)[scene]
+        (folder / "small").mkdir()
+        small = simulate_strips([scene], SMALL_PULSES, options["seed"], folder / "small")[scene]
+        found = measure_jobs(strip, small, folder / "out", options["repeats"], say)
+    text, document = format_jobs(strip.name, *found), to_document(strip.name, *found)
+    if output:
+        output.mkdir(parents=True, exist_ok=True)
+        (output / "jobs.txt").write_text(text + "\n")
+        (output / "jobs.json").write_text(json.dumps(document, indent=2) + "\n")
+        talk(f"wrote {output / 'jobs.txt'} and {output / 'jobs.json'}")
+    print_result(options["as_json"], document, [text], "jobs")
 
 
 def _bench_real(

@@ -14,6 +14,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
+@shared.recursive_option
 @shared.file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV "
                     "with reflectance and x, y, radius or vertices.")
 @shared.output_option("Calibration file to write.", "CAL.toml")
@@ -69,12 +71,11 @@ def calibrate(
     from wavebatch.surveying.calibrating.calibration_file import format_calibration
     from wavebatch.surveying.calibrating.target_file import load_targets
 
-    paths = find_files(map(str, strips))
-    if not paths:
-        raise ConfigError("no strip given")
+    paths = find_files(map(str, strips), recursive=options["recursive"])
     with protecting(paths):  # a folder or a list among STRIPs holds inputs too
         for target in filter(None, (output, options["report"], options["plot"], html_file)):
             refuse_input(target)
+    shared.check_toml(output)
     for target in filter(None, (output, options["report"])):
         refuse_existing(target, overwrite)
     if options["plot"] is not None:
@@ -99,7 +100,7 @@ def calibrate(
         talk(line)
     for note in found.notes:
         talk(f"warning: {note}")
-    numbers = f"constant {found.constant:.6g} +- {100 * found.relative_error:.1f} %"
+    numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
     talk(f"{output}: {numbers}; {found.conditions}")
@@ -134,8 +135,9 @@ def _list_report(flight: FlightCalibration) -> dict[str, Any]:
 
 
 def _describe_strip(row: StripConstant) -> str:
+    constant = format_relative(row.constant, row.relative_error)
     return (
-        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {row.constant:.4g} +- "
+        f"{row.strip}, digitizer {row.digitizer}, scanner channel {row.scanner}: constant {constant} +- "
         f"{100 * row.relative_error:.1f} %, drift {100 * row.drift:+.2f} +- {100 * row.drift_error:.2f} %, "
         f"{count(row.ties, 'tie cell')}"
     )
@@ -160,7 +162,8 @@ def _describe_target(target: TargetResult) -> str:
 
 def _describe_channel(channel: ChannelConstant) -> str:
     name = f"digitizer {channel.digitizer}, scanner channel {channel.scanner}"
-    constant = f"constant {channel.constant:.4g} +- {100 * channel.relative_error:.1f} %"
+    value = format_relative(channel.constant, channel.relative_error)
+    constant = f"constant {value} +- {100 * channel.relative_error:.1f} %"
     if not channel.echoes:
         return f"{name}: no target, by overlap, {constant}"
     scatter = f"spread {100 * channel.spread:.1f} %, from shot to shot {100 * channel.shot_energy:.1f} %"

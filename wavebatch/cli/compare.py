@@ -31,6 +31,7 @@ from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_t
 if TYPE_CHECKING:
     from wavebatch.tools.compare.angles import AngleAgreement
     from wavebatch.tools.compare.chains import Matchup
+    from wavebatch.tools.compare.differences import Spread
     from wavebatch.tools.compare.overlap import OverlapComparison
 
 EXIT_VIOLATED = 1
@@ -121,6 +122,8 @@ def compare(
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
     lines = [*_list_lines(between), *(_list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
+    if not between.matched and between.echoes_a and between.echoes_b:
+        talk("warning: A and B have no echo in common; are they results of one strip, in one CRS?")
     broken = _check_thresholds(between, options)
     _write_page(html_file, result, broken)
     for line in broken:
@@ -227,6 +230,8 @@ def _list_lines(result: Comparison) -> Iterator[str]:
     units = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
     for name, spread in result.differences.items():
         yield row(f"{units[name]:<14}", (spread.number, spread.median, spread.mean, spread.rms, spread.nmad), ".4f")
+    for kind, groups in result.differences_by.items():
+        yield from _list_groups(kind, groups, units)
     yield from _list_breakdown("missed, of B's", result.missed_by)
     yield from _list_breakdown("extra, of A's", result.extra_by)
     if result.errors:
@@ -237,6 +242,17 @@ def _list_lines(result: Comparison) -> Iterator[str]:
             if one.number:
                 scaled = (one.rms_per_bound, one.nmad_per_bound, one.calibration, one.calibration_nmad)
                 yield row(f"{kind + ' ' + name:<23}", (one.number, one.bias, one.rmse, *scaled), ".4f")
+
+
+def _list_groups(kind: str, groups: dict[str, dict[str, Spread]], units: dict[str, str]) -> Iterator[str]:
+    """Differences by LAS class or by number of echoes, where there are several."""
+    if len(groups) < 2:
+        return
+    yield from ("", row(f"{f'A - B by {kind}':<41}", ("number", "median", "mean", "rms", "nmad")))
+    for name, quantities in groups.items():
+        for quantity, one in quantities.items():
+            title = f"{name}, {units[quantity]}" if kind == "class" else f"{name} of the pulse, {units[quantity]}"
+            yield row(f"{title:<41}", (one.number, one.median, one.mean, one.rms, one.nmad), ".4f")
 
 
 def _list_breakdown(title: str, tables: dict) -> Iterator[str]:

@@ -28,6 +28,16 @@ EXIT_USAGE = 2
 """Wrong usage or chain file; nothing was started."""
 
 
+_PLAIN = {
+    "is not a valid integer range": "is no whole number",
+    "is not a valid float range": "is no number",
+    "is not a valid integer": "is no whole number",
+    "is not a valid float": "is no number",
+    "is a file": "is a file, not a folder",
+}
+"""Click's words for values of a wrong type, and plain ones."""
+
+
 class WrongUsage(click.ClickException):
     """Wrong usage as one line, like all other errors; click would print four."""
 
@@ -35,6 +45,8 @@ class WrongUsage(click.ClickException):
 
     def __init__(self, error: click.UsageError) -> None:
         text = " ".join(error.format_message().split()).removesuffix(".").replace(". (Did", " (did")
+        for jargon, plain in _PLAIN.items():
+            text = text.replace(jargon, plain)
         if not text[1:2].isupper():  # CRS stays
             text = text[:1].lower() + text[1:]
         if error.ctx:

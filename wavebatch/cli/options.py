@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from click.shell_completion import CompletionItem
 
 from wavebatch.cli.messages import one_line, report_errors, talk
+from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles
 from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
@@ -81,6 +81,16 @@ def where_option(text: str) -> Callable:
     return click.option("--where", callback=_read_where, metavar="CONDITION", help=f"{text} {more}")
 
 
+selection_options = together(
+    click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
+    click.option("--flags-without", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+                 help="Use only points with none of these flags."),
+    where_option("Use only points"),
+)  # fmt: skip
+"""Options that select points by their flags and columns."""
+
+
 html_option = output_option(
     "Also write a report page: one HTML file with all pictures in it. An older report of that name is replaced.",
     "FILE", "--html", "html_file", required=False,
@@ -98,23 +108,13 @@ def check_html(target: Path | None) -> None:
 strip_argument = click.argument("strip", type=click.Path(path_type=Path))
 
 
-def _complete_files(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Lets the shell complete file names; `@` of a list is none of theirs."""
-    return [CompletionItem(incomplete, type="file")]
-
-
-def _complete_profiles(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    from wavebatch.stages.chain_file import list_profiles
-
-    return [name for name in ("auto", *list_profiles()) if name.startswith(incomplete)]
-
-
 recursive_option = click.option("--recursive", is_flag=True, help="Also take the files in subfolders of folders.")
 strips_argument = together(
-    click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=_complete_files),
+    click.argument("strips", nargs=-1, required=True, metavar="STRIP...", shell_complete=complete_files),
     recursive_option,
 )
-clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...")
+clouds_argument = click.argument("clouds", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="CLOUD...",
+                                shell_complete=complete_files)  # fmt: skip
 
 direction_option = click.option(
     "--direction",
@@ -153,7 +153,7 @@ air_options = together(
 )  # fmt: skip
 chain_options = together(
     file_option("-c", "--chain", "chain_file", text="Run the chain of this chain file (TOML)."),
-    click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=_complete_profiles,
+    click.option("--profile", metavar="auto|fast|balanced|accurate", shell_complete=complete_profiles,
                  help="Run a shipped chain; auto surveys the strip and chooses the cheapest chain that suits it.  "
                  "[default: auto]"),
 )  # fmt: skip
@@ -217,6 +217,16 @@ def _protected(command: Callable) -> Callable:
             return command(*args, **options)
 
     return call
+
+
+_NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
+
+
+def check_toml(target: Path | None) -> None:
+    """Raises ConfigError for a name that says that another kind of file would be written."""
+    if target is not None and target.suffix.lower() in _NO_TOML:
+        more = "; --json prints the figures" if target.suffix.lower() == ".json" else ""
+        raise ConfigError(f"{target}: this file is written as TOML; name it {target.with_suffix('.toml').name}{more}")
 
 
 def given_options(options: Mapping[str, Any], names: Iterable[str]) -> dict[str, Any]:

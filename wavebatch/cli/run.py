@@ -47,6 +47,7 @@ from wavebatch.cli.options import (
     system_option,
     where_option,
 )
+from wavebatch.cli.program.completion import complete_flags, complete_written
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
@@ -98,15 +99,16 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
 @click.option("--points", type=click.Choice(["echoes", "returns"]), default="echoes", show_default=True,
               help="Write one point per echo, or the input points with the attributes of their echoes.")
 @where_option("Write only points")
-@click.option("--drop-flags", metavar="NAMES",
+@click.option("--drop-flags", metavar="NAMES", shell_complete=complete_flags,
               help="Leave out points with one of these flags, e.g. RINGING_SUSPECT,WEAK; return numbers are counted "
               "without them.")
 @click.option("--classes", callback=_read_classes, metavar="LIST", help="Write only points of these classes, e.g. 2,6.")
 @click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
               help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
 @file_option("--polygon", metavar="FILE.geojson",
-             text="Write only points inside these polygons, in the coordinates of the strips.")
-@click.option("--columns", metavar="LIST",
+             text="Write only points inside these polygons, in WGS 84, in the CRS that the file names, or in the "
+                  "coordinates of the strips.")
+@click.option("--columns", metavar="LIST", shell_complete=complete_written,
               help="a,b writes only these columns; +a,+b adds them to the usual ones. The automatic chain and the "
               "shipped ones get the stages that make them.")
 @click.option("--names", type=click.Choice(["wavebatch", "asprs", "riegl", "pdal", "opals"]), default="wavebatch",
@@ -158,19 +160,31 @@ def run(**options: Any) -> None:
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     _check_options(options)
-    jobs, batch_options = _plan(options)
-    if options["report"] not in (None, "-"):
-        _check_report(Path(options["report"]), jobs, batch_options)
-    if options["html_file"] is not None:
-        _check_report(options["html_file"], jobs, batch_options, "--html")
-        check_html(options["html_file"])
-    if options["dry_run"]:
-        sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
     try:
+        _start_processes(options)
+        jobs, batch_options = _plan(options)
+        if options["report"] not in (None, "-"):
+            _check_report(Path(options["report"]), jobs, batch_options)
+        if options["html_file"] is not None:
+            _check_report(options["html_file"], jobs, batch_options, "--html")
+            check_html(options["html_file"])
+        if options["dry_run"]:
+            sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
         raise Interrupted(text) from None
+
+
+def _start_processes(options: dict[str, Any]) -> None:
+    """Start the worker processes that will surely be needed, before this process imports what it needs itself."""
+    jobs = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
+    # A limit of memory may allow fewer processes, and resume may find nothing to do.
+    if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
+        from wavebatch.batch.processes import end_early, start_early
+
+        click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
+        start_early(jobs)
 
 
 def _check_options(options: dict[str, Any]) -> None:

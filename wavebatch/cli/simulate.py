@@ -15,6 +15,7 @@ import click
 
 from wavebatch.cli.messages import count, counting, print_summary
 from wavebatch.cli.options import common_options, from_options, given_options, output_option, seed_option
+from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.tools.simulate import (
     CANOPIES,
     PULSES,
@@ -50,7 +51,7 @@ _internal = click.option("--internal/--external", default=True,
 
 
 @click.command(epilog="Scenes:\n\n" + _SCENE_LINES)
-@click.argument("scene")
+@click.argument("scene", shell_complete=complete_scenes)
 @_output
 @output_option("Write the true echoes to this .npz file.", "FILE", "--truth", required=False)
 @click.option("--pulses", default=100_000, show_default=True, metavar="N", help="Number of pulses.")
@@ -149,7 +150,13 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
               "equation computes amplitudes.")
 @click.option("--gain", type=float, help="DN per unit of intensity, or per W.  [default: fills 80 % of the digitizer]")
 @click.option("--width", default=4.7, show_default=True,
-              help="Full width of an echo at half maximum [ns]; a column echo_width is used instead where present.")
+              help="Full width of the pulse at half maximum [ns], and of echoes without a width of their own.")
+@click.option("--widths", metavar="COLUMN",
+              help="Column with the full width of each echo at half maximum [ns].  [default: echo_width, if present]")
+@click.option("--shares", metavar="COLUMN|equal",
+              help="Reflectance: column with the share of the footprint that each return takes, 0 to 1, or equal. "
+              "Returns without data take evenly what the others of their pulse leave; shares above 1 together are "
+              "scaled to 1.  [default: each return fills it]")
 @click.option("--spacing", default=1.0, show_default=True, help="Time between samples [ns].")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="8", show_default=True, help="Bits per sample.")
 @click.option("--baseline", default=12.0, show_default=True, help="Level without signal [DN].")
@@ -167,14 +174,15 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.
 
     The strip has the points of CLOUD and one packet per pulse; `wavebatch run` can read it. A pulse is a run of points
-    with equal GPS time.
+    with equal GPS time. With --intensity reflectance a wide echo is lower, with the same energy, and a return that
+    takes a share of the footprint returns that share of the light.
 
     Exit code: 0 done, 1 the cloud cannot be read or the strip cannot be written, 2 wrong usage.
     """  # fmt: skip
     settings = from_options(SynthesisOptions, options, bits=int(options["bits"]), radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
-    print_summary(options, summary, _list_lines(output, summary))
+    print_summary(options, summary.to_json() if options["as_json"] else summary, _list_lines(output, summary))
 
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:
@@ -182,8 +190,8 @@ def _build_radar(options: dict[str, Any]) -> Radar | None:
     given = given_options(options, _RADAR)
     height = options["sensor_height"]
     if options["intensity"] == "peak":
-        if given or height is not None:
-            raise click.UsageError("the options of the lidar equation need --intensity reflectance")
+        if given or height is not None or options["shares"] is not None:
+            raise click.UsageError("the options of the lidar equation and --shares need --intensity reflectance")
         return None
     if height is None:
         raise click.UsageError("--intensity reflectance needs --sensor-height")
@@ -200,3 +208,22 @@ def _list_lines(output: Path, summary: SynthesisSummary) -> Iterator[str]:
         yield f"note: {count(summary.saturated, 'return')} above the digitizer's range; lower --gain"
     if summary.scattered:
         yield f"note: {count(summary.scattered, 'pulse')} incomplete in the cloud; sort the cloud by GPS time if needed"
+    share = f" ({summary.energy_recorded / summary.energy:.1%})" if summary.energy else ""
+    yield f"energy: {summary.energy:.4g} DN ns modelled, {summary.energy_recorded:.4g} DN ns in the samples{share}"
+    yield from _list_light(summary)
+
+
+def _list_light(summary: SynthesisSummary) -> Iterator[str]:
+    """What was assumed about widths and shares."""
+    light, points = summary.light, summary.points
+    if light.own_width:
+        yield f"widths: {light.own_width} of the cloud, {points - light.own_width} of the pulse"
+    if light.limited_width:
+        yield f"note: {count(light.limited_width, 'width')} outside of half a sample to 118 ns, set to that limit"
+    if light.pulses:
+        found = f"{light.own_share} of the cloud, {light.assumed_share} assumed"
+        yield f"shares: {found}; the returns of a pulse take {summary.light_used:.1%} of its light on average"
+    if light.pulses and summary.scattered:
+        yield "note: shares of incomplete pulses are those of the points that are there in a row"
+    if light.over_one:
+        yield f"note: {count(light.over_one, 'pulse')} with shares above 1 together, scaled to 1"

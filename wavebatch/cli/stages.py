@@ -11,6 +11,7 @@ import click
 
 from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.options import common_options
+from wavebatch.cli.program.completion import complete_stages
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 
@@ -19,10 +20,12 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("name", required=False)
+@click.argument("name", required=False, shell_complete=complete_stages)
 @common_options("json")
 def stages(name: str | None, as_json: bool, debug: bool) -> None:
-    """List the algorithms that a chain can use, or explain the one called NAME.
+    """List the algorithms that a chain can use, those of one kind, or explain the one called NAME.
+
+    Kinds are noise, detect, decompose and attribute.
 
     The explanation has its parameters with units and ranges, its source, and an example for a chain file.
 
@@ -33,13 +36,16 @@ def stages(name: str | None, as_json: bool, debug: bool) -> None:
 
     for line in load_plugins() if name not in STAGES else ():
         talk(f"warning: {line}")
-    if name is not None and name not in STAGES:
+    kind = name if name in KINDS else None
+    if name is not None and name not in STAGES and kind is None:
         hint = nearest(name, STAGES)
         raise ConfigError(f"no stage {name!r}; {hint if '?' in hint else '`wavebatch stages` lists them'}")
     order = list(KINDS)
-    chosen = [STAGES[name]] if name else sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
+    one = name is not None and kind is None
+    chosen = sorted(STAGES.values(), key=lambda s: (order.index(s.kind), s.name))
+    chosen = [stage for stage in chosen if name in (None, stage.name, stage.kind)]
     width = max(len(stage.name) for stage in chosen)
-    lines = [_explain(STAGES[name])] if name else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
+    lines = [_explain(STAGES[name])] if one else [f"{stage.name:<{width}}  {stage.summary}" for stage in chosen]
     print_result(as_json, [_describe(stage) for stage in chosen], lines)
 
 

@@ -27,11 +27,13 @@ from wavebatch.cli.options import (
 )
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import InputError
+from wavebatch.core.units import HALF_C
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
+from wavebatch.tools.return_stats.dead_zones import LEAST_PAIRS, DeadZone
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
 EXIT_UNREADABLE = 1
@@ -39,6 +41,10 @@ EXIT_UNREADABLE = 1
 
 SHOWN = 20
 """Areas of a cloud that are printed: about a screen; -o and --json have all of them."""
+
+
+_ZONE = ("dead_zone_m", "dead_zone_err_m")
+"""Columns of the table for a dead zone: of all pairs, then with the numbers of the returns appended."""
 
 
 @click.command()
@@ -103,6 +109,7 @@ def _list_lines(found: ReturnStats) -> Iterator[str]:
         yield f"{'separation':<14}  {'pairs':>10}  {'mean m':>10}  {'least m':>10}"
         for name, one in found.separations.items():
             yield f"{name:>14}  {one.pairs:>10}  {one.mean:>10.3f}  {one.least:>10.3f}"
+        yield from _list_zones(found)
     if found.several:
         pulses = count(found.several, "pulse")
         yield f"depth          {found.depth:.3f} m, mean height of the first above the last return of {pulses}"
@@ -111,6 +118,17 @@ def _list_lines(found: ReturnStats) -> Iterator[str]:
             yield f"{name:<22}  {number:>10}"
     yield from (f"warning        {line}" for line in found.warnings)
     yield from _list_areas(found.areas)
+
+
+def _list_zones(found: ReturnStats) -> Iterator[str]:
+    """The dead zones, of all pairs and by return number."""
+    yield f"{'dead zone':<14}  {'pairs':>10}  {'size m':>10}  {'error m':>10}  {'ns':>10}"
+    for name, one in found.dead_zones.items():
+        if math.isnan(one.size):
+            words = f"  no-data: fewer than {LEAST_PAIRS} pairs" if one.pairs < LEAST_PAIRS else "  no-data: all far"
+        else:
+            words = f"  {one.size:>10.2f}  {one.error:>10.2f}  {one.size / HALF_C:>10.1f}"
+        yield f"{name:>14}  {one.pairs:>10}{words}"
 
 
 def _list_areas(areas: Sequence[AreaStats]) -> Iterator[str]:
@@ -142,6 +160,7 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
     ranks = [pair.replace("-", "_").rstrip("_") for pair in RANKS]
     head += [f"{name}_{pair}" for pair in ranks for name in ("pairs", "mean_m", "least_m")]
     head += ["pulses_with_several", "first_above_last_m"]
+    head += [f"{name}{pair}" for pair in ("", *(f"_{pair}" for pair in ranks)) for name in _ZONE]
     table.writerow(head)
     for cloud, part in rows:
         if isinstance(part, AreaStats):
@@ -154,6 +173,11 @@ def _format_table(each: Sequence[ReturnStats], total: ReturnStats) -> str:
         for one in _rank_pairs(part):
             values += [one.pairs, one.mean, one.least]
         values += [part.several, part.depth]
+        # Distances are collected per cloud only: a histogram per area would need too much memory.
+        zones = {} if isinstance(part, AreaStats) else part.dead_zones
+        for name in ("all", *RANKS):
+            zone = zones.get(name, DeadZone(0, math.nan, math.nan))
+            values += [zone.size, zone.error]
         table.writerow([cloud, *(_cell(value) for value in values)])
     return text.getvalue()
 

@@ -16,12 +16,14 @@ import click
 from wavebatch.cli.messages import count, one_line, print_result, talk
 from wavebatch.cli.options import (
     check_html,
+    check_toml,
     common_options,
     html_option,
     output_option,
     strip_options,
     strips_argument,
 )
+from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 
 if TYPE_CHECKING:
     from wavebatch.core.waveforms import SystemPulse
@@ -77,6 +79,7 @@ def survey(
     overwrite = options["overwrite"]
     paths = find_files(strips, recursive=options["recursive"])
     for target in (output, chain_file):
+        check_toml(target)
         if target is not None:
             check_target(target, overwrite=overwrite)
     check_html(html_file)
@@ -143,7 +146,8 @@ def _write_angles(target: Path, opened: Any, found: Any, overwrite: bool) -> Non
 
     distance = find_sensor(opened.reader, opened.scan, SensorRequest()).distance
     sizes = {"spacing": found.figures["spacing_ns"], "amplitude": found.figures["amplitude_50"]}
-    write_angles(target, found.system, distance=distance, **sizes, overwrite=overwrite)
+    name = opened.facts.path.name
+    write_angles(target, found.system, distance=distance, strip=name, **sizes, overwrite=overwrite)
 
 
 def _survey_together(paths: Sequence[Path], options: dict[str, Any]) -> tuple[SavedSurvey, dict[str, Any]]:
@@ -230,8 +234,8 @@ def _lines(saved: SavedSurvey, facts: dict[str, Any]) -> Iterator[str]:
     yield from _noise_lines(saved)
     yield from _pulse_lines(saved)
     if "divergence_seen_mrad" in figures:
-        seen = f"{figures['divergence_seen_mrad']:.3g} +- {figures['divergence_seen_error_mrad']:.2g} mrad"
-        yield _line("beam", f"{seen} by the widths of echoes over the slopes of their surfaces")
+        seen = format_measure(figures["divergence_seen_mrad"], figures["divergence_seen_error_mrad"])
+        yield _line("beam", f"{seen} mrad by the widths of echoes over the slopes of their surfaces")
     yield from _digitizer_lines(saved)
     yield from _scene_lines(saved)
     yield "decisions"
@@ -285,7 +289,6 @@ def _name_model(system: SystemPulse) -> str:
 
 
 def _pulse_lines(saved: SavedSurvey) -> Iterator[str]:
-    from wavebatch.core.units import FWHM_PER_SIGMA
 
     system, figures = saved.survey.system, saved.survey.figures
     width = f"s_ref {system.sigma_ref:.4f} ns, full width at half maximum {system.sigma_ref * FWHM_PER_SIGMA:.3f} ns"

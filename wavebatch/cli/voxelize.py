@@ -16,6 +16,7 @@ import click
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, counting, print_json, talk
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import format_measure
 from wavebatch.files.disk.protect import refuse_input
 from wavebatch.files.inputs import find_files
 
@@ -158,9 +159,8 @@ def _list_lines(summary: VoxelSummary) -> Iterator[str]:
 def _tell_ratio(summary: VoxelSummary) -> Iterator[str]:
     """The reflectance ratio by which light is shared."""
     if summary.reflectance_ratio_source == "strip":
-        yield (
-            f"reflectance of canopy over ground: {summary.reflectance_ratio:.3g} +- {summary.reflectance_ratio_err:.2g}"
-        )
+        measure = format_measure(summary.reflectance_ratio, summary.reflectance_ratio_err or 0.0)
+        yield f"reflectance of canopy over ground: {measure}"
     elif summary.reflectance_ratio_source == "assumed":
         yield (
             "note: the strip does not show the reflectance of canopy over ground (fewer than 100 pulses, all shared by "

@@ -225,10 +225,8 @@ class EchoTable:
         }
         core = {name: np.ascontiguousarray(values, dtype=_FIELDS.get(name)) for name, values in given.items()}
         table = cls(**core, attributes=dict(attributes or {}))
-        step = np.diff(table.waveform)
-        if np.any(step < 0) or np.any((step == 0) & (np.diff(table.time) < 0)):
-            table = table.take(np.lexsort((table.time, table.waveform)))
-        return table
+        order = find_order(table.waveform, table.time)
+        return table if order is None else table.take(order)
 
     @classmethod
     def empty(cls) -> EchoTable:
@@ -303,3 +301,35 @@ class EchoTable:
         core = {name: np.concatenate([getattr(table, name) for table, _ in pairs]) for name in _FIELDS}
         core["waveform"] = np.concatenate([table.waveform + np.int32(shift) for table, shift in pairs])
         return cls(**core, attributes={name: np.concatenate([t.attributes[name] for t, _ in pairs]) for name in names})
+
+
+def find_order(waveform: np.ndarray, time: np.ndarray) -> np.ndarray | None:
+    """Order of rows by waveform, then time.
+
+    For tables that are a few sorted runs in which hardly a waveform has its echoes out of order, as fits give them: a
+    stable sort of the waveforms, and one by both of those few, takes less time than a sort of all by both.
+
+    Parameters
+    ----------
+    waveform : int (m,)
+        From 0; memory grows with the largest.
+    time : float (m,)
+
+    Returns
+    -------
+    int64 (m,) or None
+        None where the rows have that order.
+    """
+    order = None
+    if np.any(waveform[1:] < waveform[:-1]):
+        order = np.argsort(waveform, kind="stable")
+        waveform, time = waveform[order], time[order]
+    late = (waveform[1:] == waveform[:-1]) & (time[1:] < time[:-1])
+    if not late.any():
+        return order
+    order = np.arange(len(waveform)) if order is None else order
+    mixed = np.zeros(int(waveform[-1]) + 1, bool)
+    mixed[waveform[1:][late]] = True
+    rows = np.flatnonzero(mixed[waveform])
+    order[rows] = order[rows[np.lexsort((time[rows], waveform[rows]))]]
+    return order

@@ -1,4 +1,4 @@
-"""Physical constants, statistical constants and conversions that several rooms use; nothing here may be tuned."""
+"""Physical and statistical constants that several rooms use, none to be tuned, and numbers with errors as text."""
 
 import math
 
@@ -42,3 +42,46 @@ MEDIAN_ERROR = math.sqrt(math.pi / 2.0)
 
 MAD_TO_STD = 1.4826
 """Median absolute deviation of a normal distribution times this is its standard deviation."""
+
+
+def format_measure(value: float, error: float, sign: str = "+-") -> str:
+    """Return `12.34 +- 0.05`: a value with as many digits as its error, which has two.
+
+    Parameters
+    ----------
+    value, error : float
+        In one unit. Where the error is not above 0 and finite, the value stands alone.
+    sign : str
+        Between the two.
+
+    Returns
+    -------
+    str
+        `-` for a value that is not finite.
+    """
+    if not math.isfinite(value):
+        return "-"
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.7g}"
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
+    if round(error, digits) >= 10.0 ** (2 - digits) and digits:  # 0.0996 is 0.10
+        digits -= 1
+    return f"{value:.{digits}f} {sign} {error:.{digits}f}"
+
+
+def format_relative(value: float, relative_error: float) -> str:
+    """Return `2.857e-08`: a value with as many digits as its relative error allows, which then has two.
+
+    Parameters
+    ----------
+    value, relative_error : float
+        The error over the value. Where it is not above 0 and finite, six digits are given.
+
+    Returns
+    -------
+    str
+    """
+    if not (math.isfinite(relative_error) and relative_error > 0):
+        return f"{value:.6g}"
+    digits = 2 - math.floor(math.log10(relative_error))
+    return f"{value:.{min(max(digits, 2), 10)}g}"

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.publish import Draft, check_target, reporting
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def check_picture(target: Path, *, overwrite: bool) -> None:
     if target.suffix.lower() not in _METADATA:
         raise ConfigError(f"{target}: unknown kind of picture; use {', '.join(_METADATA)}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError(f"{target}: pictures need matplotlib: pip install 'wavebatch[plot]'")
+        raise ConfigError(f"{target}: pictures need matplotlib: {advise_install('matplotlib')}")
     check_target(target, overwrite=overwrite)
 
 

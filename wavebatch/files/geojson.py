@@ -1,7 +1,7 @@
 """Polygons of a GeoJSON file, and the test which points lie inside.
 
-Used for the areas of `wavebatch stats` and for reference targets of the calibration. Coordinates are those of the
-clouds; nothing is projected.
+Used for the areas of `wavebatch stats` and `run --polygon`, and for reference targets of the calibration. Coordinates
+are those of the file: `area_crs` places them in a strip.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.area_crs import AreaFile, place_rings, read_area_file
+from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
 
 _WANTED = 'it needs "features", each with "properties", and a "geometry" with "type" and "coordinates"'
@@ -30,6 +32,12 @@ class Polygon:
     name: str
     rings: tuple[np.ndarray, ...]
     """Corners of each ring, f8 (k, 2)."""
+    file: AreaFile | None = None
+    """Where its coordinates lie; None: in the strip's CRS."""
+
+    def place(self, strip: Path, header: LasHeader) -> Polygon:
+        """Return the polygon in the coordinates of a strip; raises as `area_crs.place_rings`."""
+        return Polygon(self.name, tuple(place_rings(self.file, self.rings, strip, header)))
 
 
 def find_inside(rings: Sequence[np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -68,30 +76,38 @@ def load_polygons(path: Path | str) -> list[Polygon]:
     Raises ConfigError if the file cannot be read or holds anything else.
     """
     polygons = []
-    for number, (properties, rings) in enumerate(read_features(read_text(path, "polygon file", MOST_LIST), path), 1):
+    features, file = read_features(read_text(path, "polygon file", MOST_LIST), path)
+    for number, (properties, rings) in enumerate(features, 1):
         for ring in rings:
             if len(ring) < 3 or not (np.abs(ring) <= FARTHEST).all():
                 raise ConfigError(f"{path}: polygon {number}: a ring needs three corners with finite coordinates")
-        polygons.append(Polygon(str(properties.get("name") or number), tuple(rings)))
+        polygons.append(Polygon(str(properties.get("name") or number), tuple(rings), file))
     if not polygons:
         raise ConfigError(f"{path}: holds no polygon; give a GeoJSON FeatureCollection of polygons")
     return polygons
 
 
-def read_features(text: str, path: Path | str) -> list[tuple[dict[str, Any], list[np.ndarray]]]:
-    """Return properties and rings, f8 (k, 2) each, of all features of a GeoJSON document.
+def read_features(text: str, path: Path | str) -> tuple[list[tuple[dict[str, Any], list[np.ndarray]]], AreaFile]:
+    """Return properties and rings, f8 (k, 2) each, of all features of a GeoJSON document, and where these lie.
 
     path: name for messages. Raises ConfigError for anything else than polygons.
     """
     try:
-        listed = json.loads(text)["features"]
+        document = json.loads(text)
+        if isinstance(document, dict) and document.get("type") in ("Polygon", "MultiPolygon"):
+            document = {"features": [{"geometry": document}]}
+        elif isinstance(document, dict) and document.get("type") == "Feature":
+            document = {"features": [document], "crs": document.get("crs")}
+        listed = document["features"]
         listed = list(listed.values()) if isinstance(listed, dict) else list(listed)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise ConfigError(f"{path}: not GeoJSON with a list of polygons: no JSON at {where}") from error
     except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {_WANTED}") from error
-    return [_read_feature(feature, f"{path}: feature {number}") for number, feature in enumerate(listed, 1)]
+    features = [_read_feature(feature, f"{path}: feature {number}") for number, feature in enumerate(listed, 1)]
+    rings = [ring for _, rings in features for ring in rings]
+    return features, read_area_file(path, document.get("crs"), rings)
 
 
 def _read_feature(feature: Any, where: str) -> tuple[dict[str, Any], list[np.ndarray]]:

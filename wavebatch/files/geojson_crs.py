@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.optional import advise_install
+from wavebatch.files.las.crs import repair_wkt
 from wavebatch.files.las.geotiff_wkt import find_code
 from wavebatch.files.las.header import Vlr
 
@@ -50,23 +52,9 @@ def find_crs(text: str | None, vlrs: Iterable[Vlr]) -> str | None:
     if text is not None and text.startswith("EPSG:"):
         return text
     if text is not None and text.rstrip().endswith("]"):
-        return _repair(text)
+        return repair_wkt(text)
     code = find_code(vlrs)
     return None if code is None else f"EPSG:{code}"
-
-
-def _repair(wkt: str) -> str:
-    """The WKT with degrees as the unit of its geographic CRS.
-
-    RIEGL's RiPROCESS writes metres there. PROJ then takes a central meridian of 15 for 15 radians: a strip in Austria
-    would lie in Siberia.
-    """
-    start = wkt.find("GEOGCS[")
-    wrong = re.search(r'UNIT\["[Mm]et(?:er|re)",\s*1(?:\.0*)?\s*(,AUTHORITY\["EPSG","9001"\])?\]', wkt[start:])
-    if start < 0 or wrong is None or "PROJECTION[" in wkt[start : start + wrong.start()]:
-        return wkt
-    unit = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
-    return wkt[: start + wrong.start()] + unit + wkt[start + wrong.end() :]
 
 
 def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
@@ -88,8 +76,8 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
         import pyproj
     except ImportError as error:
         raise ConfigError(
-            f"{path}: GeoJSON in WGS 84 needs pyproj: pip install 'wavebatch[gis]'; or write .csv, or --geojson-crs "
-            "keep for the coordinates of the strip"
+            f"{path}: GeoJSON in WGS 84 needs pyproj: {advise_install('pyproj')}; or write .csv, or "
+            "--geojson-crs keep for the coordinates of the strip"
         ) from error
     try:
         source = pyproj.CRS.from_user_input(crs)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.publish import Draft, check_target
 
@@ -53,7 +54,7 @@ def check_raster(target: Path, *, overwrite: bool) -> None:
     if target.suffix.lower() not in (".tif", ".tiff"):
         raise ConfigError(f"{target}: unknown kind of raster; use .tif")
     if importlib.util.find_spec("rasterio") is None:
-        raise ConfigError(f"{target}: rasters need rasterio: pip install rasterio (extra `gis` of wavebatch)")
+        raise ConfigError(f"{target}: rasters need rasterio: {advise_install('rasterio')}")
     check_target(target, overwrite=overwrite)
 
 

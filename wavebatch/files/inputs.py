@@ -27,12 +27,14 @@ def find_files(arguments: Iterable[str], *, recursive: bool = False) -> list[Pat
     `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
     are skipped. A file that does not exist or a folder that cannot be read is kept: it fails in its turn, so that the
     other files are still processed.
-    Raises ConfigError if a folder, pattern or list gives no file.
+    Raises ConfigError if a folder, pattern or list gives no file, or if there is no argument.
     """
     files: dict[str, Path] = {}
     for argument in arguments:
         for path in _expand(argument, Path(), recursive):
             files.setdefault(_real_name(path), path)
+    if not files:
+        raise ConfigError("no file given; name files, folders, patterns or @list.txt")
     protect(files.values())
     return list(files.values())
 
@@ -43,8 +45,6 @@ def find_strips(arguments: Iterable[str], *, recursive: bool = False) -> list[Pa
     Raises ConfigError if there is none, or if two strips would get outputs of the same name.
     """
     strips = find_files(arguments, recursive=recursive)
-    if not strips:
-        raise ConfigError("no strip given")
     stems: dict[str, Path] = {}
     for path in strips:
         other = stems.setdefault(os.path.normcase(path.stem), path)
@@ -58,6 +58,8 @@ def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
         yield from _read_list(folder / argument[1:], recursive)
         return
     path = folder / argument
+    if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
+        path = folder / os.path.expanduser(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
@@ -99,9 +101,13 @@ def _is_strip(path: Path) -> bool:
 
 def _read_list(path: Path, recursive: bool) -> Iterator[Path]:
     protect([path])
+    empty = True
     for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
         entry = line.strip()
         if entry and not entry.startswith("#"):
             if entry.startswith("@"):
                 raise ConfigError(f"{path}: line {number}: a list cannot name another list")
+            empty = False
             yield from _expand(entry, path.parent, recursive)
+    if empty:
+        raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 
@@ -158,8 +159,8 @@ def _project(path: Path, columns: dict[str, np.ndarray], crs: str | None) -> np.
         import pyproj
     except ImportError as error:
         raise InputError(
-            f"{path}: the trajectory is in degrees: pip install 'wavebatch[gis]' (pyproj), or give x, y, z in the "
-            "strip's CRS"
+            f"{path}: the trajectory is in degrees, which needs pyproj: {advise_install('pyproj')}; or give x, y, "
+            "z in the strip's CRS"
         ) from error
     try:
         target = pyproj.CRS.from_user_input(crs)

@@ -61,6 +61,8 @@ def load_chain(path: Path | str) -> Chain:
     ConfigError
         Where the file or the chain is wrong; names file, table, key and the nearest known word.
     """
+    if str(path) in ("auto", *list_profiles()) and not Path(path).exists():
+        raise ConfigError(f"--chain {path}: there is no such file; the shipped chain is --profile {path}")
     return parse_chain(read_text(path, "chain file"), str(path))
 
 

@@ -151,7 +151,7 @@ class ErrorStats:
     """Mean of found minus true."""
     rmse: float
     nmad: float
-    """1.4826 times the median absolute deviation from the median: the spread without outliers."""
+    """MAD_TO_STD times the median absolute deviation from the median: the spread without outliers."""
     rms_per_bound: float
     """Root mean square of error / Cramer-Rao bound of an isolated echo."""
     nmad_per_bound: float

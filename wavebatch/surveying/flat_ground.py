@@ -17,7 +17,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import UNCLEAN
-from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C
+from wavebatch.core.units import SQUARED_NORMAL_MEDIAN, C, format_measure
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan
@@ -84,7 +84,7 @@ class Reference:
             return ""
         return (
             f"a beam of {given:g} mrad contradicts the echo widths, which grow with the slopes of surfaces as those of "
-            f"a beam of {self.divergence:.3g} +- {self.divergence * self.divergence_error:.2g} mrad do: "
+            f"a beam of {format_measure(self.divergence, self.divergence * self.divergence_error)} mrad do: "
             "cross sections and angles are wrong unless the surfaces are rough; check divergence_mrad"
         )
 

@@ -132,6 +132,12 @@ def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known:
     return replace(system, sigma_ref=width * block.spacing)
 
 
+def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
+    """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
+    saturation = find_saturation(block.samples, block.digitizer.max_count)
+    return _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+
+
 def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
     """About `number` waveforms spread over the block, at least as many where it has them."""
     return block.rows(slice(None, None, max(len(block) // number, 1)))

@@ -342,7 +342,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
     """As survey_block, from noise and width as `measure_gaussian` finds them."""
     figures: dict[str, float] = {}
     if learn:
-        main = find_isolated(block, system, find_clear(block, system))
+        clear = find_clear(block, system)
+        main = find_isolated(block, system, clear)
         figures["isolated_echoes"] = len(main)
         if len(main) >= ENOUGH_TO_LEARN:
             system = learn_pulse(block, system, main, figures)
@@ -358,7 +359,8 @@ def _survey(block: WaveformBlock, system: SystemPulse, *, learn: bool) -> Survey
                 break
         before, echoes = system, decompose_sample(part, system)
         system = measure_residuals(part, system, echoes)
-        system = measure_misfit(block, system, find_strong(find_clear(block, system)))
+        # The strongest echoes are the same, and clear, whatever pulse is learned from them.
+        system = measure_misfit(block, system, find_strong(clear))
         if not _finds_alike(before, system):
             echoes = decompose_sample(part, system)
     else:

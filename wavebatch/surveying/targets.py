@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.chain import Chain
@@ -110,7 +111,8 @@ def build_calibration(
     results = [result for result, _, _ in measured]
     whole = combine_targets(results, _fit_errors([used for _, used, _ in measured]))
     if whole is None:
-        reasons = "; ".join(f"{result.name}: {result.refused}" for result in results)
+        miss = describe_miss([target.corners for target in targets], source.reader.facts.header)
+        reasons = miss or "; ".join(f"{result.name}: {result.refused}" for result in results)
         raise InputError(f"{source.path}: no target gives a constant ({reasons}); check coordinates and targets")
     used = np.concatenate([rows for _, rows, _ in measured])
     ranging = measure_ranging(source.sensor, used["distance"], options.attenuation)

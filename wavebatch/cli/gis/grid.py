@@ -7,13 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, talk
+from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.program.completion import complete_columns
 from wavebatch.files.inputs import find_files
+
+if TYPE_CHECKING:
+    from wavebatch.tools.rasters.grid import GridResult
 
 
 def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
@@ -22,7 +26,8 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 
 @click.command()
 @shared.clouds_argument
-@click.option("--column", "columns", multiple=True, metavar="NAME",
+@shared.recursive_option
+@click.option("--column", "columns", multiple=True, metavar="NAME", shell_complete=complete_columns,
               help="Extra dimension or standard field; repeated: a band each. Not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "std", "count", "density"]),
               default="mean", show_default=True,
@@ -33,13 +38,11 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 @shared.output_option("Raster to write: .tif.", "X.tif")
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to write: west, south, east, north [m].  [default: all]")
-@click.option("--flags-with", multiple=True, metavar="NAMES",
-              help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK.")
-@click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags.")
+@shared.selection_options
 @click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
 @click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
               help="Value of cells without data; nan is possible.")
-@shared.common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "json", "quiet")
 def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Write columns of CLOUDs as a GeoTIFF, of clouds of any size.
 
@@ -53,21 +56,42 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
     from wavebatch.files.geotiff_file import check_raster
     from wavebatch.tools.rasters.grid import GridOptions, write_grid
 
-    paths = find_files(map(str, clouds))
+    paths = find_files(map(str, clouds), recursive=options["recursive"])
     check_raster(output, overwrite=options["overwrite"])
     flags = {name: read_flags(options[name]) for name in ("flags_with", "flags_without")}
-    given = {name: options[name] for name in ("statistic", "size", "bounds", "crs", "no_data")}
+    given = {name: options[name] for name in ("statistic", "size", "bounds", "where", "crs", "no_data")}
     found = write_grid(paths, output, GridOptions(columns, **given, **flags), overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:
         talk(f"warning: {output}: the clouds have no CRS, so the raster has none; give it with --crs EPSG:n")
-    if options["quiet"]:
-        return
+    if not options["quiet"]:
+        talk(f"{output}: {_summarise(found, columns)}")
+    if options["as_json"]:
+        print_json({"output": str(output), "clouds": [str(path) for path in paths], "statistic": options["statistic"],
+                    **_describe(found, columns)})  # fmt: skip
+
+
+def _summarise(found: GridResult, columns: Sequence[str]) -> str:
+    layout = found.layout
     used = found.points - found.left_out - found.outside
     parts = [f"{name or 'points'} {values} values, {used - values} without data"
              for name, values in zip(columns or ("",), found.values, strict=True)]  # fmt: skip
-    talk(
-        f"{output}: {count(found.points, 'point')}, {found.left_out} left out by flags, {found.outside} outside; "
+    return (
+        f"{count(found.points, 'point')}, {found.left_out} left out, {found.outside} outside; "
         f"{'; '.join(parts)}; {layout.columns} x {layout.rows} cells of {layout.size:g} {layout.unit}, {found.filled} "
         "with a value"
     )
+
+
+def _describe(found: GridResult, columns: Sequence[str]) -> dict[str, Any]:
+    """The raster and the counts as plain values."""
+    layout = found.layout
+    used = found.points - found.left_out - found.outside
+    bands = [{"column": name or None, "description": band.description, "unit": band.unit, "values": values,
+              "no_data": used - values}
+             for name, band, values in zip(columns or ("",), found.bands, found.values, strict=True)]  # fmt: skip
+    east, south = layout.west + layout.columns * layout.size, layout.north - layout.rows * layout.size
+    cells = {"columns": layout.columns, "rows": layout.rows, "size": layout.size, "filled": found.filled}
+    return {"points": found.points, "left_out": found.left_out, "outside": found.outside, "bands": bands, **cells,
+            "bounds": [layout.west, south, east, layout.north], "unit": layout.unit, "crs": layout.crs,
+            "no_data_value": layout.no_data}  # fmt: skip

@@ -14,7 +14,8 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import NearestGroup, count, print_json, talk
-from wavebatch.cli.plot.sections import cube, flag_options, profile, section, select
+from wavebatch.cli.plot.sections import cube, describe_picture, list_tally, profile, section, select
+from wavebatch.cli.program.completion import complete_columns, complete_flags
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.publish import check_target
 from wavebatch.files.figure_file import check_picture
@@ -45,7 +46,7 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
 def plot() -> None:
     """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
 
-    Needs matplotlib: pip install 'wavebatch[plot]'. No screen is needed; the same input gives the same bytes.
+    Needs matplotlib: pip install matplotlib. No screen is needed; the same input gives the same bytes.
     """
 
 
@@ -60,7 +61,7 @@ def plot() -> None:
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
-@click.option("--flags-with", multiple=True, metavar="NAMES",
+@click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
               help="Draw the first waveforms with an echo that has one of these flags, e.g. NOT_CONVERGED,AT_BOUND.")
 @click.option("--most", type=click.IntRange(1, 24), default=6, show_default=True, metavar="N",
               help="Most waveforms of --flags-with or of the default.")
@@ -162,18 +163,18 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", "columns", required=True, multiple=True,
+@click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
               help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
               "share an axis, others get one of their own.")
-@click.option("--by", metavar="COLUMN", help="Draw one line per value of this column, e.g. number_of_returns or "
-              "classification.")
+@click.option("--by", metavar="COLUMN", shell_complete=complete_columns,
+              help="Draw one line per value of this column, e.g. number_of_returns or classification.")
 @click.option("--bins", type=click.IntRange(1, 10_000), metavar="N", help="Number of bins.  [default: by the spread]")
 @click.option("--range", "limits", callback=_read_range, metavar="LOW:HIGH",
               help="Values to show.  [default: from 0.1 to 99.9 % of each line; what lies outside is counted]")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of counts.")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one histogram of all.")
 @click.option("--counts", is_flag=True, help="Draw numbers also for several lines, not shares of each line's values.")
-@flag_options
+@shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **options: Any) -> None:
     """Draw histograms of columns of CLOUDs of any size.
@@ -197,17 +198,8 @@ def histogram(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **
     if not options["quiet"]:
         talk(f"{output}: {text}")
     if options["as_json"]:
-        drawn = [{"columns": list(names), **_list_tally(tally)} for names, tally in tallies.items()]
-        print_json({**_describe(output, clouds), "drawn": drawn})
-
-
-def _describe(output: Path, clouds: Sequence[Path]) -> dict[str, Any]:
-    return {"output": str(output), "clouds": [str(path) for path in clouds]}
-
-
-def _list_tally(tally: Any) -> dict[str, int]:
-    """How many points were drawn, and how many were not, for --json."""
-    return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
+        drawn = [{"columns": list(names), **list_tally(tally)} for names, tally in tallies.items()]
+        print_json({**describe_picture(output, clouds), "drawn": drawn})
 
 
 def _draw_flags(
@@ -269,13 +261,14 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", help="Extra dimension or standard field; not needed for count and density.")
+@click.option("--column", shell_complete=complete_columns,
+              help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
 @click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
-@flag_options
+@shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
     """Draw a map of a column of CLOUDs of any size, over x and y.
@@ -305,7 +298,7 @@ def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: An
     if options["as_json"]:
         cells = {"columns": found.grid.columns, "rows": found.grid.rows, "size": found.grid.size}
         more = {"statistic": statistic, "outside": found.outside, **cells}
-        print_json({**_describe(output, clouds), "column": column, **_list_tally(found.total), **more})
+        print_json({**describe_picture(output, clouds), "column": column, **list_tally(found.total), **more})
 
 
 plot.add_command(section)

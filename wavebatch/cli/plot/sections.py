@@ -12,20 +12,13 @@ from typing import Any
 import click
 
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, talk
+from wavebatch.cli.messages import count, print_json, talk
+from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
 from wavebatch.files.inputs import find_files
 
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
-flag_options = shared.together(
-    click.option("--flags-with", multiple=True, metavar="NAMES",
-                 help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
-    click.option("--flags-without", multiple=True, metavar="NAMES", help="Use only points with none of these flags."),
-    shared.where_option("Use only points"),
-)  # fmt: skip
-"""Options that select points by their flags and columns."""
-
 
 def select(column: str | None, options: dict[str, Any]) -> Any:
     """The selection of a column and of the flags in the options."""
@@ -36,12 +29,29 @@ def select(column: str | None, options: dict[str, Any]) -> Any:
     return Selection(column, *flags, where=options["where"])
 
 
+def describe_picture(output: Path, clouds: Sequence[Path]) -> dict[str, Any]:
+    """The first keys of every document of `plot ... --json`."""
+    return {"output": str(output), "clouds": [str(path) for path in clouds]}
+
+
+def list_tally(tally: Any) -> dict[str, int]:
+    """How many points were drawn, and how many were not, for --json."""
+    return {name: getattr(tally, name) for name in ("points", "left_out", "no_data", "values")}
+
+
+def _left_out(tally: Any) -> str:
+    return f", {tally.left_out} left out" * bool(tally.left_out)
+
+
 def _read_line(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
     return None if text is None else shared.parse_floats(text, "X0,Y0,X1,Y1")
 
 
 def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
     """Clouds, or one file of voxels."""
+    segments = [path for path in clouds if path.suffix.lower() in (".csv", ".geojson")]
+    if segments:
+        raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
     voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
     if voxels and len(clouds) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
@@ -58,16 +68,18 @@ def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
               help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
 @click.option("--width", type=float, metavar="W",
               help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")
-@click.option("--column", help="Column for the colours.  [default: z; energy for voxels]")
+@click.option("--column", shell_complete=complete_columns,
+              help="Column for the colours.  [default: z; energy for voxels]")
 @click.option("--aspect", type=click.FloatRange(0.01, 1000.0), default=1.0, show_default=True, metavar="F",
               help="Exaggerate heights F times.")
-@flag_options
-@shared.common_options("overwrite", "quiet")
+@shared.selection_options
+@shared.common_options("overwrite", "json", "quiet")
 def section(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
     """Draw a side view of CLOUDs or voxels along a line.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
-    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn.
+    voxelize`. Scales are equal without --aspect. Of more than 200,000 points an even sample is drawn. The few points
+    that lie far above or below all others are left out and counted as outside.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
@@ -82,42 +94,65 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     draw_section(found, output, aspect=options["aspect"], overwrite=options["overwrite"])
     if not options["quiet"]:
         kind = count(found.inside, "voxel" if found.voxel else "point")
-        talk(f"{output}: {kind} of {found.total.values}, {found.total.no_data} without data")
+        far = f", {found.outside} outside" if found.outside else ""
+        text = f"{kind} of {found.total.values}, {found.total.no_data} without data{far}"
+        talk(f"{output}: {text}{_left_out(found.total)}")
+    if options["as_json"]:
+        place = {"line": list(found.line), "width": found.width, "unit": found.unit, "crs": found.crs or None}
+        place |= {"outside": found.outside}
+        more = {"inside": found.inside, "drawn": len(found.value), "voxel": found.voxel or None, **place}
+        print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more})
 
 
 @click.command()
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--column", help="Column for --statistic sum and mean, e.g. energy.")
+@click.option("--column", shell_complete=complete_columns, help="Column for --statistic sum and mean, e.g. energy.")
 @click.option("--statistic", type=click.Choice(["count", "sum", "mean"]), default=None,
               help="Of the points or voxels of a height.  [default: sum with --column, else count]")
 @click.option("--size", type=float, metavar="M", help="Height of a bin.  [default: about a sixtieth of all]")
 @click.option("--each", is_flag=True, help="Draw one line per cloud instead of one of all.")
 @click.option("--log", is_flag=True, help="Use a logarithmic axis of values.")
-@flag_options
-@shared.common_options("overwrite", "quiet")
+@shared.selection_options
+@shared.common_options("overwrite", "json", "quiet")
 def profile(clouds: Sequence[Path], output: Path, column: str | None, **options: Any) -> None:
-    """Draw how many points, or how much of a column, of CLOUDs or voxels lie at each height.
+    """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
-    voxelize`. Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
+    voxelize`; or .csv or .geojson files of `wavebatch slice`, whose segments count in each bin by the share of their
+    height there (columns: length, slope, residual, pulses, weight). Heights are those of the coordinates, not above
+    ground. Far outliers in height are left out and counted.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import measure_profile
+    from wavebatch.tools.slices.read_segments import check_alone, is_segments, profile_segments
 
-    paths = _find(clouds, options)
-    check_picture(output, overwrite=options["overwrite"])
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    found = measure_profile(paths, select(column, options), statistic, **how)
+    segments = any(map(is_segments, clouds))
+    if segments:
+        check_alone(clouds, options)
+    paths = list(dict.fromkeys(clouds)) if segments else _find(clouds, options)
+    check_picture(output, overwrite=options["overwrite"])
+    if segments:
+        found = profile_segments(paths, column, statistic, **how)
+    else:
+        found = measure_profile(paths, select(column, options), statistic, **how)
     from wavebatch.tools.plots.draw_section import draw_profile
 
     draw_profile(found, output, log=options["log"], overwrite=options["overwrite"])
     if not options["quiet"]:
         total = found.total
-        talk(f"{output}: {count(total.values, 'value')}, {total.no_data} without data, {found.outside} outside")
+        kind = "segment" if segments else "value"
+        text = f"{count(total.values, kind)}, {total.no_data} without data, {found.outside} outside"
+        talk(f"{output}: {text}{_left_out(total)}")
+    if options["as_json"]:
+        series = [{"name": name, "values": row} for name, row in zip(found.names, found.values.tolist(), strict=True)]
+        more = {"statistic": statistic, "outside": found.outside, "edges": found.edges.tolist(), "series": series}
+        print_json({**describe_picture(output, paths), "column": column, **list_tally(found.total), **more,
+                    "unit": found.unit})  # fmt: skip
 
 
 @click.command()
@@ -126,7 +161,7 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
 @click.option("--x", type=click.IntRange(0), metavar="N", help="Slice across the lines at pulse N of each.")
 @click.option("--y", type=click.IntRange(0), metavar="N", help="Slice along scan line N.")
 @click.option("--t", type=float, metavar="NS", help="Slice of all pulses at one time [ns].")
-@shared.common_options("overwrite", "quiet")
+@shared.common_options("overwrite", "json", "quiet")
 def cube(cube_file: Path, output: Path, **options: Any) -> None:
     """Draw slices of a data cube of `wavebatch slice --cube`: x (pulse), y (scan line) and t (time).
 
@@ -143,3 +178,7 @@ def cube(cube_file: Path, output: Path, **options: Any) -> None:
     draw_cube(slices, output, name=cube_file.name, overwrite=options["overwrite"])
     if not options["quiet"]:
         talk(f"{output}: {', '.join(one.title for one in slices)}")
+    if options["as_json"]:
+        drawn = [{"title": one.title, "rows": one.image.shape[0], "columns": one.image.shape[1],
+                  "extent": list(one.extent), "across": one.across, "up": one.up} for one in slices]  # fmt: skip
+        print_json({"output": str(output), "cube": str(cube_file), "slices": drawn})

@@ -37,7 +37,11 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
          "with the truth; exit code 1 below 95 %"),
     ),
     "stats": (("wavebatch stats clouds/*.laz", "return numbers, separations and flags of clouds"),),
-    "synthesize": (("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),),
+    "synthesize": (
+        ("wavebatch synthesize cloud.laz -o strip.las", "waveforms from the returns of a cloud"),
+        ("wavebatch synthesize cloud.laz -o strip.las --intensity reflectance --sensor-height 1200 --shares equal",
+         "by the lidar equation, with partial footprints"),
+    ),
     "slice": (("wavebatch slice strip.las -o lines.csv", "straight surface lines in the scan lines"),),
     "voxelize": (("wavebatch voxelize strip.las --size 1 -o voxels.npz", "cross sections in voxels of 1 m"),),
     "plot": (),
@@ -58,15 +62,18 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
          "2 m wide, along the longer extent"),
     ),
     "plot profile": (
-        ("wavebatch plot profile voxels.npz -o heights.png", "energy by height"),
+        ("wavebatch plot profile voxels.npz --column energy -o heights.png", "energy by height"),
+        ("wavebatch plot profile lines.csv --column length -o lines.png", "length of surface lines by height"),
     ),
     "plot cube": (
-        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and the plane at sample 250"),
+        ("wavebatch plot cube cube.npz --y 3 --t 250 -o slices.png", "scan line 3, and all pulses at 250 ns"),
     ),
     "grid": (
         ("wavebatch grid clouds/ --column amplitude --column echo_width --statistic median --size 1 -o x.tif",
          "two bands for GIS"),
         ("wavebatch grid clouds/ --statistic density --size 5 -o density.tif", "points per square metre"),
+        ("wavebatch grid clouds/ --column z --statistic max --where 'classification != 7' -o top.tif",
+         "without points of noise"),
     ),
     "calibrate": (
         ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",

@@ -11,13 +11,12 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from laspy import PointFormat
 
 from wavebatch.core.echoes import COLUMNS, Column
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.suggest import nearest
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.files.point_dtypes import STANDARD_DTYPES, list_dimensions
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +99,7 @@ _SHORT = {
 _STANDARD = frozenset(
     re.sub("[_ ]", "", name.casefold())
     for number in STANDARD_DTYPES
-    for name in (*PointFormat(number).dimension_names, *STANDARD_DTYPES[number].names)
+    for name in (*list_dimensions(number), *STANDARD_DTYPES[number].names)
 )
 """Normalised names of the standard LAS dimensions."""
 
@@ -138,8 +137,11 @@ class WrittenColumn:
 
 
 def normalise(name: str) -> str:
-    """Return the form in which names are compared: without case, spaces, underscores and hyphens."""
-    return re.sub(r"[\s_\-]", "", name.casefold())
+    """Return the form in which names are compared: without case, spaces, underscores and other signs.
+
+    PDAL makes `_` of every sign, and takes names that differ in case only as one.
+    """
+    return re.sub(r"[\W_]", "", name.casefold())
 
 
 def describe(column: Column, unit: str | None = None) -> str:

@@ -121,6 +121,12 @@ class ColumnReader(CloudReader):
             return self._describe_extra(dimension), lambda raw: self._read_column(raw, dimension)
         if column in known:
             return self._describe_standard(column), lambda raw: self._read_standard(raw, column)
+        ours_not_here = [name for name in COLUMNS if normalise(name) == normalise(column)]
+        if ours_not_here:
+            raise ConfigError(
+                f"{self.path}: has no column {column!r}; `wavebatch run` writes {ours_not_here[0]} into clouds"
+                + (f": add --columns +{ours_not_here[0]}" if self.written else ", and this is none of them")
+            )
         hint = nearest(column, known)
         has = "" if hint.startswith("known") else f" Columns of the file: {', '.join(known)}"
         raise ConfigError(f"{self.path}: has no column {column!r}; {hint}{has}")

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import laspy
 import numpy as np
-from laspy.point.dims import DimensionInfo, DimensionKind
 
 from wavebatch.core.echoes import COLUMNS
 from wavebatch.files.cloud.column_names import STYLES
@@ -20,8 +19,13 @@ from wavebatch.files.disk.closing import Closing
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.extra_bytes import ExtraRecord
-from wavebatch.files.las.point_formats import split_numbers
+from wavebatch.files.las.point_formats import read_classes, split_numbers
 from wavebatch.files.las.read_points import open_points
+from wavebatch.files.point_dtypes import list_dimensions
+
+if TYPE_CHECKING:  # laspy takes 50 ms to import, and a run hardly ever needs it
+    import laspy
+    from laspy.point.dims import DimensionInfo
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""
@@ -34,12 +38,13 @@ CLOUD_DTYPE = np.dtype(
         ("flags", "<u2"),
         ("number", "u1"),
         ("total", "u1"),
+        ("classification", "u1"),
         ("intensity", "<u2"),
         *((name, "<f4") for name in CLOUD_COLUMNS),
     ]  # fmt: skip
 )
 """One echo of a cloud: time [s], position [m], the stored packet vector (0: none; it may point either way), EchoFlag
-bits, return number and number of returns, intensity, and columns (NaN: no data)."""
+bits, return number and number of returns, class, intensity, and columns (NaN: no data)."""
 
 _PIECE = 250_000
 _PIECE_BYTES = 1 << 26
@@ -107,6 +112,7 @@ class CloudReader(Closing):
         for name in CLOUD_COLUMNS:
             rows[name] = self._read_column(raw, self._sources.get(name))
         rows["number"], rows["total"] = split_numbers(raw)
+        rows["classification"] = read_classes(raw)
         rows["intensity"] = raw["intensity"]
         if "echo_flags" in self._sources:
             rows["flags"] = raw[self._sources["echo_flags"].name].astype(np.uint16)
@@ -135,6 +141,8 @@ class CloudReader(Closing):
 
 def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
     """Return laspy's point format with the extra dimensions of the checked records, under the names of the fields."""
+    import laspy
+
     point_format = laspy.PointFormat(checked.header.point_format)
     for field, record in zip(checked.dtype.names[-len(checked.records) :], checked.records, strict=False):
         point_format.dimensions.append(describe_dimension(field, record))
@@ -143,6 +151,8 @@ def describe_format(checked: CheckedHeader) -> laspy.PointFormat:
 
 def describe_dimension(field: str, record: ExtraRecord) -> DimensionInfo:
     """Return laspy's description of an extra dimension under the name of its field."""
+    from laspy.point.dims import DimensionInfo
+
     scales, offsets = (None, None) if record.scaling is None else np.array(record.scaling)[:, None]
     dimension = DimensionInfo.from_dtype(field, record.dtype, False, record.description, offsets, scales)
     return dimension._replace(no_data=record.no_data)
@@ -161,12 +171,13 @@ def read_dimension(raw: np.ndarray, dimension: DimensionInfo) -> np.ndarray:
 
 def list_fields(point_format: int) -> tuple[str, ...]:
     """Return the names of the fields of a point format, with x, y and z in place of their integers."""
-    names = (one.name for one in laspy.PointFormat(point_format).dimensions)
-    return ("x", "y", "z", *(name for name in names if name not in ("X", "Y", "Z")))
+    return ("x", "y", "z", *(name for name in list_dimensions(point_format) if name not in ("X", "Y", "Z")))
 
 
 def read_field(raw: np.ndarray, point_format: int, name: str) -> np.ndarray:
     """Return the stored values (n,) of a field of raw records, other than x, y and z."""
+    import laspy
+
     return widen(np.asarray(laspy.PackedPointRecord(raw, laspy.PointFormat(point_format))[name]))
 
 
@@ -192,6 +203,8 @@ def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str
 
 def _is_stored_as(dimension: DimensionInfo, column: str, scale: float | None) -> bool:
     """Whether the dimension is one number, scaled if the style scales it, and flags are unsigned integers."""
+    from laspy.point.dims import DimensionKind
+
     if dimension.num_elements != 1 or (dimension.scales is None) != (scale is None):
         return False
     return column != "echo_flags" or dimension.kind is DimensionKind.UnsignedInteger

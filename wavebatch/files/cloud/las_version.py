@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.las.crs import repair_records
 from wavebatch.files.las.geotiff_wkt import convert_geotiff
 from wavebatch.files.las.header import (
     GEOTIFF_ID,
@@ -33,7 +34,7 @@ class Version:
     version: tuple[int, int]
     point_format: int
     wkt: str | None = None
-    """WKT record to add."""
+    """WKT record to write in place of those of the strip."""
     notes: tuple[str, ...] = ()
     """Lines for the user."""
 
@@ -53,17 +54,32 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
     evlrs, _ = find_evlrs(path, header)
     records = [*header.vlrs, *evlrs]
     only_keys = has_record(records, PROJECTION, GEOTIFF_ID) and not has_record(records, PROJECTION, WKT_ID)
+    repaired = _repair(header)
     if wanted == "1.4" and point_format is None and not keep:
         modern = MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
         if only_keys and wkt is None:
             return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern),))
-        return Version(max(header.version, (1, 4)), modern, wkt)
-    wkt = None
+        return Version(max(header.version, (1, 4)), modern, wkt or repaired, (_REPAIRED,) * bool(repaired))
+    wkt = repaired
     if only_keys and target >= 6:
         wkt = convert_geotiff(path, header.vlrs, asked=header.point_format < 6)
     oldest = (1, 4) if wanted == "1.4" or target >= 6 else header.version
-    return Version(max(header.version, oldest), target, wkt)
+    return Version(max(header.version, oldest), target, wkt, (_REPAIRED,) * bool(repaired))
+
+
+_REPAIRED = (
+    "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS show the strip elsewhere; the "
+    "cloud's WKT is right"
+)
+
+
+def _repair(header: LasHeader) -> str | None:
+    """The WKT of the header as GIS understand it; None where it is right, or where there is none."""
+    for old, new in zip(header.vlrs, repair_records(header.vlrs), strict=True):
+        if new is not old:
+            return new.payload.rstrip(b"\0").decode()
+    return None
 
 
 def _explain_keys(target: int, modern: int) -> str:
@@ -78,7 +94,10 @@ def _explain_keys(target: int, modern: int) -> str:
 def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
     """LAS 1.3, if it can hold all that the strip has."""
     if target >= 6:
-        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}; leave one of the two out")
+        needed = header.point_format >= 6
+        what = "leave --las-version out" if needed else "leave one of the two out"
+        reason = f", and the strip's points of format {header.point_format} fit into no other" if needed else ""
+        raise ConfigError(f"{path}: --las-version 1.3 has no point format {target}{reason}; {what}")
     evlrs, _ = find_evlrs(path, header)
     if any(evlr.record_id != WAVEFORM_RECORD_ID for evlr in evlrs):
         raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")

@@ -40,7 +40,7 @@ class OutputLayout:
     packets: PacketPlace | None
     """The packets of the input, if the output keeps them."""
     wkt: str | None = None
-    """CRS, where the input gives it by GeoTIFF keys only and the point format needs WKT."""
+    """WKT in place of that of the input: where this gives GeoTIFF keys only, or a WKT that GIS misunderstand."""
     notes: tuple[str, ...] = ()
     """What the user should know about the format."""
 

@@ -120,6 +120,7 @@ def _build_header(layout: OutputLayout, provenance: Mapping[str, Any], evlrs: li
     vlrs = [vlr for vlr in source.vlrs if _is_carried(vlr, layout)]
     earlier = sum(vlr.user == USER_ID for vlr in vlrs)
     if layout.wkt is not None:
+        vlrs = [vlr for vlr in vlrs if not has_record([vlr], PROJECTION, WKT_ID)]
         vlrs.append(build_wkt(layout.wkt))
     vlrs.append(_encode_provenance(layout, provenance, earlier + 1))
     encoding = source.global_encoding & ~(WAVES_INTERNAL | WAVES_EXTERNAL)

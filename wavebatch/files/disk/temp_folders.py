@@ -21,6 +21,9 @@ from pathlib import Path
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import locks
 
+MEMORY_PLACE = Path("/dev/shm")
+"""Files here are in memory; Linux has it."""
+
 _LOCK = "lock"
 _place: ContextVar[Path | None] = ContextVar("wavebatch_scratch", default=None)
 _own: list[_Owned] = []
@@ -81,6 +84,29 @@ def owning_scratch(parent: Path | None = None) -> Iterator[Path | None]:
     finally:
         _place.reset(token)
         owned.close()
+
+
+@contextlib.contextmanager
+def owning_memory() -> Iterator[Path | None]:
+    """Make a folder for files in memory, and remove it at the end; None where the system has no place for them.
+
+    If this process is killed, its workers remove it (`remove_memory_orphans`), or else the next run.
+    """
+    try:
+        owned = _Owned(MEMORY_PLACE, "") if MEMORY_PLACE.is_dir() else None
+    except OSError:
+        owned = None
+    try:
+        yield None if owned is None else owned.folder
+    finally:
+        if owned is not None:
+            owned.close()
+
+
+def remove_memory_orphans() -> None:
+    """Remove the folders of killed processes from memory."""
+    with contextlib.suppress(OSError):
+        remove_orphans(MEMORY_PLACE)
 
 
 def remove_orphans(parent: Path) -> list[Path]:

@@ -10,12 +10,21 @@ import json
 import math
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from wavebatch.files.las.epsg_units import find_unit
-from wavebatch.files.las.header import EVLR_HEADER_SIZE, GEOTIFF_ID, WKT_ID, LasHeader, find_evlrs, is_projection
+from wavebatch.files.las.header import (
+    EVLR_HEADER_SIZE,
+    GEOTIFF_ID,
+    WKT_ID,
+    LasHeader,
+    Vlr,
+    build_wkt,
+    find_evlrs,
+    is_projection,
+)
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
@@ -114,13 +123,42 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
 
 
 def read_crs_definition(path: Path, header: LasHeader) -> str | None:
-    """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None."""
+    """Return the CRS of a file as GIS libraries take it: its WKT, else `EPSG:n` from its GeoTIFF keys, else None.
+
+    The WKT is that of `repair_wkt`.
+    """
     records = _read_records(path, header)
     text = records.get(WKT_ID, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
     if text:
-        return text
+        return repair_wkt(text)
     code = _read_code(records.get(GEOTIFF_ID, b""))
     return None if code is None else code.partition("+")[0]  # heights have no place in a raster
+
+
+def repair_wkt(wkt: str) -> str:
+    """Return a WKT with degrees as the unit of its geographic CRS.
+
+    RIEGL's RiPROCESS writes metres there. PROJ then takes a central meridian of 15 for 15 radians: a strip in Austria
+    would lie in Siberia.
+    """
+    start = wkt.find("GEOGCS[")
+    wrong = re.search(r'UNIT\["[Mm]et(?:er|re)",\s*1(?:\.0*)?\s*(,AUTHORITY\["EPSG","9001"\])?\]', wkt[start:])
+    if start < 0 or wrong is None or "PROJECTION[" in wkt[start : start + wrong.start()]:
+        return wkt
+    unit = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
+    repaired = wkt[: start + wrong.start()] + unit + wkt[start + wrong.end() :]
+    # RiPROCESS also gives code 0, which GDAL looks up and does not find: a GeoTIFF then has no projection.
+    return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", repaired)
+
+
+def repair_records(vlrs: Iterable[Vlr]) -> list[Vlr]:
+    """Return the records with the WKT among them as `repair_wkt` gives it; records that are right stay as they are."""
+    found = []
+    for vlr in vlrs:
+        text = vlr.payload.split(b"\0")[0].decode("utf-8", "replace")
+        wrong = is_projection(vlr) and vlr.record_id == WKT_ID and repair_wkt(text) != text
+        found.append(build_wkt(repair_wkt(text)) if wrong else vlr)
+    return found
 
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:

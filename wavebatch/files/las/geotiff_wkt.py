@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.las.header import GEOTIFF_ID, Vlr, is_projection
 
 _MODEL, _PROJECTED_CODE, _LINEAR, _VERTICAL_CODE, _VERTICAL_UNIT = 1024, 3072, 3076, 4096, 4099
@@ -71,7 +72,7 @@ def convert_geotiff(path: Path, vlrs: Iterable[Vlr], *, asked: bool) -> str | No
 
             return pyproj.CRS.from_epsg(code).to_wkt("WKT1_GDAL")
         except ImportError:
-            reason = f"EPSG:{code}, which pyproj would convert: pip install 'wavebatch[gis]'"
+            reason = f"EPSG:{code}, which pyproj would convert: {advise_install('pyproj')}"
         except pyproj.exceptions.CRSError as error:
             reason = f"EPSG:{code}, which pyproj does not know ({error})"
     else:

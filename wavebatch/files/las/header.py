@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from laspy import PointFormat
-
 from wavebatch import __version__
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import damaged, open_regular, reporting_reads
+from wavebatch.files.point_dtypes import STANDARD_DTYPES as STANDARD_DTYPES
 
 HEADER_SIZES = {(1, 0): 227, (1, 1): 227, (1, 2): 227, (1, 3): 235, (1, 4): 375, (1, 5): 393}
 """Bytes of the header by LAS version."""
@@ -33,9 +32,6 @@ MAX_FILE = 1 << 54
 WAVES_INTERNAL = 0b10
 WAVES_EXTERNAL = 0b100
 WKT_BIT = 0b1_0000
-
-STANDARD_DTYPES = {number: PointFormat(number).dtype() for number in range(11)}
-"""Record of every point format without extra bytes; fields have the names of laspy's raw arrays."""
 
 EVLR_HEADER_SIZE = 60
 MAX_EVLRS = 4096
@@ -188,12 +184,26 @@ def read_header(path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
         return read_header_of(file, path, least)
 
 
+def _guess(path: Path, front: bytes) -> str:
+    """What a file is that is no LAS file, and what to give in its place; empty where that is not known."""
+    beside = (path.with_suffix(end) for end in (".las", ".laz", ".LAS", ".LAZ"))
+    strip = next((one for one in beside if one.is_file()), None)
+    if front.startswith(b"PulseWaves"):
+        return "; it is PulseWaves, which wavebatch does not read" + f": give {strip}" * (strip is not None)
+    if path.suffix.lower() == ".wdp":
+        return f"; it has the packets of {strip or path.with_suffix('.las')}: give that file"
+    text = path.suffix.lower() in (".txt", ".lst", ".list", ".csv") or not front
+    if text and b"\0" not in front:
+        return f"; if it is a list of files, write @{path}" if front else "; it is empty"
+    return ""
+
+
 def read_header_of(file: BinaryIO, path: Path, least: tuple[int, int] = (1, 0)) -> LasHeader:
     """Return header and VLRs of an open LAS or LAZ file; `path` is its name in messages."""
     file.seek(0)
     front = file.read(_FRONT.size)
     if len(front) < _FRONT.size or front[:4] != b"LASF":
-        raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF)")
+        raise InputError(f"{path}: not a LAS or LAZ file (it does not begin with LASF){_guess(path, front)}")
     (_, source_id, encoding, project, major, minor, system, software, day, year, size, offset, n_vlrs,
      point_format, length, count, *rest) = _FRONT.unpack(front)  # fmt: skip
     standard = HEADER_SIZES.get((major, minor))

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.raw_bytes import guarded
 from wavebatch.files.las.checked_header import CheckedHeader
 
@@ -30,8 +31,8 @@ class LaszipPoints:
     def __init__(self, checked: CheckedHeader) -> None:
         if importlib.util.find_spec("laszip") is None:
             raise InputError(
-                f"{checked.path}: compressed with the coding of LAS 1.5, which lazrs cannot read; pip install laszip, "
-                "or decompress it first: laszip -i IN.laz -o OUT.las"
+                f"{checked.path}: compressed with the coding of LAS 1.5, which lazrs cannot read: "
+                f"{advise_install('laszip')}, or decompress it first: laszip -i IN.laz -o OUT.las"
             )
         self._checked = checked
         self._next, self._late = -1, False

@@ -7,6 +7,8 @@ classes); test changes by reading the output with both libraries.
 from __future__ import annotations
 
 import contextlib
+import io
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
+from wavebatch.core.optional import advise_install
 from wavebatch.files.las.header import HEADER_SIZES, STANDARD_DTYPES, LasHeader, Vlr, read_header_of
 
 try:
@@ -27,6 +30,10 @@ except ImportError:  # optional: only formats 9 and 10 with several scanner chan
 _ERRORS: tuple[type[Exception], ...] = (lazrs.LazrsError, *([laszip.LaszipError] if laszip else []))
 
 _WAVE_ITEM, _BROKEN_VERSION, _READABLE_VERSION = 9, 2, 1
+CHUNK_POINTS = 50_000
+"""Points of a LAZ chunk: what LASzip and lazrs write."""
+_TABLE_PLACE = struct.Struct("<q")
+"""Before the first chunk: where the table of the chunks' sizes begins."""
 _ITEMS_AT = 34
 """Offset of the list of items in the "laszip encoded" record."""
 
@@ -41,8 +48,30 @@ class PointEncoder:
     def write(self, rows: np.ndarray) -> None:
         self._file.write(rows.view(np.uint8).data)
 
+    @property
+    def coding(self) -> bytes | None:
+        """What `compress_chunk` needs to make chunks for `write_chunk`; None where only `write` makes this file."""
+        return None
+
+    def write_chunk(self, points: int, chunk: bytes) -> None:
+        """Append a chunk of `compress_chunk`; all but the last hold CHUNK_POINTS, and `write` may not be called too."""
+        raise NotImplementedError
+
     def finish(self) -> None:
         """Write what is left to be written."""
+
+
+def compress_chunk(coding: bytes, rows: np.ndarray) -> bytes:
+    """Compress rows (m,) as one chunk of a LAZ file; its bytes depend on nothing else.
+
+    coding: of the encoder that will write it. Raises InputError if it fails.
+    """
+    try:
+        with uninterrupted():
+            found = lazrs.compress_points(lazrs.LazVlr(coding), rows.view(np.uint8), False)
+    except _ERRORS as error:
+        raise InputError(f"the points cannot be compressed: {error}") from error
+    return bytes(memoryview(found)[_TABLE_PLACE.size : _TABLE_PLACE.unpack_from(found)[0]])
 
 
 def open_encoder(file: BinaryIO, header: LasHeader) -> PointEncoder:
@@ -99,6 +128,20 @@ class _LazrsEncoder(PointEncoder):
         self._channel: int | None = None
         self._watched = _WatchedFile(file)
         self._compressor = lazrs.LasZipCompressor(self._watched, lazrs.LazVlr(payload))
+        self._payload = payload
+        self._chunks: list[tuple[int, int]] = []
+        """Points and bytes of the chunks of `write_chunk`."""
+
+    @property
+    def coding(self) -> bytes | None:
+        return None if self._guarded else self._payload
+
+    def write_chunk(self, points: int, chunk: bytes) -> None:
+        if not self._chunks:
+            self._start = self._file.tell()
+            self._file.write(_TABLE_PLACE.pack(0))  # until `finish` knows it
+        self._file.write(chunk)
+        self._chunks.append((points, len(chunk)))
 
     def write(self, rows: np.ndarray) -> None:
         if self._guarded:
@@ -113,12 +156,24 @@ class _LazrsEncoder(PointEncoder):
         if np.any(channels != self._channel):
             raise InputError(
                 "points of several scanner channels with packets cannot be written as LAZ by lazrs; "
-                "pip install laszip, write LAS, or leave --keep-packets out"
+                f"{advise_install('laszip')}, write LAS, or leave --keep-packets out"
             )
 
     def finish(self) -> None:
+        if self._chunks:
+            self._finish_chunks()
+            return
         with self._watched.explaining():
             self._compressor.done()
+
+    def _finish_chunks(self) -> None:
+        """Write what lazrs writes after its last chunk: the table of the chunks, and its place before the first."""
+        place, table = self._file.tell(), io.BytesIO()
+        lazrs.write_chunk_table(table, self._chunks, lazrs.LazVlr(self._payload))
+        self._file.write(table.getvalue())
+        self._file.seek(self._start)
+        self._file.write(_TABLE_PLACE.pack(place))
+        self._file.seek(0, 2)
 
 
 class _LaszipEncoder(PointEncoder):

@@ -21,6 +21,12 @@ ANGLE_UNIT = 0.006
 """Degrees per count of `scan_angle` in formats 6-10; `scan_angle_rank` of formats 0-5 counts whole degrees."""
 _OVERLAP_CLASS = 12
 
+CLASS_NAMES = {
+    0: "never classified", 1: "unclassified", 2: "ground", 3: "low vegetation", 4: "medium vegetation",
+    5: "high vegetation", 6: "building", 7: "low point", 9: "water", 17: "bridge deck", 18: "high noise",
+}  # fmt: skip
+"""Names of classes in the LAS standard that all versions share."""
+
 
 def locate(points: np.ndarray, header: LasHeader) -> np.ndarray:
     """Return coordinates of records (n,), f8 (n, 3) [m]."""
@@ -32,6 +38,12 @@ def split_numbers(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the return numbers and numbers of returns of records (n,), u1 (n,) each."""
     bits = points["bit_fields"]
     return (bits & 15, bits >> 4) if "classification_flags" in points.dtype.names else (bits & 7, bits >> 3 & 7)
+
+
+def read_classes(points: np.ndarray) -> np.ndarray:
+    """Return the classes of records (n,), u1 (n,), without the flags that formats 0 to 5 keep in the same byte."""
+    modern = "classification_flags" in points.dtype.names
+    return points["classification"] if modern else points["raw_classification"] & 31
 
 
 def choose_format(path: Path, header: LasHeader, wanted: int | None, keep: bool) -> int:

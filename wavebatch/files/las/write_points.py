@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -19,7 +19,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.publish import Draft, publish_together, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID, ExtraRecord
 from wavebatch.files.las.header import WAVEFORM_RECORD_ID, LasHeader, Vlr, encode_evlr_header, has_record
-from wavebatch.files.las.laz_encode import open_encoder
+from wavebatch.files.las.laz_encode import compress_chunk, open_encoder
 
 _COPY_SIZE = 1 << 22
 _EXTRA_BYTES = ("LASF_Spec", EXTRA_BYTES_RECORD_ID)
@@ -69,12 +69,30 @@ class PointFile(contextlib.AbstractContextManager):
             return
         rows = np.ascontiguousarray(rows)
         self._statistics.add(rows)
-        if self._statistics.count >= 2**32 and self._header.version < (1, 4):
-            version = "{}.{}".format(*self._header.version)
-            raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
+        self._check_count()
         with self._guarded():
             self._encoder.write(rows)
             self.draft.file.flush()  # else a worker forked now would inherit the buffer and write it again
+
+    @property
+    def chunk_maker(self) -> ChunkMaker | None:
+        """What makes the arguments of `write_chunk`, also in another process; None where only `write` can be used."""
+        coding = self._encoder.coding
+        return None if coding is None else ChunkMaker(coding, self.dtype, tuple(self._records))
+
+    def write_chunk(self, chunk: bytes, statistics: Statistics) -> None:
+        """Append a chunk of `chunk_maker`: CHUNK_POINTS records, or fewer in the last; excludes `write`."""
+        interrupts.check()
+        self._statistics.merge(statistics)
+        self._check_count()
+        with self._guarded():
+            self._encoder.write_chunk(statistics.count, chunk)
+            self.draft.file.flush()
+
+    def _check_count(self) -> None:
+        if self._statistics.count >= 2**32 and self._header.version < (1, 4):
+            version = "{}.{}".format(*self._header.version)
+            raise InputError(f"{self.target}: LAS {version} holds at most 4294967295 points; use --las-version 1.4")
 
     def finish_points(self) -> None:
         """End the points; extended records may follow."""
@@ -155,6 +173,23 @@ class PointFile(contextlib.AbstractContextManager):
             raise InputError(f"{self.target}: {error}") from error
 
 
+@dataclass(frozen=True, slots=True)
+class ChunkMaker:
+    """Compresses records for `PointFile.write_chunk`; picklable."""
+
+    coding: bytes
+    dtype: np.dtype
+    records: tuple[ExtraRecord, ...]
+
+    def make(self, rows: np.ndarray) -> tuple[bytes, Statistics]:
+        """Return the chunk of records (m,) and their statistics; raises InputError if they cannot be compressed."""
+        if rows.dtype != self.dtype:
+            raise InputError("rows of another layout than the file's; this is a bug, please report it")
+        statistics = Statistics(self.dtype, self.records)
+        statistics.add(rows)
+        return compress_chunk(self.coding, rows), statistics
+
+
 class Statistics:
     """Counts, bounds and extremes of all rows written, for the header and the extra-bytes records."""
 
@@ -177,6 +212,17 @@ class Statistics:
             if record.code:
                 self._widen(field, rows[field], record.no_data)
 
+    def merge(self, other: Statistics) -> None:
+        """Add the statistics of further rows of the same file."""
+        self.count += other.count
+        self._bits += other._bits
+        for key, found in other._extremes.items():
+            self._extend(key, *found)
+
+    def _extend(self, key: tuple[str, int], low: np.generic, high: np.generic) -> None:
+        least, largest = self._extremes.get(key, (low, high))
+        self._extremes[key] = min(low, least), max(high, largest)
+
     def _widen(self, name: str, values: np.ndarray, no_data: np.ndarray | None = None) -> None:
         for element, column in enumerate(np.atleast_2d(values.T)):
             column = np.ascontiguousarray(column)
@@ -185,8 +231,9 @@ class Statistics:
                 good &= column != no_data[element]
             column = column if good.all() else column[good]
             if len(column):
-                least, largest = self._extremes.get((name, element), (column[0], column[0]))
-                self._extremes[name, element] = min(column.min(), least), max(column.max(), largest)
+                # Plus 0: which of 0.0 and -0.0 is the least depends on the order of the rows.
+                plus = column.dtype.type(0)
+                self._extend((name, element), column.min() + plus, column.max() + plus)
 
     def fill(self, header: LasHeader) -> None:
         """Set counts and bounds of the header; an empty file gets zeros."""

@@ -125,7 +125,14 @@ class NearSharing:
         fresh = place[::-1]
         unseen = self._first[fresh] < 0
         self._first[fresh[unseen]] = where[::-1][unseen]
-        np.add.at(self._new, self._bin(keys[new]), 1)
+        fresh = self._bin(keys[new])
+        if not len(fresh):
+            return
+        low, high = int(fresh.min()), int(fresh.max())
+        if high - low < 8 * len(fresh):  # as nearly always: packets follow the points, and counting takes a tenth
+            self._new[low : high + 1] += np.bincount(fresh - low).astype(np.int32)
+        else:
+            np.add.at(self._new, fresh, 1)
 
     def _bin(self, keys: np.ndarray) -> np.ndarray:
         return (((keys >> INDEX_BITS) - self._low) // self._width).astype(np.int64)

@@ -191,8 +191,7 @@ def cut_windows(
     s = samples.shape[1]
     length = min(length, s)
     begin = np.minimum(low, s - length)
-    views = np.lib.stride_tricks.sliding_window_view(samples.reshape(-1), length)
-    y = views[waveform * s + begin].astype(np.float32)
+    y = _windows_of(samples, length)[waveform * s + begin].astype(np.float32)
     clipped = None
     if clip is not None:
         clipped = y >= clip
@@ -201,7 +200,7 @@ def cut_windows(
     if baseline.ndim == 1:
         y -= baseline[waveform][:, None]
     else:
-        y -= np.lib.stride_tricks.sliding_window_view(baseline.reshape(-1), length)[waveform * s + begin]
+        y -= _windows_of(baseline, length)[waveform * s + begin]
     position = np.arange(length, dtype=np.float32)
     outside = position < (low - begin).astype(np.float32)[:, None]
     outside |= position >= (high - begin).astype(np.float32)[:, None]
@@ -213,6 +212,15 @@ def cut_windows(
     if clipped is not None:
         clipped &= ~outside
     return Windows(y, x, std[waveform].astype(np.float64), clipped, weight), begin
+
+
+def _windows_of(samples: np.ndarray, length: int) -> np.ndarray:
+    """View of all windows of `length` samples of contiguous waveforms laid end to end.
+
+    As NumPy's sliding_window_view, whose checks take longer than a small batch.
+    """
+    flat = samples.reshape(-1)
+    return np.lib.stride_tricks.as_strided(flat, (len(flat) - length + 1, length), 2 * flat.strides, writeable=False)
 
 
 def _weigh(y: np.ndarray, std: np.ndarray, noise_gain: float) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 
 STEP = 0.2
@@ -85,9 +86,9 @@ def stack_pulse(
         part = values[begin:end]
         if len(part) >= LEAST_BIN:
             middle = np.median(part)
-            spread = 1.4826 * np.median(np.abs(part - middle))
+            spread = MAD_TO_STD * np.median(np.abs(part - middle))
             centre = (bins[begin] + 0.5) * STEP - before
-            stack.append((centre, middle, 1.2533 * max(spread, least) / np.sqrt(len(part))))
+            stack.append((centre, middle, MEDIAN_ERROR * max(spread, least) / np.sqrt(len(part))))
     return Stack(*np.array(stack).reshape(-1, 3).T)
 
 

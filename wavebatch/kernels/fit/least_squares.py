@@ -36,7 +36,7 @@ DAMPING = 0.01
 KEPT = 0.75
 """A step whose fall of the cost is at least this share of what it promised eases the damping."""
 
-EASE, RAISE = 0.1, 10.0
+EASE, RAISE = 0.2, 4.0
 """Factors of the damping after such a step, and after a step that is refused; otherwise it stays. Overlapping echoes
 lie in a curved valley: if every accepted step eased the damping, each second step would be too long.
 """
@@ -106,16 +106,20 @@ class WidthPrior(NamedTuple):
             Cost of the prior.
         """
         k = parameters.shape[2]
-        lack = np.maximum(self.width - parameters[:, 2], 0.0)
-        cost = np.zeros(len(lack))
-        rows = np.flatnonzero(lack.any(axis=1))
-        if len(rows):
-            lack, spread = lack[rows], (std[rows] / self.spread)[:, None] ** 2
-            unit = parameter_units(parameters[rows], std[rows])[:, 2]
-            gram[rows, 2 * k : 3 * k, -1] += spread * lack * unit
-            diagonal = np.arange(2 * k, 3 * k)
-            gram[rows[:, None], diagonal, diagonal] += spread * unit * unit * (lack > 0)
-            cost[rows] = np.sum(spread * lack * lack, axis=1)
+        lack = self.width - parameters[:, 2]
+        below = lack > 0
+        lack *= below
+        spread = ((std / self.spread) ** 2)[:, None]
+        pull = spread * lack
+        cost = (pull * lack).sum(axis=1)
+        if below.any():
+            unit = parameters[:, 2] / np.maximum(parameters[:, 0], 0.5 * std[:, None])
+            pull *= unit
+            gram[:, 2 * k : 3 * k, -1] += pull
+            unit *= unit
+            unit *= below
+            unit *= spread
+            np.einsum("mpp->mp", gram)[:, 2 * k : 3 * k] += unit
         return cost
 
 
@@ -173,18 +177,18 @@ def evaluate_model(windows: Windows, parameters: np.ndarray, shape: PulseShape) 
     return rows
 
 
-def _steps(
-    gram: np.ndarray, gradient: np.ndarray, damping: np.ndarray, frozen: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Marquardt step (m, p), and the fall of the cost that it promises (m,)."""
-    matrix = gram.copy()
-    if frozen.any():
-        free = ~frozen
-        matrix *= free[:, :, None]
-        matrix *= free[:, None, :]
-        gradient = gradient * free
+def _steps(gram: np.ndarray, damping: np.ndarray, frozen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Marquardt step (m, p), 0 where `frozen` (m, p), and the fall of the cost that it promises (m,)."""
+    matrix = gram[:, :-1, :-1].copy()
+    gradient = gram[:, :-1, -1]
+    at = np.flatnonzero(frozen.any(axis=1))
+    if len(at):
+        free = ~frozen[at]
+        matrix[at] *= free[:, :, None] & free[:, None, :]
+        gradient = gradient.copy()
+        gradient[at] *= free
     diagonal = np.einsum("mpp->mp", matrix)
-    diagonal *= 1 + damping[:, None]
+    diagonal *= (1 + damping)[:, None]
     diagonal += RIDGE
     step = solve_symmetric(matrix, gradient)
     return step, np.einsum("mp,mp->m", step, gradient)
@@ -338,22 +342,21 @@ class _State:
         std = self.windows.std
         self.rows = evaluate_model(self.windows, self.trial, shape)
         gram = gram_matrix(self.rows)
-        cost = gram[:, -1, -1]
+        cost = gram[:, -1, -1].copy()
         if self.prior is not None:
-            cost = cost + self.prior.add(self.trial, std, gram)
+            cost += self.prior.add(self.trial, std, gram)
         self.accepted = cost <= self.cost * (1 + 1e-6)
         factor = np.where(self.accepted, np.where(self.cost - cost > KEPT * self.promised, EASE, 1.0), RAISE)
         self.damping = np.maximum(self.damping * factor, 1e-7)
-        if self.accepted.all():
-            self.kept, self.cost, self.gram = self.trial, cost, gram
-        else:
-            self.kept = np.where(self.accepted[:, None, None], self.trial, self.kept)
-            self.cost = np.where(self.accepted, cost, self.cost)
-            self.gram = np.where(self.accepted[:, None, None], gram, self.gram)
-        gradient = self.gram[:, :-1, -1]
-        slope = gradient.reshape(self.kept.shape)
-        frozen = ((self.kept <= self.low) & (slope < 0)) | ((self.kept >= self.high) & (slope > 0))
-        step, decrement = _steps(self.gram[:, :-1, :-1], gradient, self.damping, frozen.reshape(gradient.shape))
+        refused = np.flatnonzero(~self.accepted)
+        kept = self.trial
+        if len(refused):
+            kept = kept.copy()
+            kept[refused], cost[refused], gram[refused] = self.kept[refused], self.cost[refused], self.gram[refused]
+        self.kept, self.cost, self.gram = kept, cost, gram
+        slope = gram[:, :-1, -1].reshape(kept.shape)
+        frozen = ((kept <= self.low) & (slope < 0)) | ((kept >= self.high) & (slope > 0))
+        step, decrement = _steps(gram, self.damping, frozen.reshape(len(kept), 3 * kept.shape[2]))
         step = step.reshape(self.kept.shape)
         step *= parameter_units(self.kept, std)
         step += self.kept

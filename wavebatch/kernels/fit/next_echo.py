@@ -9,7 +9,7 @@ import numpy as np
 
 from wavebatch.core.units import SQRT_PI
 from wavebatch.kernels.fit.least_squares import Fit, Limits, Windows
-from wavebatch.kernels.fit.normal_equations import add_ridge, parameter_units
+from wavebatch.kernels.fit.normal_equations import add_ridge, factor_symmetric, parameter_units, substitute_back
 from wavebatch.kernels.fit.problem import Problem, Settings
 from wavebatch.kernels.fit.residual_test import find_misfits, hermite_moments
 from wavebatch.kernels.signal.filters import gaussian_taps
@@ -67,20 +67,25 @@ def propose_echo(
     m, _, k = parameters.shape
     taps = gaussian_taps(width)
     inside = (windows.x >= 0).astype(np.float32)
-    spread = _correlate(rows, taps).astype(np.float64)
-    energy = _correlate(inside, taps**2).astype(np.float64)
-    cross = spread[:, :-1]
-    matrix = add_ridge(gram[:, :-1, :-1].copy())
-    explained = np.linalg.solve(matrix, cross)
-    onto = spread[:, -1] - np.einsum("mpl,mp->ml", explained, gram[:, :-1, -1])
-    left = energy - np.einsum("mpl,mpl->ml", cross, explained)
-    usable = (left > LEAST_NEW * energy.max(axis=1, keepdims=True)) & (inside > 0)
-    amplitude = np.where(usable, np.maximum(onto, 0) / np.where(usable, left, 1.0), 0.0)
+    spread = _correlate(rows, taps)
+    energy = _correlate(inside, taps**2)
+    lower, pivot, right = factor_symmetric(add_ridge(gram[:, :-1, :-1].copy()), gram[:, :-1, -1])
+    # What the new pulse has in common with the present ones is taken off, row by row of the factorised equations.
+    onto, left = spread[:, -1], energy.copy()
+    for i in range(3 * k):
+        for j in range(i):
+            spread[:, i] -= lower[:, i, j].astype(np.float32)[:, None] * spread[:, j]
+        share = spread[:, i] * (1 / pivot[:, i]).astype(np.float32)[:, None]
+        left -= share * spread[:, i]
+        onto -= share * right[:, i].astype(np.float32)[:, None]
+    usable = (left > np.float32(LEAST_NEW) * energy.max(axis=1, keepdims=True)) & (inside > 0)
+    amplitude = np.where(usable, np.maximum(onto, 0) / np.where(usable, left, np.float32(1)), np.float32(0))
     score = amplitude**2 * left
     place = np.argmax(score, axis=1)
     problem = np.arange(m)
-    new = amplitude[problem, place]
-    change = -(explained[problem, :, place] * new[:, None]).reshape(m, 3, k) * parameter_units(parameters, windows.std)
+    new = amplitude[problem, place].astype(np.float64)
+    explained = substitute_back(lower, spread[problem, :-1, place] / pivot)
+    change = -(explained * new[:, None]).reshape(m, 3, k) * parameter_units(parameters, windows.std)
     start = np.empty((m, 3, k + 1))
     start[:, 0, :k] = np.maximum(parameters[:, 0] + change[:, 0], 0.2 * parameters[:, 0])
     start[:, 1, :k] = parameters[:, 1] + np.clip(change[:, 1], -width, width)

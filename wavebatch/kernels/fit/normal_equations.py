@@ -12,6 +12,11 @@ import numpy as np
 RIDGE = 1e-9
 """Added to the diagonal of the scaled equations: an echo outside its window must not make them singular."""
 
+LEAST_PIVOT = 1e-7
+"""Pivots below are what rounding of float32 products leaves: the data do not determine such an unknown."""
+
+_UNDETERMINED = 1e30
+
 STEEP = 1e3
 """Variance inflation by overlap from which products are taken in float64 (docs/algorithms.md H2)."""
 
@@ -29,7 +34,12 @@ def gram_matrix(rows: np.ndarray) -> np.ndarray:
     float64 (m, p, p)
         Products summed in float32.
     """
-    return (rows @ rows.transpose(0, 2, 1)).astype(np.float64)
+    gram = np.empty((len(rows), rows.shape[1], rows.shape[1]))
+    # Not all rows by all rows: NumPy takes a slower way for the product of an array with itself.
+    gram[:, :-1] = rows[:, :-1] @ rows.transpose(0, 2, 1)
+    gram[:, -1, :-1] = gram[:, :-1, -1]
+    gram[:, -1, -1] = np.einsum("ml,ml->m", rows[:, -1], rows[:, -1])
+    return gram
 
 
 def parameter_units(parameters: np.ndarray, std: np.ndarray) -> np.ndarray:
@@ -138,6 +148,43 @@ def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     solution[:, 1] = xy * a + yy * b + yz * c
     solution[:, 2] = xz * a + yz * b + zz * c
     solution /= determinant[:, None]
+    return solution
+
+
+def factor_symmetric(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Factors of positive definite matrices, lower D lower', and right-hand sides without their lower triangle.
+
+    Parameters
+    ----------
+    matrix : float64 (m, p, p)
+        See `add_ridge`.
+    right : float64 (m, p)
+
+    Returns
+    -------
+    lower : float64 (m, p, p)
+        Below the diagonal; the diagonal, not given, is 1.
+    pivot : float64 (m, p)
+        D; so large where it is below LEAST_PIVOT that the unknown stays 0 and changes no other.
+    right : float64 (m, p)
+        Solution of lower times it = right.
+    """
+    p = matrix.shape[1]
+    lower, pivot, right = matrix.copy(), np.empty(right.shape), right.copy()
+    for j in range(p):
+        pivot[:, j] = np.where(lower[:, j, j] > LEAST_PIVOT, lower[:, j, j], _UNDETERMINED)
+        column = lower[:, j + 1 :, j] / pivot[:, j, None]
+        lower[:, j + 1 :, j + 1 :] -= column[:, :, None] * lower[:, j + 1 :, j, None].transpose(0, 2, 1)
+        right[:, j + 1 :] -= column * right[:, j, None]
+        lower[:, j + 1 :, j] = column
+    return lower, pivot, right
+
+
+def substitute_back(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions x, float64 (m, p), of lower' x = right, with the lower triangle of `factor_symmetric`."""
+    solution = right.astype(np.float64)
+    for j in reversed(range(solution.shape[1] - 1)):
+        solution[:, j] -= np.einsum("mp,mp->m", lower[:, j + 1 :, j], solution[:, j + 1 :])
     return solution
 
 

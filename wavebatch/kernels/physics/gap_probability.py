@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.core.units import MAD_TO_STD
+
 LEAST_PULSES = 100
 """Smallest number of pulses."""
 
@@ -105,7 +107,7 @@ def _share(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> np.ndarray:
 def _measure_scatter(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
     """Robust relative standard deviation of the light of pulses."""
     light = np.log(canopy + ratio * ground)
-    return 1.4826 * float(np.median(np.abs(light - np.median(light))))
+    return MAD_TO_STD * float(np.median(np.abs(light - np.median(light))))
 
 
 def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
@@ -120,5 +122,5 @@ def _slope(canopy: np.ndarray, ground: np.ndarray, ratio: float) -> float:
         slope = float(x @ y / (x @ x))
         level = light[used].mean() - slope * share[used].mean()
         off = np.abs(light - level - slope * share)
-        used = off <= _CLIP * max(1.4826 * float(np.median(off)), 1e-9)
+        used = off <= _CLIP * max(MAD_TO_STD * float(np.median(off)), 1e-9)
     return slope

@@ -129,6 +129,8 @@ def _read_strip(
 ) -> _Strip:
     """Decompose what lies on targets or in the overlap with other strips, in one pass."""
     with open_strip_source(path, options) as source:
+        header = source.reader.facts.header
+        targets = [target.place(path, header) for target in targets]
         seen = see_channels(source.reader, source.scan)
         known = source.reader.facts.digitizers  # points may name others: they have no waveform
         channels = tuple(SCANNERS * digitizer + scanner for digitizer, scanner in seen if digitizer in known)

@@ -8,14 +8,16 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.area_crs import AreaFile, place_rings
 from wavebatch.files.geojson import FARTHEST, find_inside, read_features
+from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
 
 _CORNERS = 64
@@ -36,6 +38,13 @@ class Target:
     """Corners of its outline, f8 (k, 2) [m]."""
     incidence: float | None = None
     """Angle between ray and normal [deg]; None: taken from the plane of the target's echoes."""
+    file: AreaFile | None = None
+    """Where the coordinates of a GeoJSON file lie; None: in the CRS of the strip."""
+
+    def place(self, strip: Path, header: LasHeader) -> Target:
+        """Return the target in the coordinates of a strip; raises as `area_crs.place_rings`."""
+        (corners,) = place_rings(self.file, [self.corners], strip, header)
+        return replace(self, corners=corners, file=None)
 
     def contains(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return whether points at x, y, f8 (n,) [m], lie inside, bool (n,)."""
@@ -59,7 +68,8 @@ def load_targets(path: Path | str) -> list[Target]:
     ----------
     path : path
         GeoJSON: polygons with the property reflectance. CSV: the column reflectance, and x, y, radius, or vertices as
-        `x y x y x y ...`. Both may have name and incidence [deg]. Coordinates are those of the strip.
+        `x y x y x y ...`. Both may have name and incidence [deg]. Coordinates of CSV are those of the strip; those of
+        GeoJSON are placed in each strip by `Target.place`.
 
     Returns
     -------
@@ -72,24 +82,29 @@ def load_targets(path: Path | str) -> list[Target]:
     """
     text = read_text(path, "target file", MOST_LIST)
     lines = io.StringIO(text, newline=None)
+    file = None
     try:
-        rows = _read_geojson(text, path) if text.lstrip().startswith("{") else list(csv.DictReader(lines))
+        if text.lstrip().startswith("{"):
+            rows, file = _read_geojson(text, path)
+        else:
+            rows = list(csv.DictReader(lines))
     except csv.Error as error:
         raise ConfigError(f"{path}: target file is neither GeoJSON nor CSV ({error})") from error
-    targets = [_read_target(row, f"{path}: target {number}") for number, row in enumerate(rows, 1)]
+    targets = [replace(_read_target(row, f"{path}: target {i}"), file=file) for i, row in enumerate(rows, 1)]
     if not targets:
         raise ConfigError(f"{path}: no target in it; give polygons (GeoJSON) or rows (CSV)")
     return targets
 
 
-def _read_geojson(text: str, path: Path | str) -> list[dict[str, Any]]:
+def _read_geojson(text: str, path: Path | str) -> tuple[list[dict[str, Any]], AreaFile]:
     rows = []
-    for properties, rings in read_features(text, path):
+    features, file = read_features(text, path)
+    for properties, rings in features:
         if len(rings) > 1:
             raise ConfigError(f"{path}: a target has {len(rings)} rings; make every part a target, without holes")
         corners = " ".join(f"{float(x)!r} {float(y)!r}" for x, y in rings[0])
         rows.append({**properties, "vertices": corners})
-    return rows
+    return rows, file
 
 
 def _read_target(row: Mapping[str, Any], where: str) -> Target:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
@@ -259,7 +259,7 @@ def _find_ringing(block: WaveformBlock, system: SystemPulse, lone: EchoTable) ->
             continue
         value = np.nanmean(here[rows], axis=1)
         middle = float(np.median(value))
-        error = 1.2533 * MAD_TO_STD * float(np.median(np.abs(value - middle))) / np.sqrt(len(value))
+        error = MEDIAN_ERROR * MAD_TO_STD * float(np.median(np.abs(value - middle))) / np.sqrt(len(value))
         if middle > max(LEAST_RINGING, RINGING_ERRORS * error):
             largest = max(largest, float(np.quantile(value, 0.9)))
     return min(largest, LARGEST_RINGING)

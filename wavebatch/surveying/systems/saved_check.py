@@ -16,7 +16,6 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying import Survey
 from wavebatch.surveying.choose_chain import sample_size
 from wavebatch.surveying.flight import (
-    HELD,
     STEADY,
     Look,
     compare_looks,
@@ -25,6 +24,9 @@ from wavebatch.surveying.flight import (
     look_at,
     read_flight,
 )
+
+HELD = 1024
+"""Waveforms of the strip that are held against the survey."""
 
 LARGEST_WIDTH, LEAST_WIDTH, LARGEST_MISFIT, LARGEST_NOISE = 1.4, 0.7, 0.15, 3.0
 """Limits for files without the figures of a look, such as shipped or hand-written ones: width of a Gaussian fit over

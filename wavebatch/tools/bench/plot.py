@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.optional import advise_install
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.bench.figures import find_front
 from wavebatch.tools.plots.labels import place_labels
 
-NO_PLOT = "no plot without matplotlib: pip install 'wavebatch[plot]'"
+NO_PLOT = f"no plot without matplotlib: {advise_install('matplotlib')}"
 
 PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),

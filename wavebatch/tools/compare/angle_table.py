@@ -13,22 +13,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.disk.publish import check_target
-from wavebatch.files.figure_file import check_picture, open_picture
+from wavebatch.files.figure_file import check_picture, open_picture, plain_text
 from wavebatch.files.text_file import write_text
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.physics.angle_errors import angles_of_variance
-from wavebatch.kernels.physics.incidence import spread_of_angle
+from wavebatch.kernels.physics.incidence import angle_of_spread, spread_of_angle
 from wavebatch.stages.attribute.width_angle import added_variance
 from wavebatch.surveying.angle_limits import REFERENCE_ERROR
+from wavebatch.tools.plots.labels import fit_parts
 
 ANGLES = np.arange(0.0, 81.0)
 """Angles of the table [deg]."""
+
+_DRAWS = 2000
+"""Measured widths, evenly drawn from their law, from which the error of an angle is computed."""
 
 _WIDEST, _FINE = 40.0, 20_000
 """Largest width that is tried [system widths], and number of widths."""
@@ -51,7 +55,7 @@ class AngleTable:
     width: np.ndarray
     """Column echo_width, f8 (a,) [ns]."""
     error: np.ndarray
-    """Standard deviation of the angle of one echo, f8 (a,) [deg]."""
+    """Root mean square error of the angle that a run gives one echo of a surface with this angle, f8 (a,) [deg]."""
 
 
 def tabulate_angles(
@@ -66,9 +70,21 @@ def tabulate_angles(
     bound = np.array([bound_time(max(amplitude, 1e-3), max(one, 1e-6), system.noise_std, spacing)
                       for one in np.nan_to_num(sigma, nan=1.0)])  # fmt: skip
     variance, variance_err = _add_variance(system, spacing, sigma, bound)
-    error = np.degrees(angles_of_variance(variance, variance_err, np.full(len(ANGLES), distance), beam)[1])
+    error = _expect_error(variance, variance_err, distance, beam)
     width = FWHM_PER_SIGMA * sigma
     return AngleTable(distance, divergence, amplitude, ANGLES, spread, width, np.where(np.isnan(sigma), np.nan, error))
+
+
+def _expect_error(variance: np.ndarray, variance_err: np.ndarray, distance: float, beam: float) -> np.ndarray:
+    """Root mean square error of the angles of many echoes of each surface [deg].
+
+    The error column of a run belongs to one measured width: over the widths it jumps near 0, where half of the echoes
+    are read as 0. What a surface gives on average does not.
+    """
+    normal = np.sqrt(2.0) * scipy.special.erfinv(np.arange(-_DRAWS + 1, _DRAWS, 2) / _DRAWS)
+    measured = variance[:, None] + variance_err[:, None] * normal
+    angle = angle_of_spread(np.sqrt(np.maximum(measured, 0.0)), distance, beam)
+    return np.degrees(np.sqrt(np.mean((angle - np.radians(ANGLES)[:, None]) ** 2, axis=1)))
 
 
 def _add_variance(
@@ -90,9 +106,16 @@ def check_angles(target: Path, *, overwrite: bool) -> None:
 
 
 def write_angles(
-    target: Path, system: SystemPulse, *, spacing: float, distance: float | None, amplitude: float, overwrite: bool
+    target: Path,
+    system: SystemPulse,
+    *,
+    spacing: float,
+    distance: float | None,
+    amplitude: float,
+    strip: str = "",
+    overwrite: bool = False,
 ) -> None:
-    """Writes the table of a strip as .csv, or draws it.
+    """Writes the table of a strip as .csv, or draws it; strip: its name, for the title.
 
     Raises ConfigError where the beam is not known, InputError where the sensor's position is not known or no width of
     this system means an angle.
@@ -107,7 +130,7 @@ def write_angles(
     if target.suffix.lower() == ".csv":
         write_text(target, format_angles(found), overwrite=overwrite)
     else:
-        draw_angles(found, target, overwrite=overwrite)
+        draw_angles(found, target, strip=strip, overwrite=overwrite)
 
 
 def format_angles(found: AngleTable) -> str:
@@ -122,17 +145,19 @@ def format_angles(found: AngleTable) -> str:
     return text.getvalue()
 
 
-def draw_angles(found: AngleTable, target: Path, *, overwrite: bool = False) -> None:
+def draw_angles(found: AngleTable, target: Path, *, strip: str = "", overwrite: bool = False) -> None:
     """Writes a picture of the table; raises as figure_file.open_picture does."""
     with open_picture(target, (7.0, 4.6), overwrite=overwrite) as figure:
         axes = figure.subplots()
         low, high = np.clip(found.angle - found.error, 0, 90), np.clip(found.angle + found.error, 0, 90)
         axes.fill_between(found.width, low, high, color="#0072b2", alpha=0.2, linewidth=0,
-                          label="one standard deviation")  # fmt: skip
+                          label="root mean square error")  # fmt: skip
         axes.plot(found.width, found.angle, color="#0072b2", linewidth=1.5, label="angle")
         axes.set_ylim(0, 90)
         axes.set_xlabel("echo_width [ns]")
         axes.set_ylabel("incidence angle [deg]")
         beam = f"{found.distance:.0f} m, {found.divergence:g} mrad"
-        axes.set_title(f"{beam}; errors of echoes of {found.amplitude:.0f} DN")
+        parts = [plain_text(strip), beam, f"errors of echoes of {found.amplitude:.0f} DN"]
+        figure.suptitle(fit_parts(figure, [part for part in parts if part], 6.8, size=10.5), x=0.01, ha="left",
+                        fontsize=10.5)  # fmt: skip
         axes.legend(loc="lower right")

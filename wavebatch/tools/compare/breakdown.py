@@ -1,4 +1,4 @@
-"""Counts of echoes without a partner, by return number, amplitude, flags, and whether their pulse has other echoes.
+"""Counts of echoes without a partner, by return number, LAS class, amplitude, flags, and other echoes of their pulse.
 
 `pairing` has one Breakdown per side. Add a class of echoes here to see it in `wavebatch compare`.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
+from wavebatch.files.las.point_formats import CLASS_NAMES
 
 _OCTAVES = 18
 """Classes of amplitude: below 1, then one per doubling; the last one holds everything larger."""
@@ -34,6 +35,7 @@ class Breakdown:
         numbered = rows["number"] > 0
         code = np.minimum(rows["total"], _NUMBERS - 1) * np.int64(_NUMBERS) + np.minimum(rows["number"], _NUMBERS - 1)
         self._count("return", code[numbered], alone[numbered])
+        self._count("class", rows["classification"], alone)
         known = ~np.isnan(rows["amplitude"])
         self._count("amplitude", _octave(rows["amplitude"][known]), alone[known])
         self._count("intensity", _octave(rows["intensity"]), alone)
@@ -51,7 +53,7 @@ class Breakdown:
     def tables(self) -> dict[str, Table]:
         """For each kind the classes that have an echo; kinds without data are left out.
 
-        `intensity` is there only without amplitudes and if not all are 0; `flag` only if any echo has one.
+        `intensity` is there only without amplitudes and if not all are 0; `flag` and `class` only if any echo has one.
         """
         tables = {}
         for kind, tally in self._tallies.items():
@@ -61,6 +63,8 @@ class Breakdown:
             del tables["intensity"]
         if set(tables["flag"]) <= {"none"}:
             del tables["flag"]
+        if set(tables["class"]) <= {name_class(0)}:
+            del tables["class"]
         return {kind: table for kind, table in tables.items() if table}
 
 
@@ -69,9 +73,15 @@ def _octave(values: np.ndarray) -> np.ndarray:
     return np.clip(np.frexp(np.clip(values.astype(np.float64), 0.0, 1e9))[1], 0, _OCTAVES - 1).astype(np.int64)
 
 
+def name_class(number: int) -> str:
+    """A LAS class with its name, if the standard has one."""
+    return f"{number} {CLASS_NAMES[number]}" if number in CLASS_NAMES else str(number)
+
+
 _OCTAVE_NAMES = ["below 1", *(f"{1 << n}-{2 << n}" for n in range(_OCTAVES - 2)), f"from {1 << (_OCTAVES - 2)}"]
 _NAMES = {
     "return": [f"{number} of {total}" for total in range(_NUMBERS) for number in range(_NUMBERS)],
+    "class": [name_class(number) for number in range(256)],
     "amplitude": _OCTAVE_NAMES,
     "intensity": _OCTAVE_NAMES,
     "pulse": ["nothing of the other side", "other echoes of the other side"],

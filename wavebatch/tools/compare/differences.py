@@ -1,4 +1,6 @@
-"""Differences of paired echoes in time, amplitude and width; against a truth also in units of the Cramer-Rao bound.
+"""Differences of paired echoes in time, amplitude and width: of all, by LAS class, and by number of echoes.
+
+Against a truth also in units of the Cramer-Rao bound.
 
 `pairing` adds pairs; sums are of all pairs, medians of an even sample, so that memory is bounded.
 """
@@ -21,6 +23,9 @@ SPEED = 0.9997 * HALF_C
 _BOTH = ("echo_time", "amplitude", "echo_width")
 """Columns that are compared if both sides have them."""
 
+GROUPS = {"class": "classification", "echoes": "total"}
+"""By what differences are grouped: the LAS class, and the number of echoes of the pulse."""
+
 
 @dataclass(frozen=True, slots=True)
 class Spread:
@@ -39,6 +44,9 @@ class Differences:
     def __init__(self, limit: int | None = None) -> None:
         self._sample = EvenSample(limit)
         self.sums = {name: np.zeros(3) for name in ("time", *_BOTH)}
+        self._grouped = {
+            (kind, side, name): np.zeros((256, 3)) for kind in GROUPS for side in "ab" for name in self.sums
+        }
 
     def add(self, a: np.ndarray, b: np.ndarray) -> None:
         """Adds pairs: a[i] with b[i]."""
@@ -47,25 +55,43 @@ class Differences:
         for name, values in part.items():
             good = values[~np.isnan(values)]
             self.sums[name] += [len(good), good.sum(), np.square(good).sum()]
+            for kind, field in GROUPS.items():
+                for side, rows in (("a", a), ("b", b)):
+                    group = rows[field][~np.isnan(values)]
+                    sums = self._grouped[kind, side, name]
+                    for place, weights in enumerate((None, good, np.square(good))):
+                        sums[:, place] += np.bincount(group, weights, len(sums))
         for name in ("amplitude_err", "echo_width_err", "range_err"):
             part[name] = a[name]
         for name in ("amplitude", "echo_width", "flags"):
             part[f"true_{name}"] = b[name]
+        part |= {f"{kind}_{side}": rows[field] for kind, field in GROUPS.items() for side, rows in (("a", a), ("b", b))}
         part["isolated"] = b["isolated"] if "isolated" in b.dtype.names else np.zeros(len(b), bool)
         self._sample.add(part)
 
     def spreads(self) -> dict[str, Spread]:
         """Median, mean, rms and NMAD of a minus b, for each quantity that both sides have."""
-        result = {}
-        for name, (number, total, squares) in self.sums.items():
-            if not number:
+        data = self._sample.read()
+        return {name: _spread(sums, data[name]) for name, sums in self.sums.items() if sums[0]}
+
+    def groups(self) -> dict[str, dict[int, dict[str, Spread]]]:
+        """The same by kind of GROUPS and by number: of the class, and of the echoes that the pulse has.
+
+        A pair belongs to the group of its echo of b; where b has no groups (all are 0), to that of its echo of a.
+        Kinds in which both sides have none are left out. Medians of rare groups are NaN if the sample has none of them.
+        """
+        data, result = self._sample.read(), {}
+        for kind in GROUPS:
+            side = next((side for side in "ba" if self._grouped[kind, side, "time"][1:, 0].any()), None)
+            if side is None:
                 continue
-            values = self._sample.read()[name]
-            values = values[~np.isnan(values)]
-            median = np.median(values)
-            nmad = MAD_TO_STD * np.median(np.abs(values - median))
-            figures = (median, total / number, np.sqrt(squares / number), nmad)
-            result[name] = Spread(int(number), *map(float, figures))
+            result[kind] = {
+                group: {
+                    name: _spread(sums[group], data[name][data[f"{kind}_{side}"] == group])
+                    for name in self.sums if (sums := self._grouped[kind, side, name])[group, 0]
+                }
+                for group in np.flatnonzero(self._grouped[kind, side, "time"][:, 0]).tolist()
+            }  # fmt: skip
         return result
 
     def errors(self, meta: dict) -> dict[str, dict[str, ErrorStats]]:
@@ -92,6 +118,15 @@ class Differences:
         return {
             kind: {name: _measure(rows, *values) for name, values in columns.items()} for kind, rows in classes.items()
         }
+
+
+def _spread(sums: np.ndarray, values: np.ndarray) -> Spread:
+    """The spread from number, sum and sum of squares of all pairs, and from the differences of a sample of them."""
+    number, total, squares = sums.tolist()
+    values = values[~np.isnan(values)]
+    median = np.median(values) if len(values) else np.nan
+    nmad = MAD_TO_STD * np.median(np.abs(values - median)) if len(values) else np.nan
+    return Spread(int(number), float(median), total / number, float(np.sqrt(squares / number)), float(nmad))
 
 
 def measure_lag(a: np.ndarray, b: np.ndarray) -> np.ndarray:

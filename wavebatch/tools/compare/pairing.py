@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.stages.score import ErrorStats, list_pairs, pair_nearest
-from wavebatch.tools.compare.breakdown import Breakdown, Table
+from wavebatch.tools.compare.breakdown import Breakdown, Table, name_class
 from wavebatch.tools.compare.differences import SPEED, Differences, Spread
 
 MOST_PER_PULSE = 64
@@ -53,13 +53,15 @@ class Comparison:
     counts_b: dict[int, int]
     differences: dict[str, Spread]
     """time along the ray [ns, later is positive]; echo_time [ns], amplitude [DN], echo_width [ns] if both have it."""
+    differences_by: dict[str, dict[str, dict[str, Spread]]] = field(default_factory=dict)
+    """The same by `class` (LAS classes of b, or of a if b has none) and by `echoes` (of the pulse, likewise)."""
     errors: dict[str, dict[str, ErrorStats]] = field(default_factory=dict)
     """Only with a truth: errors by class (all, isolated, overlapped) and quantity.
 
     `time` is the error of the position; `echo_time`, if the cloud has it, the error of the fit alone.
     Medians and errors of more than a million pairs come from an even sample."""
     missed_by: dict[str, Table] = field(default_factory=dict)
-    """Missed echoes by kind (return, amplitude or intensity, pulse, flag) and class: number missed, and number in b.
+    """Missed echoes by kind (return, class, amplitude or intensity, pulse, flag) and name: number missed, number in b.
     An echo counts for each of its flags. Intensity is used if b has no amplitudes."""
     extra_by: dict[str, Table] = field(default_factory=dict)
     """Extra echoes, as `missed_by`."""
@@ -159,6 +161,7 @@ class Pairing:
             counts_a=_list_counts(self.counts[0]),
             counts_b=_list_counts(self.counts[1]),
             differences=self.differences.spreads(),
+            differences_by=_name_groups(self.differences.groups()),
             errors=self.differences.errors(self.meta) if self.meta else {},
             missed_by=self.breakdowns[1].tables(),
             extra_by=self.breakdowns[0].tables(),
@@ -229,6 +232,12 @@ def check_tolerance(tolerance_ns: float) -> float:
     if not 0 < tolerance_ns < 1e6:
         raise ConfigError(f"tolerance {tolerance_ns} ns must be above 0")
     return tolerance_ns
+
+
+def _name_groups(groups: dict[str, dict[int, dict[str, Spread]]]) -> dict[str, dict[str, dict[str, Spread]]]:
+    """Groups of differences with names: of LAS classes, and numbers of echoes as text, as JSON has them."""
+    names = {"class": name_class, "echoes": str}
+    return {kind: {names[kind](number): one for number, one in group.items()} for kind, group in groups.items()}
 
 
 def _add_counts(old: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -39,6 +39,10 @@ def _list_rows(document: Mapping[str, Any]) -> Iterator[Row]:
         elif name in ("counts_a", "counts_b"):
             for number, pulses in value.items():
                 yield "echoes per pulse", name[-1].upper(), "", str(number), "pulses", pulses
+        elif name == "differences_by":
+            for kind, groups in value.items():
+                for group, quantities in groups.items():
+                    yield from _list_group(kind, group, quantities)
         elif name == "between":
             yield from _list_rows(value)
         elif name == "vendor":
@@ -59,6 +63,13 @@ def _list_classes(name: str, tables: Mapping[str, Any]) -> Iterator[Row]:
         for each, (alone, of) in classes.items():
             for figure, value in (("echoes", alone), ("of", of), ("share", alone / of if of else math.nan)):
                 yield title, side, kind, str(each), figure, value
+
+
+def _list_group(kind: str, group: str, quantities: Mapping[str, Any]) -> Iterator[Row]:
+    """Differences of one LAS class, or of the pulses with one number of echoes."""
+    for quantity, spread in quantities.items():
+        for figure, value in spread.items():
+            yield "differences by " + kind, "", group, quantity, figure, value
 
 
 def _list_nested(table: str, values: Mapping[str, Any], *path: str) -> Iterator[Row]:

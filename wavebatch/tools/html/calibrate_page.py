@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from wavebatch import __version__
+from wavebatch.core.units import format_relative
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration
@@ -24,8 +25,9 @@ def write_calibrate_page(target: Path, flight: FlightCalibration) -> None:
 
 
 def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
+    constant = format_relative(found.constant, found.relative_error)
     rows = {
-        "constant": f"{found.constant:.6g} +- {100 * found.relative_error:.1f} %, {UNIT}",
+        "constant": f"{constant} +- {100 * found.relative_error:.1f} %, {UNIT}",
         "attenuation of the air": f"{found.attenuation:g} dB/km one way",
         "divergence": "not given" if found.divergence is None else f"{found.divergence:g} mrad",
         "conditions": found.conditions,

@@ -46,6 +46,12 @@ def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -
     head = ["A - B", "number", "median", "mean", "rms", "nmad"]
     yield markup.section("Differences", markup.paragraph("Times and widths in ns, amplitudes in DN."),
                          markup.table(head, rows))  # fmt: skip
+    rows = [[kind, group, quantity, spread.number, spread.median, spread.mean, spread.rms, spread.nmad]
+            for kind, groups in one.differences_by.items() if len(groups) > 1
+            for group, quantities in groups.items() for quantity, spread in quantities.items()]  # fmt: skip
+    if rows:
+        head = ["by", "group", "A - B", "number", "median", "mean", "rms", "nmad"]
+        yield markup.section("Differences by class and number of echoes", markup.table(head, rows, sortable=True))
     yield _breakdown("Missed echoes of B", one.missed_by)
     yield _breakdown("Extra echoes of A", one.extra_by)
     if one.errors:

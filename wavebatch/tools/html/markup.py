@@ -28,6 +28,11 @@ def number(value: Any, form: str = ",") -> str:
     return text(format(value, form))
 
 
+def significant(value: float, digits: int = 4) -> float:
+    """The value with so many digits: a measured figure with more claims what it does not know."""
+    return float(f"{value:.{digits}g}")
+
+
 def share(part: float, whole: float) -> str:
     """A share in percent; NO_VALUE of nothing."""
     return f"{100 * part / whole:.2f} %" if whole else NO_VALUE

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from wavebatch.core.units import MAD_TO_STD
+
 FIGURES: dict[str, tuple[str, str, float]] = {
     "echoes": ("echoes per waveform", ".3f", 0.02),
     "passed": ("passed through %", ".2f", 1.0),
@@ -67,7 +69,7 @@ def find_outliers(strips: Sequence[Mapping[str, float]]) -> list[dict[str, str]]
         if len(known) < FEWEST:
             continue
         median = float(np.median(known))
-        spread = 1.4826 * float(np.median(np.abs(known - median)))
+        spread = MAD_TO_STD * float(np.median(np.abs(known - median)))
         limit = max(FARTHEST * spread, LEAST_SHARE * abs(median), least)
         for place, value in enumerate(values):
             if abs(value - median) > limit:

@@ -102,8 +102,8 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
 def draw_views(views: Views, chain: str, level: int = 3) -> str:
     """The sheet of random waveforms and the worst fits, as sections of a page."""
     legend = (
-        "Grey: samples and noise; line: fit; dots: echoes; dashed: returns of the input. `wavebatch plot waveform "
-        "--point N` draws one of them large."
+        "Grey: samples and noise; line: fit; dots: echoes; dashed: returns of the input. The command wavebatch plot "
+        "waveform STRIP --point N -o FILE.png draws one of them large."
     )
     whole = f"all {views.searched:,} waveforms"
     part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"

@@ -10,7 +10,7 @@ from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.toml_file import format_toml
 from wavebatch.surveying.system_file import SYSTEM_SCHEMA, parse_survey
 from wavebatch.tools.html.drawing.charts import draw_counts, draw_pulse, figures
-from wavebatch.tools.html.markup import facts, paragraph, table
+from wavebatch.tools.html.markup import facts, paragraph, significant, table
 
 
 def read_system(described: Mapping[str, Any], figures: Mapping[str, float]) -> SystemPulse:
@@ -29,10 +29,10 @@ def draw_survey(system: SystemPulse, found: Mapping[str, float], waveforms: int)
         counts = {name: round(float(value or 0) * waveforms) for name, value in shares}
         counts["several apart"] = waveforms - sum(counts.values())
         pulses.append(draw_counts(counts, title="Waveforms of the survey", label="echoes in them"))
-    components = [[weight, delay, sigma] for weight, delay, sigma in system.components]
+    components = [list(map(significant, component)) for component in system.components]
     learned = table(["weight", "delay ns", "sigma ns"], components, caption="Gaussians of the learned pulse")
-    misfits = [(name.removeprefix("misfit_").replace("_", " "), value) for name, value in sorted(found.items())
-               if name.startswith("misfit_")]  # fmt: skip
+    misfits = [(_name_model(name.removeprefix("misfit_")), significant(value, 3))
+               for name, value in sorted(found.items()) if name.startswith("misfit_")]  # fmt: skip
     tried = table(["pulse model", "misfit, share of the amplitude"], misfits, caption="Models that were tried")
     return "\n".join(
         [facts(_list_figures(system, found, waveforms)), figures(pulses), learned if components else "",
@@ -69,3 +69,9 @@ def list_decisions(decisions: Iterable[Mapping[str, Any]]) -> str:
     if not rows:
         return paragraph("The survey did not choose the chain: the user gave it.")
     return table(["", "part of the chain", "reason"], rows)
+
+
+def _name_model(key: str) -> str:
+    """A pulse model in words, from its key in the figures of a survey."""
+    words = key.replace("_", " ").replace("gaussian", "Gaussian")
+    return "1 Gaussian" if words == "1 Gaussians" else words

@@ -25,7 +25,7 @@ from wavebatch.files.las.checked_header import CheckedHeader, read_checked_heade
 from wavebatch.files.las.crs import read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
-from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, split_numbers
+from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, read_classes, split_numbers
 from wavebatch.surveying.inspect_strip import describe_strip
 
 _GPS_EPOCH = datetime(1980, 1, 6)
@@ -170,7 +170,7 @@ class _Totals:
         number, total = split_numbers(raw)
         self.returns += np.bincount(number, minlength=16)
         self.totals += np.bincount(total, minlength=16)
-        kinds = raw["classification"] if modern else raw["raw_classification"] & 31
+        kinds = read_classes(raw)
         _count(self.classes, kinds)
         _count(self.sources, raw["point_source_id"])
         if flags is not None:

@@ -61,13 +61,14 @@ def draw_section(found: Section, target: Path, *, aspect: float = 1.0, overwrite
 def _parts(found: Section, aspect: float) -> list[str]:
     x0, y0, x1, y1 = (f"{value:.10g}" for value in found.line)
     kind = "voxels" if found.voxel else "points"
-    drawn = "" if len(found.value) == found.inside else f", of which {len(found.value):,} are drawn"
+    drawn = "" if len(found.value) == found.inside - found.outside else f", of which {len(found.value):,} are drawn"
     parts = [
         name_clouds(found.names), found.facts.name, f"{found.inside:,} of {found.total.values:,} {kind}{drawn}",
         f"from {x0} {y0} to {x1} {y1}", f"{found.width:.4g} {found.unit} wide",
     ]  # fmt: skip
     parts += [f"{found.total.no_data:,} without data"] if found.total.no_data else []
     parts += [f"{found.total.left_out:,} left out"] if found.total.left_out else []
+    parts += [f"{found.outside:,} outside"] if found.outside else []
     parts.append("equal scales" if aspect == 1.0 else f"heights {aspect:g} times exaggerated")
     return [*parts, f"CRS: {plain_text(found.crs, 90) or 'not given'}"]
 
@@ -107,14 +108,20 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
         for number, values in enumerate(found.values):
             color = SERIES[number % len(SERIES)]
             label = fit_text(figure, plain_text(found.names[number], 200), 4.5, size=8.5)
-            alone = len(found.values) == 1
+            alone = len(found.values) == 1 and found.statistic != "mean"
             if alone:
                 axes.stairs(np.nan_to_num(values), found.edges, orientation="horizontal", fill=True, color=color,
                             alpha=0.35)  # fmt: skip
-            axes.stairs(values, found.edges, orientation="horizontal", color=color, linewidth=1.2, label=label)
+            # A mean is no amount: from 0 on, differences of a few per cent would not be seen.
+            base = None if found.statistic == "mean" else 0.0
+            axes.stairs(values, found.edges, orientation="horizontal", color=color, linewidth=1.2, label=label,
+                        baseline=base)  # fmt: skip
         if log:
             axes.set_xscale("log")
-        elif np.nanmin(found.values) >= 0:
+            # Labels as powers of ten need math text, which file names forbid: a $ in one would break the picture.
+            axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+            axes.xaxis.set_minor_formatter("")
+        elif np.nanmin(found.values) >= 0 and found.statistic != "mean":
             axes.set_xlim(left=0)
         axes.set_ylim(found.edges[0], found.edges[-1])
         if not log:
@@ -122,9 +129,10 @@ def draw_profile(found: Profile, target: Path, *, log: bool = False, overwrite: 
             axes.xaxis.get_major_locator().set_params(nbins=6)
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlabel(fit_text(figure, plain_text(f"{found.label} of {found.edges[1] - found.edges[0]:.4g} "
-                                                    f"{found.unit}", 300), 5.0, size=9.5))  # fmt: skip
+                                                    f"{found.unit.split()[0]}", 300), 5.0, size=9.5))  # fmt: skip
         axes.set_ylabel(f"height [{found.unit}]")
-        parts = [name_clouds(found.names), found.facts.name, f"{found.total.values:,} values"]
+        parts = [name_clouds(found.names), f"{found.total.values:,} {found.noun}"]
+        parts[1:1] = [found.facts.name] if found.facts.name != found.noun else []
         rest = {"without data": found.total.no_data, "left out": found.total.left_out, "outside": found.outside}
         parts += [f"{number:,} {text}" for text, number in rest.items() if number]
         figure.suptitle(fit_parts(figure, parts, 5.8, size=10.0), x=0.01, ha="left", fontsize=10.0)

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, EchoFlag
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.tools.plots.waveform import WaveformView
 
 MOST_LISTED = 40
@@ -62,13 +62,7 @@ def _column(view: WaveformView, name: str) -> np.ndarray:
 
 
 def _measure(value: float, error: float) -> str:
-    """`12.34 +- 0.05`, with two digits of the error; a dash for no data."""
-    if not math.isfinite(value):
-        return "-"
-    if not (math.isfinite(error) and error > 0):
-        return f"{value:.7g}"
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
-    return f"{value:.{digits}f} \N{PLUS-MINUS SIGN} {error:.{digits}f}"
+    return format_measure(value, error, "\N{PLUS-MINUS SIGN}")
 
 
 def _cell(value: float, digits: int) -> str:

@@ -17,6 +17,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.las.point_formats import CLASS_NAMES
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, shown_limits
 
 FEWEST, MOST_CHOSEN = 20, 120
@@ -27,12 +28,6 @@ MOST_GROUPS = 12
 
 FEW_STEPS = 64
 """A column with at most so many possible values is shown whole: a rare class is no outlier."""
-
-CLASSES = {
-    0: "never classified", 1: "unclassified", 2: "ground", 3: "low vegetation", 4: "medium vegetation",
-    5: "high vegetation", 6: "building", 7: "low point", 9: "water", 17: "bridge deck", 18: "high noise",
-}  # fmt: skip
-"""Names of classes in the LAS standard that all versions share."""
 
 _MOST_STEPS = 1e15
 """Most steps from zero for which a float64 still holds half a step."""
@@ -229,7 +224,7 @@ def _name_series(key: _Key, columns: Sequence[Clouds], paths: Sequence[Path], ea
 def _name_group(column: str, value: float) -> str:
     if value == _UNKNOWN:
         return f"no {column}"
-    meaning = CLASSES.get(int(value), "") if column in ("classification", "raw_classification") else ""
+    meaning = CLASS_NAMES.get(int(value), "") if column in ("classification", "raw_classification") else ""
     return f"{column} {value:g}" + (f" ({meaning})" if meaning else "")
 
 

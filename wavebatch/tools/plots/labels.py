@@ -131,13 +131,24 @@ def _overlap(a: Any, b: Any) -> float:
 
 
 def space_ticks(axis: Any, length: float, each: float) -> None:
-    """Places as many ticks as fit, or one in the middle; length: of the axis, each: room of a tick [inches]."""
+    """Places as many ticks as fit, or two, or one; length: of the axis, each: room of a tick [inches]."""
     if length >= 2 * each:
         axis.get_major_locator().set_params(nbins=int(min(length / each, 8)))
         axis.set_major_formatter(lambda value, _: f"{value:.10g}")
         return
     low, high = axis.get_view_interval()
-    # A round place within a hundredth of the axis, so that its number is short.
-    digits = 2 - math.floor(math.log10(high - low)) if high > low else 3
-    axis.set_ticks([round(low + 0.5 * (high - low), digits)])
-    axis.set_major_formatter(lambda value, _: f"{value:.{max(digits, 0)}f}")
+    axis.set_ticks(_round_places(low, high, 2 if length >= each else 1))
+    axis.set_major_formatter(lambda value, _: f"{value:.10g}")
+
+
+def _round_places(low: float, high: float, most: int) -> list[float]:
+    """One or two round numbers between the ends of an axis that is too short for more."""
+    if not high > low:
+        return [low]
+    room = 0.8 * (high - low)
+    power = 10.0 ** math.floor(math.log10(room))
+    step = max(factor * power for factor in (1, 2, 5) if factor * power <= room)
+    places = [step * number for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    if most == 1 or len(places) < 2:
+        return [min(places, key=lambda place: abs(place - 0.5 * (low + high)))]
+    return [places[0], places[-1]]

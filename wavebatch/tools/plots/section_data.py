@@ -6,9 +6,8 @@ section keeps an even sample of its points, a profile only sums.
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,10 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.core.suggest import nearest
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.disk.npz_reader import read_npz, reading_npz
-from wavebatch.files.las.crs_name import name_crs
 from wavebatch.tools.plots.raster import check_crs
-from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, robust_limits
-from wavebatch.tools.voxels.grid import COLUMNS
+from wavebatch.tools.plots.values import MARGIN, Clouds, Selection, Tally, name_paths, robust_limits
+from wavebatch.tools.voxels.voxel_points import VoxelFile
 
 MOST_POINTS = 200_000
 """Most points of a section that are drawn: more would only cover each other."""
@@ -31,64 +27,11 @@ MOST_POINTS = 200_000
 MOST_BINS = 5000
 """Most bins of a profile."""
 
+LEAST = 20
+"""Least number of heights among which one can be an outlier."""
+
 _CHOSEN_BINS = 60
 """Bins of a profile, about, if their size is not given."""
-
-_PIECE = 1_000_000
-
-_LARGEST = 1e12
-"""Largest coordinate and size [m] of voxels, and the root of their largest value; damaged files have larger ones."""
-
-
-class VoxelFile:
-    """The voxels of an .npz of `wavebatch voxelize`, read as the points at their centres.
-
-    Has the interface of `values.Clouds`. Raises InputError for a file that holds no voxels, ConfigError without the
-    column.
-    """
-
-    def __init__(self, path: Path, selection: Selection) -> None:
-        self.paths, self.selection = (path,), selection
-        if selection.flags_with or selection.flags_without:
-            raise ConfigError(f"{path}: voxels have no echo_flags to select by")
-        what, remedy = "voxels of `wavebatch voxelize`", "make them again"
-        columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}
-        facts = {"index": ("i", 2), "origin": ("f", 1), "size": ("f", 0), "crs": ("U", 0), "meta": ("U", 0)}
-        self._data = read_npz(path, {**facts, **columns}, what, remedy)
-        self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
-        self.size = float(self._data["size"])
-        lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
-        is_sound = self._index.shape[1] == 3 and lengths == {len(self._index)} and self._origin.shape == (3,)
-        is_sound &= bool((np.abs(self._origin) < _LARGEST).all()) and 1e-6 <= self.size < _LARGEST
-        values = [self._data[column.name] for column in COLUMNS if column.name in self._data]
-        if not is_sound or any((np.abs(one) > _LARGEST**2).any() for one in values):
-            raise InputError(f"{path}: holds no {what}: its arrays do not fit; {remedy}")
-        with reading_npz(path, what, remedy):
-            json.loads(str(self._data["meta"]))
-        self.crs = name_crs(str(self._data["crs"])) if str(self._data["crs"]) else ""
-        known = {column.name: column for column in COLUMNS if column.name in self._data}
-        name = selection.column
-        if name is not None and name not in known:
-            raise ConfigError(f"{path}: has no column {name!r}; {nearest(name, known)}")
-        facts = known.get(name)
-        unit, meaning = (facts.unit, facts.meaning) if facts else ("-", "")
-        self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
-
-    def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:
-        """As Clouds.read, with the height of the centre in `others`."""
-        dtype = [("x", "<f8"), ("y", "<f8"), ("value", "<f8"), ("others", "<f8", (1,))]
-        for start in range(0, len(self._index), _PIECE):
-            part = slice(start, start + _PIECE)
-            place = self._origin + (self._index[part] + 0.5) * self.size
-            rows = np.zeros(len(place), dtype)
-            rows["x"], rows["y"], rows["others"][:, 0] = place.T
-            rows["value"] = 1.0 if self.selection.column is None else self._data[self.selection.column][part]
-            good = rows[~np.isnan(rows["value"])]
-            yield 0, good, Tally(len(rows), 0, len(rows) - len(good), len(good))
-
-    def complain(self, tally: Tally) -> InputError:
-        """The error that says why nothing can be drawn."""
-        return InputError(f"{self.paths[0]}: nothing to draw: {tally.points} voxels, {tally.no_data} without data")
 
 
 def open_heights(paths: Sequence[Path], selection: Selection) -> Clouds | VoxelFile:
@@ -117,6 +60,8 @@ class Section:
     """Counts of all points of the clouds."""
     inside: int
     """Points with a value in the section, of which at most MOST_POINTS are here."""
+    outside: int
+    """Of these, far outliers in height, which are not here: they would press all others into a line."""
     shown: tuple[float, float]
     """Limits of the colours."""
     voxel: float
@@ -148,15 +93,15 @@ def cut_section(
     width = max(length / 50, voxel) if width is None else width
     if not (math.isfinite(width) and width > 0):
         raise ConfigError(f"--width {width:g}: must be above 0")
-    unit_along = (end - start) / length
+
+    def cut(rows: np.ndarray) -> np.ndarray:
+        return _cut_rows(rows, start, (end - start) / length, length, width)
+
     sample, total = EvenSample(MOST_POINTS), Tally()
     for _, rows, tally in clouds.read():
         total += tally
-        offset = np.stack([rows["x"], rows["y"]], axis=1) - start
-        along, across = offset @ unit_along, offset @ np.array([-unit_along[1], unit_along[0]])
-        keep = (along >= 0) & (along <= length) & (np.abs(across) <= 0.5 * width) & np.isfinite(rows["others"][:, 0])
-        if keep.any():
-            place = np.stack([along, rows["others"][:, 0], rows["value"]], axis=1)[keep]
+        place = cut(rows)
+        if len(place):
             sample.add({"place": place})
     if not total.values:
         raise clouds.complain(total)
@@ -165,23 +110,56 @@ def cut_section(
             f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} of the line from {start[0]:.10g} "
             f"{start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
         )
-    along, height, value = sample.read()["place"].T
+    places = sample.read()["place"]
+    low, high = choose_frame(places[:, 1], length)
+    near = (places[:, 1] >= low) & (places[:, 1] <= high)
+    outside = int(np.count_nonzero(~near))
+    if sample.seen > len(places):
+        every = (cut(rows)[:, 1] for _, rows, _ in clouds.read())
+        outside = sum(int(np.count_nonzero((height < low) | (height > high))) for height in every)
+    along, height, value = places[near].T
     shown = tuple(np.percentile(value, (2, 98)).tolist())
     names = tuple(path.name for path in paths)
-    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen, shown,
-                   voxel, crs, unit)  # fmt: skip
+    return Section(clouds.facts, names, tuple(map(float, line)), width, along, height, value, total, sample.seen,
+                   outside, shown, voxel, crs, unit)  # fmt: skip
+
+
+def _cut_rows(rows: np.ndarray, start: np.ndarray, along: np.ndarray, length: float, width: float) -> np.ndarray:
+    """Distance along the line, height and value of the points beside it, f8 (k, 3); along: its unit vector."""
+    offset = np.stack([rows["x"], rows["y"]], axis=1) - start
+    far, aside = offset @ along, offset @ np.array([-along[1], along[0]])
+    height = rows["others"][:, 0]
+    keep = (far >= 0) & (far <= length) & (np.abs(aside) <= 0.5 * width) & np.isfinite(height)
+    return np.stack([far, height, rows["value"]], axis=1)[keep]
+
+
+def choose_frame(height: np.ndarray, length: float) -> tuple[float, float]:
+    """Least and largest height that a section shows, of heights (n,): not the few that lie far from all others.
+
+    At each end the thousandth that is farthest, but at least one, is left out where it lies farther from the rest than
+    MARGIN of its extent and than a tenth of the section's length. Fewer than LEAST heights have no outliers.
+    """
+    few = math.ceil(0.001 * len(height))
+    if len(height) < LEAST:
+        return -math.inf, math.inf
+    rest = np.sort(height)[few:-few]
+    reach = max(MARGIN * float(rest[-1] - rest[0]), 0.1 * length)
+    return float(rest[0]) - reach, float(rest[-1]) + reach
 
 
 def _choose_line(clouds: Clouds | VoxelFile) -> tuple[float, float, float, float]:
     """A line through the middle of the points, along their longer extent."""
-    sample = EvenSample()
-    for _, rows, _ in clouds.read():
+    sample, total = EvenSample(), Tally()
+    for _, rows, tally in clouds.read():
+        total += tally
         places = np.stack([rows["x"], rows["y"]], axis=1)
         places = places[np.isfinite(places).all(axis=1)]
         if len(places):
             sample.add({"place": places})
+    if not total.values:
+        raise clouds.complain(total)
     if not sample.seen:
-        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a value and a position")
+        raise InputError(f"{clouds.paths[0]}: nothing to draw: no point has a position")
     places = sample.read()["place"]
     middle = places.mean(axis=0)
     values, vectors = np.linalg.eigh(np.cov((places - middle).T) if len(places) > 1 else np.eye(2))
@@ -210,11 +188,15 @@ class Profile:
     total: Tally
     unit: str
 
+    noun: str = "values"
+    """What is counted, in the title."""
+
     @property
     def label(self) -> str:
         """Label of the axis of values."""
         if self.statistic == "count":
-            return f"{'voxels' if self.facts.name == 'voxels' else 'points'} per height [-]"
+            kind = self.facts.name if self.facts.name in ("voxels", "segments") else "points"
+            return f"{kind} per height [-]"
         return f"{self.statistic} of {self.facts.label} per height"
 
 
@@ -243,7 +225,7 @@ def measure_profile(
     if not sample.seen:
         raise clouds.complain(total)
     voxel = clouds.size if isinstance(clouds, VoxelFile) else 0.0
-    edges = _place_heights(sample.read()["height"], least, largest, size, voxel)
+    edges = place_heights(sample.read()["height"], least, largest, size, voxel)
     series = len(paths) if each else 1
     sums, numbers, outside = np.zeros((series, len(edges) - 1)), np.zeros((series, len(edges) - 1)), 0
     for cloud, rows, _ in clouds.read():
@@ -260,7 +242,7 @@ def measure_profile(
     return Profile(clouds.facts, statistic, names, edges, values, outside, total, unit)
 
 
-def _place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
+def place_heights(sample: np.ndarray, least: float, largest: float, size: float | None, voxel: float) -> np.ndarray:
     """Edges of bins: multiples of their size; for voxels the faces of these, or no voxel would lie on one side only."""
     low, high = robust_limits(sample, least, largest)
     if size is None:

@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch import __version__
+from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts
+from wavebatch.files.cloud.column_reader import ColumnFacts, select_points
 from wavebatch.files.cloud.columns_reader import ColumnsReader
 from wavebatch.files.disk.spool import Spool
 from wavebatch.files.geotiff_file import TILE, Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
@@ -52,6 +53,8 @@ class GridOptions:
     """West, south, east, north."""
     flags_with: int = 0
     flags_without: int = 0
+    where: Condition | None = None
+    """Points must meet this."""
     crs: str | None = None
     no_data: float = -9999.0
 
@@ -63,13 +66,15 @@ class GridResult:
     layout: RasterLayout
     points: int = 0
     left_out: int = 0
-    """Points that were left out because of their flags."""
+    """Points that were left out because of their flags or by --where."""
     outside: int = 0
     """Points outside of the bounds, or without a position."""
     values: tuple[int, ...] = ()
     """Points with a value, per band."""
     filled: int = 0
     """Cells that have a value in a band at least."""
+    bands: tuple[Band, ...] = ()
+    """Name and unit of each band."""
 
 
 def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, overwrite: bool = False) -> GridResult:
@@ -84,8 +89,8 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     box, points, largest = _find_extent(paths, options)
     layout = _lay_out(str(paths[0]), box, options)
     layout = replace(layout, dtype=_choose_dtype(facts, largest), crs=crs, unit=unit)
-    result = GridResult(layout)
     bands = _describe(facts, options.statistic, unit)
+    result = GridResult(layout, bands=tuple(bands))
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}", "STATISTIC": options.statistic}
     number = int(np.clip(-(-points // (HELD // 2)), 1, MOST_BUCKETS))
     entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (len(bands),))]))
@@ -162,16 +167,19 @@ def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFa
 
 
 def _read(paths: Sequence[Path], options: GridOptions) -> Iterator[tuple[np.ndarray, int]]:
-    """Pieces of all clouds: points with the right flags, and the number of those left out."""
+    """Pieces of all clouds: points with the right flags that meet the condition, and the number of those left out."""
     for path in paths:
         with ColumnsReader(path, options.columns) as reader:
             if (options.flags_with or options.flags_without) and not reader.has_flags:
                 raise ConfigError(f"{path}: has no column echo_flags to select points by")
+            select_points(reader, options.where)
+            seen = 0
             for rows in reader.read_pieces():
                 keep = (rows["flags"] & np.uint16(options.flags_without)) == 0
                 if options.flags_with:
                     keep &= (rows["flags"] & np.uint16(options.flags_with)) != 0
-                yield rows[keep], int(len(rows) - keep.sum())
+                more, seen = reader.left_out - seen, reader.left_out
+                yield rows[keep], int(len(rows) - keep.sum()) + more
 
 
 def _is_inside(rows: np.ndarray, bounds: tuple[float, float, float, float] | None) -> np.ndarray:
@@ -196,8 +204,10 @@ def _find_extent(
             largest = np.maximum(largest, np.nan_to_num(np.abs(rows["values"])).max(axis=0, initial=0.0))
             points += len(rows)
     if not points:
-        where = "within the bounds" if options.bounds else "with a position and the right flags"
-        raise InputError(f"{paths[0]}: no raster: no point {where}")
+        wanted = ["a position within --bounds" if options.bounds else "a position"]
+        wanted += ["the chosen flags"] if options.flags_with or options.flags_without else []
+        wanted += ["what --where asks for"] if options.where is not None else []
+        raise InputError(f"{paths[0]}: no raster: no point has {' and '.join(wanted)}")
     return options.bounds or (*low.tolist(), *high.tolist()), points, largest
 
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
+from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.geojson import Polygon, find_inside
+from wavebatch.files.las.header import read_header
 
 MOST_AREAS = 50_000
 """Most areas of all clouds together, so that memory is bounded."""
@@ -51,6 +54,12 @@ class Division(Protocol):
     def describe(self, number: int) -> Area:
         """The area with this number."""
 
+    def place(self, cloud: Path) -> Division:
+        """The division in the coordinates of a cloud."""
+
+    def miss(self, cloud: Path) -> str:
+        """Says that no area lies in the cloud, once it is placed; empty where one does."""
+
 
 class Grid:
     """Square cells whose borders are multiples of `size`, in the unit of the coordinates."""
@@ -77,6 +86,14 @@ class Grid:
         x, y = ((number >> 31) - _HALF) * self.size, ((number & ((1 << 31) - 1)) - _HALF) * self.size
         return Area("cell", f"{x:.10g} {y:.10g}", x, y)
 
+    def place(self, cloud: Path) -> Grid:
+        """As Division.place."""
+        return self
+
+    def miss(self, cloud: Path) -> str:
+        """As Division.miss."""
+        return ""
+
 
 class PolygonSet:
     """Polygons; where polygons overlap, a position belongs to the first one."""
@@ -95,6 +112,15 @@ class PolygonSet:
     def describe(self, number: int) -> Area:
         """As Division.describe."""
         return OUTSIDE if number == _OUTSIDE else Area("polygon", self.polygons[number].name)
+
+    def place(self, cloud: Path) -> PolygonSet:
+        """As Division.place; raises as `Polygon.place`."""
+        header = read_header(cloud)
+        return PolygonSet([polygon.place(cloud, header) for polygon in self.polygons])
+
+    def miss(self, cloud: Path) -> str:
+        """As Division.miss."""
+        return describe_miss([ring for polygon in self.polygons for ring in polygon.rings], read_header(cloud))
 
 
 RANKS = ("1-2", "2-3", "3-4", "4-")

@@ -32,20 +32,12 @@ from wavebatch.tools.return_stats.areas import (
     measure_depths,
     share_counts,
 )
-
-_BIN, _BINS = 0.01, 10_000
-"""Width [m] and number of the bins of distances from which the dead zone is found: to 1 cm, up to 100 m."""
+from wavebatch.tools.return_stats.dead_zones import DeadZone, Distances
 
 _MOST_PAIR = 15
 """Classes of pairs by return number; the last one holds all higher numbers."""
 
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
-_LEAST_PAIRS = 100
-"""Fewer pairs give no dead zone."""
-
-_EDGE = 0.001
-"""Share of the distances that may lie within the dead zone, so that a few duplicate points do not hide it."""
-
 _SURE = 3.0
 """A sensor limit is reported if pulses with the most returns outnumber those with one less by so many standard
 deviations; without a limit, counts fall with the number of returns."""
@@ -74,6 +66,8 @@ class ReturnStats:
     """Mean height of the first above the last return of these pulses [m]; NaN without any."""
     dead_zone: float
     """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs."""
+    dead_zones: dict[str, DeadZone]
+    """The same with its error, for `all` pairs and by return number: `1-2`, `2-3`, `3-4` and `4-` (all higher ones)."""
     hidden: float
     """Pairs per pulse that the dead zone would hold if they were as frequent there as up to twice its size."""
     flags: dict[str, int] | None
@@ -134,8 +128,9 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
     with ReturnReader(path) as reader:
         by_time = pulses_told_apart(reader)  # by all points
         select_points(reader, where)
-        areas = [AreaTally(division) for division in divisions]
-        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=areas)
+        placed = [division.place(path) for division in divisions]
+        tally = _Tally(methods={"gps_time" if by_time else "return_number"}, areas=list(map(AreaTally, placed)))
+        tally.misses = [line for division in placed for line in [division.miss(path)] if line]
         if reader.has_flags:
             tally.flags = np.zeros(16, np.int64)
         number = count_buckets(reader.point_count)
@@ -190,12 +185,14 @@ class _Tally:
     methods: set[str] = field(default_factory=set)
     by_number: np.ndarray = field(default_factory=lambda: np.zeros(16, np.int64))
     by_count: np.ndarray = field(default_factory=lambda: np.zeros(MOST_COUNT + 1, np.int64))
-    bins: np.ndarray = field(default_factory=lambda: np.zeros(_BINS, np.int64))
+    distances: Distances = field(default_factory=Distances)
     pairs: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR, np.int64))
     sums: np.ndarray = field(default_factory=lambda: np.zeros(_MOST_PAIR))
     least: np.ndarray = field(default_factory=lambda: np.full(_MOST_PAIR, np.inf))
     flags: np.ndarray | None = None
     areas: list[AreaTally] = field(default_factory=list)
+    misses: list[str] = field(default_factory=list)
+    """Lines that say that no area lies in the cloud."""
 
     def add_points(self, rows: np.ndarray) -> None:
         """Adds return numbers and flags of some points."""
@@ -223,7 +220,7 @@ class _Tally:
         known = np.isfinite(distance)
         before, distance = before[known], distance[known]
         rank = np.minimum(rows["number"][before], _MOST_PAIR) - 1
-        self.bins += np.bincount(np.minimum(distance / _BIN, _BINS - 1).astype(np.int64), minlength=_BINS)
+        self.distances.add(rows["number"][before], distance)
         self.pairs += np.bincount(rank, minlength=_MOST_PAIR)
         self.sums += np.bincount(rank, distance, _MOST_PAIR)
         np.minimum.at(self.least, rank, distance)
@@ -233,9 +230,9 @@ class _Tally:
     def merge(self, other: _Tally) -> None:
         """Adds the sums of another cloud."""
         self.methods |= other.methods
-        for name in ("points", "left_out", "incomplete", "several", "depth", "by_number", "by_count", "bins", "pairs",
-                     "sums"):  # fmt: skip
+        for name in ("points", "left_out", "incomplete", "several", "depth", "by_number", "by_count", "pairs", "sums"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.distances.merge(other.distances)
         self.least = np.minimum(self.least, other.least)
         for area, more in zip(self.areas, other.areas, strict=True):
             area.merge(more)
@@ -245,9 +242,9 @@ class _Tally:
     def finish(self, cloud: str) -> ReturnStats:
         """The statistics."""
         pulses = int(self.by_count.sum())
-        zone = hidden = self._find_dead_zone()
-        if not math.isnan(zone):
-            hidden = int(self.bins[round(zone / _BIN) : round(2 * zone / _BIN)].sum()) / pulses
+        zones = self.distances.list_zones()
+        zone = zones["all"].size
+        hidden = math.nan if math.isnan(zone) else self.distances.count_hidden(zone) / pulses
         names = [flag.name for flag in EchoFlag]
         return ReturnStats(
             cloud=cloud,
@@ -261,6 +258,7 @@ class _Tally:
             several=self.several,
             depth=self.depth / self.several if self.several else math.nan,
             dead_zone=zone,
+            dead_zones=zones,
             hidden=hidden,
             flags=None if self.flags is None else dict(zip(names, self.flags.tolist(), strict=True)),
             warnings=tuple(self._warn(zone, hidden, pulses)),
@@ -275,15 +273,8 @@ class _Tally:
             table[name] = describe_pairs(self.pairs[rank], self.sums[rank], self.least[rank])
         return table
 
-    def _find_dead_zone(self) -> float:
-        """Lower edge of the distances, to 1 cm, without the closest thousandth."""
-        total = int(self.bins.sum())
-        if total < _LEAST_PAIRS:
-            return math.nan
-        return round(int(np.searchsorted(np.cumsum(self.bins), _EDGE * total, side="right")) * _BIN, 2)
-
     def _warn(self, zone: float, hidden: float, pulses: int) -> list[str]:
-        lines = []
+        lines = list(self.misses)
         if self.left_out:
             lines.append(
                 f"--where: {self.left_out} of {self.points + self.left_out} points are left out; pulses and distances "

@@ -9,7 +9,7 @@ blocks                           a scene as blocks in memory, with the true echo
 given_echoes                     a block with exactly the echoes that the caller gives
 returns                          true echoes to discrete returns, as vendors and discrete receivers record them
 strip, truth                     a scene as a LAS or LAZ file, and the .npz with its true echoes
-from_returns                     an existing cloud of returns as a strip with modelled waveforms
+from_returns, return_light       an existing cloud of returns as a strip with modelled waveforms
 
 Called by `wavebatch simulate`, `wavebatch synthesize`, tools.bench, the examples and the tests.
 """

@@ -1,28 +1,31 @@
 """A cloud of discrete returns as a strip with modelled waveforms: a Gaussian per return, from range and intensity.
 
 `wavebatch synthesize` calls `synthesize_strip`. The cloud is read once in pieces that cut no pulse, and once before to
-choose the gain where none is given. The other modules of this folder invent echoes; this one takes them from a file.
+choose the gain where none is given. Heights, widths and shares of the beam are those of `return_light`. The other
+modules of this folder invent echoes; this one takes them from a file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
+from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
-from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
+from wavebatch.tools.simulate.return_light import Light, LightCounts, LightModel, Radar, open_light
 from wavebatch.tools.simulate.returns import fill_packets
 
 INTENSITIES = ("peak", "reflectance")
@@ -47,29 +50,6 @@ _LEVELS = np.geomspace(1e-12, 1e12, 4801)
 
 
 @dataclass(frozen=True, slots=True)
-class Radar:
-    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
-
-    height: float
-    """Height of the sensor, in the height system of the cloud [m]."""
-    power: float = 1.0
-    """Peak power of the pulse [W]; matters only with a gain."""
-    aperture: float = 0.1
-    """Diameter of the receiver [m]."""
-    divergence: float = 0.5e-3
-    """Full angle of the beam [rad]."""
-    efficiency: float = 0.5
-    """Share of the light that the optics let through."""
-    attenuation: float = 0.22
-    """Attenuation by the air [dB/km]."""
-
-    def __post_init__(self) -> None:
-        positive = (self.power, self.aperture, self.divergence, self.efficiency)
-        if not (min(positive) > 0 and self.attenuation >= 0):
-            raise ConfigError("power, aperture, divergence and efficiency must be above 0, attenuation not below 0")
-
-
-@dataclass(frozen=True, slots=True)
 class SynthesisOptions:
     """How returns become waveforms."""
 
@@ -81,7 +61,12 @@ class SynthesisOptions:
     radar: Radar | None = None
     """Needed for `reflectance`, and only there."""
     width: float = 4.7
-    """Full width at half maximum of an echo [ns]; a column echo_width of the cloud goes first."""
+    """Full width at half maximum of the pulse [ns], and of echoes whose width is not known."""
+    widths: str | None = None
+    """Column of the cloud with the full width at half maximum of each echo [ns]; None: echo_width, where it has it."""
+    shares: str | None = None
+    """Column with the share of the beam that each return takes, or `equal`; only for `reflectance`. None: reflectances
+    are those of surfaces that fill the beam."""
     spacing: float = 1.0
     """Time between two samples [ns]."""
     bits: int = 8
@@ -98,6 +83,10 @@ class SynthesisOptions:
             raise ConfigError(f"intensity {self.intensity!r} is unknown; choose peak or reflectance")
         if (self.radar is None) != (self.intensity == "peak"):
             raise ConfigError("the sensor's height is needed for intensity reflectance, and only there")
+        if self.shares is not None and self.radar is None:
+            raise ConfigError(
+                "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
+            )
         if not (self.width > 0 and (self.gain is None or self.gain > 0)):
             raise ConfigError("width and gain must be above 0")
         if self.sigma < 0.5 * self.spacing:
@@ -128,6 +117,24 @@ class SynthesisSummary:
     """Pulses whose number of points in a row is not the number of returns that the points state."""
     gain: float = 1.0
     """DN per unit of intensity, or per W."""
+    energy: float = 0.0
+    """Of the echoes of all returns, as modelled [DN ns]."""
+    energy_without_packet: float = 0.0
+    """Of those without a packet."""
+    energy_recorded: float = 0.0
+    """Sum of the samples above the baseline [DN ns]: less than modelled where the digitizer saturates, and where echoes
+    are lower than half a count."""
+    light: LightCounts = field(default_factory=LightCounts)
+    """Whose widths and shares were known."""
+
+    @property
+    def light_used(self) -> float:
+        """Mean share of the beam that the returns of a pulse take together; NaN without shares."""
+        return self.light.shares / self.light.pulses if self.light.pulses else float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers for JSON."""
+        return {**asdict(self), "light_used": self.light_used}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +171,8 @@ def synthesize_strip(
     the first one. The ray runs from the first to the last return; lone returns take the direction that the pulses
     around them have at their scan angle. All points keep their coordinates and fields (extra bytes are left out); point
     formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. Memory does not grow with the cloud.
-    Raises InputError where the cloud cannot be read or has no GPS times, or the target exists; no file remains then.
+    Raises InputError where the cloud cannot be read or has no GPS times, or the target exists, ConfigError where it
+    lacks a column; no file remains then.
     """
     options = options or SynthesisOptions()
     recordings = [options.recording(length) for length in _LENGTHS]
@@ -174,13 +182,18 @@ def synthesize_strip(
                 f"{cloud}: point format {reader.point_format} has no GPS times, which are needed to group points into "
                 "pulses; give a cloud of another point format"
             )
-        gain = _choose_gain(reader, options) if options.gain is None else options.gain
-        summary = SynthesisSummary(gain=gain)
+        model = partial(open_light, reader.path, options.radar, options.sigma, options.spacing,
+                        widths=options.widths, shares=options.shares)  # fmt: skip
+        light = model()
+        # A model counts what it sees: each pass over the cloud has one.
+        gain = _choose_gain(reader, options, model()) if options.gain is None else options.gain
+        summary = SynthesisSummary(gain=gain, light=light.counts)
         with _open_writer(reader, Path(target), options, overwrite) as writer:
             for number, (rows, records) in enumerate(_read_pulses(reader)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
-                pulses = _model_pulses(rows, options, gain, reader.path, rng)
-                offset = _write_packets(writer, recordings, pulses, rng)
+                pulses = _model_pulses(rows, records, options, gain, light, rng)
+                offset, energy = _write_packets(writer, recordings, pulses, rng)
+                summary.energy_recorded += energy
                 writer.write_points(_fill_points(writer.dtype, records, pulses, offset, options))
                 _count(summary, pulses, recordings[0])
                 if progress:
@@ -219,52 +232,36 @@ def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, 
     )
 
 
-def _measure_strength(rows: np.ndarray, options: SynthesisOptions, path: Path) -> np.ndarray:
-    """Peak of each return before the gain: intensity, or received power [W]."""
-    intensity = rows["intensity"].astype(np.float64)
-    radar = options.radar
-    if radar is None:
-        return intensity
-    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["angle"], -80, 80)))
-    if len(distance) and distance.min() <= 0:
-        highest = rows["xyz"][:, 2].max()
-        raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
-    return receive_power(
-        spread_cross_section(intensity / 65535, distance, radar.divergence),
-        distance,
-        transmitted=radar.power,
-        aperture=radar.aperture,
-        divergence=radar.divergence,
-        efficiency=radar.efficiency,
-        attenuation=radar.attenuation,
-    )
-
-
-def _choose_gain(reader: ReturnReader, options: SynthesisOptions) -> float:
+def _choose_gain(reader: ReturnReader, options: SynthesisOptions, light: LightModel) -> float:
     """The gain that fills the digitizer; reads all points."""
     counts = np.zeros(len(_LEVELS) + 1, np.int64)
-    for rows in reader.read_pieces():
-        strength = _measure_strength(rows, options, reader.path)
+    for rows, records in _read_pulses(reader):
+        strength = light.measure(rows, records, group_pulses(rows["gps_time"], rows["number"])).strength
         counts += np.bincount(np.searchsorted(_LEVELS, strength[strength > 0]), minlength=len(counts))
     total = int(counts.sum())
     if reader.point_count and not total:
-        raise InputError(f"{reader.path}: all intensities are 0, so there is nothing to model")
+        rest = " or share 0" if options.shares else ""
+        raise InputError(f"{reader.path}: all returns have intensity 0{rest}, so there is nothing to model")
     level = int(np.searchsorted(np.cumsum(counts), 0.999 * total))
     room = FULL_SHARE * ((1 << options.bits) - 1 - options.baseline)
     return float(room / _LEVELS[min(level, len(_LEVELS) - 1)])
 
 
 def _model_pulses(
-    rows: np.ndarray, options: SynthesisOptions, gain: float, path: Path, rng: np.random.Generator
+    rows: np.ndarray,
+    records: np.ndarray,
+    options: SynthesisOptions,
+    gain: float,
+    light: LightModel,
+    rng: np.random.Generator,
 ) -> _Pulses:
     """Echoes of the returns, with sample 0 a margin and a random part of a sample before the first of each pulse."""
     starts = group_pulses(rows["gps_time"], rows["number"])
     count = np.diff(np.append(starts, len(rows)))
     pulse = np.repeat(np.arange(len(starts)), count)
     ray = fit_rays(rows["xyz"], starts, rows["angle"], rows["source"])
-    known = rows["echo_width"] > 0
-    measured = np.where(known, rows["echo_width"], 0) / FWHM_PER_SIGMA
-    sigma = np.where(known, np.clip(measured, 0.5 * options.spacing, 50.0), options.sigma)
+    seen: Light = light.measure(rows, records, starts)
+    sigma = seen.sigma
     delay = np.einsum("ij,ij->i", rows["xyz"] - rows["xyz"][starts][pulse], ray[pulse]) / HALF_C
     margin = MARGIN * np.maximum.reduceat(sigma, starts)
     phase = options.spacing * rng.random(len(starts))
@@ -273,7 +270,7 @@ def _model_pulses(
     return _Pulses(
         pulse=pulse,
         time=time,
-        amplitude=gain * _measure_strength(rows, options, path),
+        amplitude=gain * seen.strength,
         sigma=sigma,
         ray=ray,
         kind=np.searchsorted(_LENGTHS, n_samples),
@@ -283,8 +280,9 @@ def _model_pulses(
 
 def _write_packets(
     writer: FullwaveWriter, recordings: list[Recording], pulses: _Pulses, rng: np.random.Generator
-) -> np.ndarray:
-    """Byte offset of every pulse's packet, u8 (n,); 0 where it has none."""
+) -> tuple[np.ndarray, float]:
+    """Byte offset of every pulse's packet, u8 (n,), 0 where it has none; and the energy of the samples [DN ns]."""
+    energy = 0.0
     offset = np.zeros(len(pulses.kind), np.uint64)
     for number, recording in enumerate(recordings):
         same = np.flatnonzero(pulses.kind == number)
@@ -297,8 +295,10 @@ def _write_packets(
             echoes = waveform >= 0
             columns = (values[echoes] for values in (waveform, pulses.time, pulses.amplitude, pulses.sigma))
             signal = paint_echoes(recording, len(chosen), *columns)
-            offset[chosen] = writer.write_packets(record_counts(recording, signal, rng), number + 1)
-    return offset
+            counts = record_counts(recording, signal, rng)
+            energy += recording.spacing * (float(counts.sum(dtype=np.float64)) - recording.baseline * counts.size)
+            offset[chosen] = writer.write_packets(counts, number + 1)
+    return offset, energy
 
 
 def _fill_points(
@@ -317,6 +317,9 @@ def _fill_points(
 
 def _count(summary: SynthesisSummary, pulses: _Pulses, recording: Recording) -> None:
     too_long = pulses.kind == len(_LENGTHS)
+    energy = SQRT_2PI * pulses.amplitude * pulses.sigma
+    summary.energy += float(energy.sum())
+    summary.energy_without_packet += float(energy[too_long[pulses.pulse]].sum())
     summary.points += len(pulses.pulse)
     summary.packets += int(np.count_nonzero(~too_long))
     summary.without_packet += int(np.count_nonzero(too_long[pulses.pulse]))

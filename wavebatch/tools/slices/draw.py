@@ -13,6 +13,7 @@ import numpy as np
 from wavebatch.files.figure_file import open_picture, plain_text
 from wavebatch.tools.plots.labels import fit_parts
 from wavebatch.tools.slices.cube import CubeSlice
+from wavebatch.tools.slices.output import NO_SAMPLE
 from wavebatch.tools.slices.segments import Segment
 
 _LEAST_HEIGHT = 0.15
@@ -31,7 +32,9 @@ def draw_segments(
     low, high = ends.reshape(-1, 3).min(axis=0), ends.reshape(-1, 3).max(axis=0)
     extent = np.maximum(high - low, 1e-3)
     with open_picture(target, (12.0, 6.0), overwrite=overwrite) as figure:
-        parts = [plain_text(strip), f"{len(segments):,} segments in {lines:,} scan lines",
+        numbers = [f"{number:,} {name}{'s' * (number != 1)}" for number, name in
+                   ((len(segments), "segment"), (lines, "scan line"))]  # fmt: skip
+        parts = [plain_text(strip), " in ".join(numbers),
                  f"CRS: {plain_text(crs, 90) or 'not given'}"]  # fmt: skip
         figure.suptitle(fit_parts(figure, parts, 11.8, size=10.5), x=0.01, ha="left", fontsize=10.5)
         plan = figure.add_subplot(1, 2, 1)
@@ -43,7 +46,8 @@ def draw_segments(
         plan.set_xlim(low[0] - base[0] - margin, high[0] - base[0] + margin)
         plan.set_ylim(low[1] - base[1] - margin, high[1] - base[1] + margin)
         plan.set_aspect("equal")
-        names = [f"{name} - {value:.10g} [m]" for name, value in zip("xyz", base, strict=True)]
+        names = [f"{name} {'-' if value >= 0 else '+'} {abs(value):.10g} [m]" if value else f"{name} [m]"
+                 for name, value in zip("xyz", base, strict=True)]  # fmt: skip
         plan.set_xlabel(names[0])
         plan.set_ylabel(names[1])
         figure.colorbar(shown, ax=plan, label="height [m]", orientation="horizontal", aspect=40)
@@ -56,7 +60,8 @@ def draw_segments(
             space.tick_params(axis=axis, labelsize=7)
         tall = max(extent[2], _LEAST_HEIGHT * extent.max())
         sides = np.append(np.maximum(extent[:2], 0.05 * extent.max()), tall)
-        space.set_box_aspect(sides, zoom=0.85)
+        # A long box is seen along its diagonal, and leaves more room around it than a cube.
+        space.set_box_aspect(sides, zoom=0.85 + 0.35 * (1.0 - np.sort(sides)[1] / sides.max()))
         for axis, side in zip("xyz", sides / sides.max(), strict=True):
             _place_ticks(getattr(space, f"{axis}axis"), 5.0 * side)
         for axis, side in zip((plan.xaxis, plan.yaxis), extent[:2] / extent.max(), strict=True):
@@ -67,10 +72,12 @@ def draw_segments(
 
 
 def _place_ticks(axis, number: float) -> None:
-    """Sets about so many ticks, or only one at the beginning of a short axis: more would cover each other."""
+    """Sets about so many ticks, or only one in the middle of a short axis: more would cover each other."""
     if number < 1.5:
-        axis.set_ticks([axis.get_view_interval()[0]])
-        axis.set_major_formatter("{x:.3g}")
+        low, high = axis.get_view_interval()
+        step = 10.0 ** np.floor(np.log10(0.5 * (high - low)))
+        axis.set_ticks([step * np.round(0.5 * (low + high) / step)])
+        axis.set_major_formatter("{x:.6g}")
     else:
         axis.get_major_locator().set_params(nbins=max(int(number), 2))
 
@@ -80,11 +87,12 @@ def draw_cube(slices: Sequence[CubeSlice], target: Path, *, name: str, overwrite
     known = np.concatenate([one.image[np.isfinite(one.image)] for one in slices])
     high = float(np.percentile(known, 99.8)) if len(known) else 1.0
     with open_picture(target, (max(4.6 * len(slices), 6.0), 4.8), overwrite=overwrite) as figure:
-        title = fit_parts(figure, [plain_text(name), "white: no sample"], max(4.6 * len(slices), 6.0) - 0.2, size=10.5)
+        title = fit_parts(figure, [plain_text(name), "blue: no sample"], max(4.6 * len(slices), 6.0) - 0.2, size=10.5)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
         panels = figure.subplots(1, len(slices), squeeze=False)[0]
         for axes, one in zip(panels, slices, strict=True):
             axes.grid(visible=False)
+            axes.set_facecolor(NO_SAMPLE)
             shown = axes.imshow(one.image, extent=one.extent, origin="lower", aspect="auto", cmap="Greys", vmin=0.0,
                                 vmax=max(high, 1e-6), interpolation="nearest")  # fmt: skip
             if one.down:

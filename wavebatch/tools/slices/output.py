@@ -22,6 +22,9 @@ SEGMENT_SUFFIXES = (".csv", ".geojson")
 _PLACE = ("pulses", "first_pulse", "last_pulse", "first_point")
 _FIGURES = ("length", "slope", "residual", *_PLACE, "theta", "rho", "weight")
 _HEAD = ("line", "segment", "x1", "y1", "z1", "x2", "y2", "z2", *_FIGURES)
+NO_SAMPLE = "#d9e6f2"
+"""Colour of what was not recorded: a light blue, because samples without signal are white."""
+
 _TALLEST = 8.0
 """Largest height of the axes of a slice [inches]."""
 _MOST_PIXELS = 40_000_000
@@ -104,6 +107,7 @@ def draw_slice(
         figure.set_layout_engine("compressed")
         axes = figure.subplots()
         axes.grid(visible=False)
+        axes.set_facecolor(NO_SAMPLE)
         shown = axes.imshow(image, extent=extent, origin="lower", aspect="equal" if plane else "auto", cmap="gray_r",
                             interpolation="nearest")  # fmt: skip
         figure.colorbar(shown, ax=axes, label="DN above the level without signal", orientation="horizontal", aspect=40)
@@ -116,7 +120,7 @@ def draw_slice(
         axes.set_xlabel("along the slice [m]" if plane else "time from the nearest sample of all [ns]")
         axes.set_ylabel("height [m]" if plane else "pulse")
         parts = [plain_text(strip), f"scan line {piece.line.number}", f"{len(piece.line)} pulses"]
-        parts.append(f"{len(segments)} segment" + "s" * (len(segments) != 1))
+        parts += [f"{len(segments)} segment" + "s" * (len(segments) != 1), "blue: no sample"]
         title = fit_parts(figure, [part for part in parts if part], figure.get_figwidth() - 0.2, size=10.5)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
 

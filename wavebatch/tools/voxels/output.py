@@ -18,6 +18,7 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft
+from wavebatch.files.las.crs import repair_records, repair_wkt
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,
@@ -128,9 +129,9 @@ def _write_las(target: Path, space: VoxelSpace, pieces: Iterable[Piece], overwri
 
 def _build_header(space: VoxelSpace) -> LasHeader:
     facts, source = space.facts, read_header(space.facts.path)
-    vlrs = [vlr for vlr in source.vlrs if is_projection(vlr)]
+    vlrs = repair_records(vlr for vlr in source.vlrs if is_projection(vlr))
     if not has_record(vlrs, PROJECTION, WKT_ID) and (facts.crs or "").endswith("]"):
-        record = build_wkt(facts.crs)  # from an extended record
+        record = build_wkt(repair_wkt(facts.crs))  # from an extended record
         if len(record.payload) > 65535:
             raise InputError(f"{facts.path}: its CRS is longer than the record of a point cloud; write an .npz")
         vlrs.append(record)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag
-from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.units import FWHM_PER_SIGMA, format_measure
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, evaluate_pulse
 from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
@@ -195,7 +195,7 @@ def draw_values(
     chart = Chart(Axis(0, len(names), names=ticks), Axis(low - room, high + room), title=title, labels=("", label))
     for place, (value, error) in enumerate(zip(middle, spread, strict=True)):
         chart.line(np.full(2, place + 0.5), np.array([value - error, value + error]), 1)
-        chart.points(place + 0.5, value, 0, radius=4, names=[f"{names[place]}: {value:.6g} +- {error:.2g}"])
+        chart.points(place + 0.5, value, 0, radius=4, names=[f"{names[place]}: {format_measure(value, error)}"])
     return figure(chart.render(), ", ".join(f"{place + 1}: {name}" for place, name in enumerate(names)))
 
 

@@ -1,0 +1,90 @@
+"""Plausible mistakes of a first hour: the line says what to do next, not only what is wrong."""
+
+import shutil
+import struct
+
+import pytest
+from click.testing import CliRunner
+
+from wavebatch.cli import main
+from wavebatch.files.inputs import find_files
+
+
+@pytest.fixture
+def place(tmp_path, tiny_strip, monkeypatch):
+    """A folder to work in, with a strip."""
+    shutil.copy(tiny_strip, tmp_path / "strip.las")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def _say(*words, code=None):
+    """The only line on stderr."""
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert result.exit_code == code if code is not None else result.exit_code in (1, 2, 3, 4), result.output
+    (line,) = result.stderr.splitlines()
+    return line
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        ("run strip.las -o o --chain fast", "there is no such file; the shipped chain is --profile fast"),
+        ("run strip.las -o o --chain auto", "the shipped chain is --profile auto"),
+        ("run strip.las -o o --memory 10", "10 bytes is too little, one job needs 350 MB; write for example 500M"),
+        ("run strip.las -o o --jobs 0.5", "'0.5' is no whole number"),
+        ("run strip.las -o o --flight-height high", "'high' is no number"),
+        ("run strip.las -o strip.las", "'strip.las' is a file, not a folder"),
+        ("survey strip.las -o system.json", "written as TOML; name it system.toml; --json prints the figures"),
+        ("calibrate strip.las --targets t.csv -o cal.csv", "written as TOML; name it cal.toml"),
+        ("stats strip.las --where echo_width<5", "`wavebatch run` writes echo_width into clouds, and this is none"),
+        ("plot map strip.las --column echowidth -o m.png", "`wavebatch run` writes echo_width into clouds"),
+        ("stages decomposer", "did you mean"),
+    ],
+)
+def test_options_that_are_nearly_right(place, words, advice):
+    assert advice in _say(*words.split())
+
+
+def test_a_column_that_the_run_left_out_names_the_option_that_adds_it(place):
+    assert CliRunner().invoke(main, ["run", "strip.las", "-o", "o", "--profile", "fast", "-q"]).exit_code == 0
+    line = _say("grid", next((place / "o").glob("strip.la?")), "--column", "cross_section", "-o", "x.tif")
+    assert "writes cross_section into clouds: add --columns +cross_section" in line or "rasterio" in line
+
+
+def test_files_of_other_kinds_say_what_to_give(place):
+    (place / "list.txt").write_text("strip.las\n")
+    assert "if it is a list of files, write @list.txt" in _say("info", "list.txt")
+    (place / "strip.wdp").write_bytes(b"\0" * 100)
+    assert "it has the packets of strip.las: give that file" in _say("info", "strip.wdp")
+    (place / "strip.pls").write_bytes(b"PulseWavesPulse\0" + b"\0" * 300)
+    assert "it is PulseWaves, which wavebatch does not read: give strip.las" in _say("run", "strip.pls", "-o", "o")
+    (place / "empty.las").touch()
+    assert "it is empty" in _say("info", "empty.las")
+
+
+def test_the_home_folder_is_found_in_lists_and_quotes(place, monkeypatch):
+    monkeypatch.setenv("HOME", str(place))
+    monkeypatch.setenv("USERPROFILE", str(place))
+    (place / "sub").mkdir()
+    (place / "sub" / "list.txt").write_text("~/strip.las\n")
+    assert find_files(["@sub/list.txt"]) == find_files(["~/strip.las"]) == [place / "strip.las"]
+    (place / "~odd.las").touch()  # a file of such a name stays a file
+    assert [path.name for path in find_files(["~odd.las"])] == ["~odd.las"]
+
+
+def test_stages_lists_those_of_a_kind():
+    result = CliRunner().invoke(main, ["stages", "decompose"])
+    names = [line.split()[0] for line in result.stdout.splitlines()]
+    assert result.exit_code == 0 and "decompose.residual_loop" in names
+    assert all(name.startswith("decompose.") for name in names)
+
+
+def test_clouds_without_an_echo_in_common_are_doubted(place):
+    content = bytearray((place / "strip.las").read_bytes())
+    struct.pack_into("<d", content, 155, struct.unpack_from("<d", content, 155)[0] + 1e5)  # x of all points
+    (place / "moved.las").write_bytes(content)
+    result = CliRunner().invoke(main, ["compare", "strip.las", "moved.las"])
+    assert result.exit_code == 0 and "warning: A and B have no echo in common" in result.stderr
+    result = CliRunner().invoke(main, ["compare", "strip.las", "strip.las"])
+    assert "no echo in common" not in result.stderr

@@ -1,0 +1,21 @@
+"""Order of the rows of a table: that of a sort by waveform, then time."""
+
+import numpy as np
+
+from wavebatch.core.echoes import find_order
+
+
+def test_any_rows_get_the_order_of_a_full_sort(rng):
+    for _ in range(300):
+        m = int(rng.integers(1, 60))
+        waveform = rng.integers(0, rng.integers(1, 40), m).astype(np.int32)
+        # Whole numbers: rows of the same waveform and time keep their order.
+        time = rng.integers(-5, 5, m).astype(float)
+        expected = np.lexsort((time, waveform))
+        order = find_order(waveform, time)
+        np.testing.assert_array_equal(np.arange(m) if order is None else order, expected)
+
+
+def test_rows_in_order_are_left_alone():
+    assert find_order(np.array([0, 0, 3, 3, 3]), np.array([1.0, 2.0, -1.0, -1.0, 5.0])) is None
+    assert find_order(np.empty(0, np.int64), np.empty(0)) is None

@@ -1,0 +1,193 @@
+"""Areas of GeoJSON lie where its standard, or its member `crs`, says; without pyproj one line says what to do."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from strips import add_record
+
+from wavebatch.batch.selection import build_selection
+from wavebatch.cli import main
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.area_crs import AreaFile, describe_miss, place_rings, read_area_file
+from wavebatch.files.geojson import load_polygons
+from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.header import build_wkt, read_header
+from wavebatch.tools.simulate import simulate_strip
+
+ZONE = build_utm(32633)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A strip without a CRS."""
+    path = tmp_path_factory.mktemp("areas") / "plain.las"
+    simulate_strip("flat", path, pulses=400, seed=1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def strip(plain):
+    """The same strip in UTM zone 33."""
+    path = plain.with_name("utm.las")
+    shutil.copy(plain, path)
+    add_record(path, build_wkt(ZONE))
+    return path
+
+
+def _box(strip, part=(0.25, 0.75)):
+    """Corners of a box in the middle of a strip, f8 (4, 2)."""
+    header = read_header(strip)
+    low, high = np.array(header.mins[:2]), np.array(header.maxs[:2])
+    west, south = low + part[0] * (high - low)
+    east, north = low + part[1] * (high - low)
+    return np.array([[west, south], [east, south], [east, north], [west, north]])
+
+
+def _write(path, ring, crs=None):
+    shape = {"type": "Polygon", "coordinates": [ring.tolist()]}
+    document = {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": shape}]}
+    if crs is not None:
+        document["crs"] = {"type": "name", "properties": {"name": crs}}
+    path.write_text(json.dumps(document))
+    return path
+
+
+def _project(ring, source, target):
+    pyproj = pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    return np.stack(pyproj.Transformer.from_crs(source, target, always_xy=True).transform(*ring.T), axis=1)
+
+
+@pytest.mark.parametrize("crs", [None, "urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326"])
+def test_degrees_are_projected_into_the_strip(strip, tmp_path, crs):
+    box = _box(strip)
+    (polygon,) = load_polygons(_write(tmp_path / "a.geojson", _project(box, "EPSG:32633", "EPSG:4326"), crs))
+    (ring,) = polygon.place(strip, read_header(strip)).rings
+    # Every corner is there, and more between them where an edge is long.
+    assert all(np.hypot(*(ring - corner).T).min() < 1e-4 for corner in box)
+    assert np.hypot(*np.diff(ring, axis=0).T).max() < 120
+
+
+def test_a_long_edge_is_straight_in_degrees_as_the_standard_says():
+    pyproj = pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    header = type("H", (), {"mins": (3e5, 5e6, 0), "maxs": (3.5e5, 5.1e6, 0), "vlrs": ()})()
+    file = read_area_file("a.geojson", None, [np.zeros((1, 2))])
+    edge = np.array([[13.0, 48.0], [14.0, 48.0], [14.0, 48.1]])
+    ring, = _place(file, [edge], header)  # fmt: skip
+    back = np.stack(pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*ring.T), axis=1)
+    south = back[: np.flatnonzero(np.isclose(back[:, 0], 14.0, atol=1e-9))[0]]
+    np.testing.assert_allclose(south[:, 1], 48.0, atol=1e-9)
+    assert len(south) > 500 and np.ptp(ring[: len(south), 1]) > 100  # in UTM it bends by more than 100 m
+    # A neighbour that has the edge in the other direction has the same corners: no gap, no overlap.
+    other, = _place(file, [edge[::-1]], header)  # fmt: skip
+    assert {tuple(row) for row in ring.tolist()} == {tuple(row) for row in other.tolist()}
+
+
+def _place(file, rings, header):
+    import wavebatch.files.area_crs as module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "read_crs_definition", lambda path, header: ZONE)
+        return place_rings(file, rings, "s.las", header)
+
+
+def test_a_named_crs_is_projected_and_the_strips_own_is_not(strip, tmp_path):
+    box = _box(strip)
+    (same,) = load_polygons(_write(tmp_path / "a.geojson", box, "urn:ogc:def:crs:EPSG::32633"))
+    assert same.place(strip, read_header(strip)).rings[0].tolist() == box.tolist()
+    other = _project(box, "EPSG:32633", "EPSG:32632")
+    (far,) = load_polygons(_write(tmp_path / "b.geojson", other, "urn:ogc:def:crs:EPSG::32632"))
+    np.testing.assert_allclose(far.place(strip, read_header(strip)).rings[0], box, atol=1e-3)
+
+
+def test_coordinates_of_the_strip_stay(strip, plain, tmp_path):
+    for path in (strip, plain):
+        (polygon,) = load_polygons(_write(tmp_path / "a.geojson", _box(path)))
+        assert polygon.place(path, read_header(path)).rings[0].tolist() == _box(path).tolist()
+    # A strip with local coordinates near the origin has areas there: they are no degrees.
+    near = type("H", (), {"mins": (0, 0, 0), "maxs": (80, 60, 9), "vlrs": ()})()
+    file = AreaFile("a.geojson", None, True)
+    assert place_rings(file, [np.eye(2)], strip, near)[0].tolist() == np.eye(2).tolist()
+
+
+def test_what_cannot_be_placed_is_one_line(strip, plain, tmp_path, monkeypatch):
+    degrees = np.array([[15.6, 48.6], [15.7, 48.6], [15.7, 48.7]])
+    (polygon,) = load_polygons(_write(tmp_path / "a.geojson", degrees))
+    with pytest.raises(InputError, match=r"a.geojson: is in degrees \(OGC:CRS84\), and .*plain.las has no CRS"):
+        polygon.place(plain, read_header(plain))
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(ConfigError, match=r"a.geojson: is in OGC:CRS84, .*needs pyproj: .*pip install .*; or write"):
+        polygon.place(strip, read_header(strip))
+    # Without pyproj, areas that lie in the strip are taken as its own: the name may be that of the same CRS.
+    (inside,) = load_polygons(_write(tmp_path / "b.geojson", _box(strip), "my grid"))
+    assert inside.place(strip, read_header(strip)).rings[0].tolist() == _box(strip).tolist()
+    with pytest.raises(ConfigError, match="its member crs has no name"):
+        read_area_file("c.geojson", {"type": "link"}, [])
+
+
+def test_an_unknown_crs_is_one_line(strip, tmp_path):
+    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    (polygon,) = load_polygons(_write(tmp_path / "a.geojson", _box(strip), "my grid"))
+    with pytest.raises(InputError, match="a.geojson: cannot be projected into the CRS of .*utm.las") as caught:
+        polygon.place(strip, read_header(strip))
+    assert "\n" not in str(caught.value)
+
+
+def test_both_extents_are_named(strip):
+    header = read_header(strip)
+    assert describe_miss([_box(strip)], header) == "" == describe_miss([], header)
+    text = describe_miss([_box(strip) + 1e5], header)
+    assert f"{_box(strip)[0, 0] + 1e5:.10g}" in text and f"{header.mins[0]:.10g}" in text and "another CRS" in text
+
+
+def test_a_bare_polygon_and_a_single_feature_are_geojson_too(strip, tmp_path):
+    shape = {"type": "Polygon", "coordinates": [_box(strip).tolist()]}
+    for document in (shape, {"type": "Feature", "properties": None, "geometry": shape}):
+        (tmp_path / "a.geojson").write_text(json.dumps(document))
+        (polygon,) = load_polygons(tmp_path / "a.geojson")
+        assert polygon.rings[0].tolist() == _box(strip).tolist()
+
+
+def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
+    """The same points, areas and echoes by degrees as by coordinates of the strip."""
+    box = _box(strip)
+    degrees = _write(tmp_path / "deg.geojson", _project(box, "EPSG:32633", "EPSG:4326"))
+    own = _write(tmp_path / "own.geojson", box)
+    numbers, counted = [], []
+    for name, file in (("a", degrees), ("b", own)):
+        result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "-q"])
+        assert result.exit_code == 0, result.output
+        numbers.append(read_header(tmp_path / name / "utm.laz").point_count)
+        result = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(file), "--json"])
+        counted.append([area["points"] for area in json.loads(result.stdout)["files"][0]["areas"]])
+        again = ["run", str(strip), "-o", str(tmp_path / name), "--polygon", str(file), "--resume"]
+        assert "skipped" in CliRunner().invoke(main, again).stderr  # the report has the corners of the file
+    # An edge that is straight in degrees bends by a centimetre in UTM.
+    assert 20 < numbers[0] < read_header(strip).point_count and abs(numbers[0] - numbers[1]) < 5
+    assert len(counted[0]) == len(counted[1]) == 2 and abs(counted[0][0] - counted[1][0]) < 5
+    targets = {"type": "FeatureCollection", "features": [
+        {"type": "Feature", "properties": {"reflectance": 0.3}, "geometry": {"type": "Polygon", "coordinates": [
+            _project(_box(strip, (-0.2, 1.2)), "EPSG:32633", "EPSG:4326").tolist()]}}]}  # fmt: skip
+    (tmp_path / "t.geojson").write_text(json.dumps(targets))
+    words = ["calibrate", strip, "--targets", tmp_path / "t.geojson", "-o", tmp_path / "cal.toml"]
+    result = CliRunner().invoke(main, list(map(str, words)))
+    assert "lies outside" not in result.output and "0 clean single echoes" not in result.output
+
+
+def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_path):
+    away = _write(tmp_path / "away.geojson", _box(strip) + 1e4)
+    result = CliRunner().invoke(main, ["run", str(strip), "-o", str(tmp_path / "o"), "--polygon", str(away), "-q"])
+    assert "no point is written" in result.stderr and "lies outside the strip (x " in result.stderr
+    result = CliRunner().invoke(main, ["stats", str(strip), "--polygons", str(away)])
+    assert "lies outside the strip (x " in result.output
+
+
+def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_path):
+    degrees = _write(tmp_path / "deg.geojson", _project(_box(strip), "EPSG:32633", "EPSG:4326"))
+    chosen = build_selection(polygon=degrees)
+    facts = type("F", (), {"path": strip, "header": read_header(strip)})()
+    placed = chosen.place(facts)
+    assert placed.describe() == chosen.describe() and placed.areas != chosen.areas

@@ -1,0 +1,84 @@
+"""LAZ files whose chunks were compressed apart: the bytes are those of a file that was compressed in one go."""
+
+import numpy as np
+import pytest
+from numpy.lib import recfunctions
+from writer_tools import BACKENDS, read_raw
+
+from wavebatch.core.errors import InputError
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
+from wavebatch.files.las.header import LasHeader
+from wavebatch.files.las.laz_encode import CHUNK_POINTS
+from wavebatch.files.las.write_points import PointFile, Statistics
+
+RECORDS = [ExtraRecord.build("width", "<f4", "a test", no_data=-9999.0)]
+
+
+def make_rows(point_format, n, seed=0):
+    rng = np.random.default_rng(seed)
+    dtype = build_dtype(point_format, RECORDS)
+    rows = rng.integers(0, 256, (n, dtype.itemsize), dtype=np.uint8).view(dtype)[:, 0]
+    for axis in "XYZ":
+        rows[axis] = np.cumsum(rng.integers(-50, 60, n))
+    if "gps_time" in dtype.names:
+        rows["gps_time"] = np.arange(n) * 1e-5
+    rows[dtype.names[-1]] = rng.normal(0, 1, n)
+    return rows
+
+
+def open_file(target, point_format):
+    version = (1, 4) if point_format > 5 else (1, 3)
+    header = LasHeader.new(version, point_format, (0.01,) * 3, (0.0,) * 3)
+    return PointFile(target, header, build_dtype(point_format, RECORDS), RECORDS, overwrite=True)
+
+
+@pytest.mark.parametrize("point_format", [0, 1, 3, 4, 5, 6, 7, 8])
+@pytest.mark.parametrize("n", [0, 1, CHUNK_POINTS, 2 * CHUNK_POINTS + 17])
+def test_chunks_give_the_bytes_of_the_whole(tmp_path, point_format, n):
+    rows = make_rows(point_format, n)
+    with open_file(tmp_path / "whole.laz", point_format) as file:
+        for part in np.array_split(rows, 7):
+            file.write(part)
+        file.commit()
+    with open_file(tmp_path / "chunks.laz", point_format) as file:
+        maker = file.chunk_maker
+        for at in range(0, n, CHUNK_POINTS):
+            file.write_chunk(*maker.make(rows[at : at + CHUNK_POINTS].copy()))
+        file.commit()
+    assert (tmp_path / "chunks.laz").read_bytes() == (tmp_path / "whole.laz").read_bytes()
+    for backend in BACKENDS if n else ():
+        assert read_raw(tmp_path / "chunks.laz", backend).tobytes() == rows.tobytes()
+
+
+@pytest.mark.parametrize(("name", "point_format"), [("out.las", 6), ("out.laz", 9), ("out.laz", 10)])
+def test_other_files_are_written_by_one_process(tmp_path, name, point_format):
+    with open_file(tmp_path / name, point_format) as file:
+        assert file.chunk_maker is None
+
+
+def test_statistics_do_not_depend_on_how_rows_are_cut():
+    """Also where 0.0 and -0.0 are the extremes: which one a minimum returns depends on the order of the rows."""
+    rows = make_rows(6, 1000)
+    width = rows.dtype.names[-1]
+    rows[width] = np.where(np.arange(1000) % 3, 0.0, -0.0)
+    rows["gps_time"] = -0.0
+    rows["gps_time"][500:] = 0.0
+    seen = set()
+    for pieces in 1, 2, 3, 10:
+        whole = Statistics(rows.dtype, RECORDS)
+        for part in np.array_split(rows, pieces):
+            one = Statistics(rows.dtype, RECORDS)
+            one.add(part)
+            whole.merge(one)
+        header = LasHeader.new((1, 5), 6, (0.01,) * 3, (0.0,) * 3)
+        whole.fill(header)
+        seen.add((header.point_count, header.by_return, header.mins, header.maxs, str(header.gps_range),
+                  whole.ranged()[0].data))  # fmt: skip
+    assert len(seen) == 1
+
+
+def test_rows_of_another_layout_are_refused(tmp_path):
+    with open_file(tmp_path / "a.laz", 6) as file:
+        other = recfunctions.drop_fields(make_rows(6, 3), "X")
+        with pytest.raises(InputError, match="another layout"):
+            file.chunk_maker.make(other)

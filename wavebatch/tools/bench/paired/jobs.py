@@ -1,0 +1,240 @@
+"""`wavebatch bench --jobs-model`: what each part of a run costs in each process, and what many jobs then reach.
+
+The parts are processor seconds of runs with one and two jobs that take turns; other load of the machine changes them
+far less than it changes elapsed time. A machine of 64 cores is not needed to see what would bound 64 jobs: what one
+process does alone, and what it does per waveform.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch.batch.processes import Workers
+from wavebatch.batch.run import run_batch
+from wavebatch.batch.unit import prepare_strip
+from wavebatch.core.errors import InputError
+from wavebatch.tools.api.run import plan_run
+from wavebatch.tools.bench.worker import Worker
+
+JOBS = (1, 2, 4, 16, 64)
+"""Numbers of jobs of the table."""
+MANY = 1000
+"""Strips of the second column of the table: while one is prepared, others are processed."""
+SMALL_STRIPS = 20
+"""Strips of a batch that measures what each costs the process that writes."""
+_IMPORTS = "import resource, wavebatch.tools.api.run, wavebatch.cli.run; r = resource.getrusage(resource.RUSAGE_SELF)"
+
+
+@dataclass(frozen=True, slots=True)
+class Lap:
+    """One run of a strip."""
+
+    elapsed: float
+    """[s]."""
+    own: float
+    """Processor seconds of the process that writes."""
+    workers: float
+    """Those of the workers."""
+    waveforms: int
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What a run consists of; medians."""
+
+    waveforms: int
+    """Of the strip."""
+    start: float
+    """Before a run begins: processor seconds of the imports."""
+    start_worker: float
+    """The same of a worker; all start at once, while the parent starts."""
+    prepare: float
+    """Scan and survey of a strip, by one process: processor seconds."""
+    single: float
+    """One job: seconds per waveform."""
+    work: float
+    """Several jobs: seconds of the workers per waveform."""
+    write: float
+    """Several jobs: seconds of the process that writes, per waveform."""
+    strip: float
+    """The same per strip, however small."""
+    tail: float
+    """Workers wait for the last unit of a strip [s]."""
+
+    def predict(self, jobs: int, strips: int = 1) -> float:
+        """Return the seconds of a batch of such strips on a machine with a core for every process."""
+        n = self.waveforms
+        if jobs == 1:
+            return self.start + strips * (self.prepare + n * self.single)
+        start = max(self.start, self.start_worker)
+        writing = strips * (self.strip + n * self.write)
+        if strips == 1:
+            return start + self.prepare + max(n * self.work / jobs + self.tail * (1 - 1 / jobs), writing)
+        return start + max(strips * (self.prepare + n * self.work) / jobs, writing) + self.prepare
+
+    @property
+    def most(self) -> float:
+        """Return the number of jobs from which the process that writes is the slowest."""
+        return (self.prepare + self.waveforms * self.work) / (self.strip + self.waveforms * self.write)
+
+
+def measure_jobs(
+    strip: Path, small: Path, folder: Path, rounds: int, say: Callable[[str], None]
+) -> tuple[Parts, dict[int, list[Lap]]]:
+    """Measure the parts of a run of a strip.
+
+    Parameters
+    ----------
+    strip : Path
+        The longer the better: 10 units or more.
+    small : Path
+        A strip of few waveforms.
+    folder : Path
+        For the outputs.
+    rounds : int
+        Runs with one job and with two, in turn.
+    say : callable
+        Gets a line of progress.
+
+    Returns
+    -------
+    parts : Parts
+    laps : dict
+        The runs by number of jobs.
+    """
+    laps: dict[int, list[Lap]] = {1: [], 2: []}
+    with Worker() as worker:
+        start_worker = worker.call(measure_worker)
+        prepare = _middle([worker.call(time_preparation, strip, folder) for _ in range(rounds)])
+        for turn in range(rounds):
+            for jobs in (1, 2) if turn % 2 else (2, 1):
+                say(f"running {strip.name} with {jobs} jobs, turn {turn + 1} of {rounds}")
+                laps[jobs].append(worker.call(run_lap, strip, folder, jobs))
+        say(f"running {SMALL_STRIPS} small strips")
+        few = worker.call(run_small, small, folder / "small")
+    one, two = laps[1], laps[2]
+    n = one[0].waveforms
+    if not n:
+        raise InputError(f"{strip}: has no waveforms to be timed")
+    work = _middle([lap.workers - prepare - 2 * start_worker for lap in two]) / n
+    units = max(n // 50_000, 1)
+    parts = Parts(
+        waveforms=n,
+        start=time_imports(),
+        start_worker=start_worker,
+        prepare=prepare,
+        single=_middle([lap.own - prepare for lap in one]) / n,
+        work=work,
+        write=_middle([lap.own for lap in two]) / n,
+        strip=few,
+        tail=work * n / units / 2,
+    )
+    return parts, laps
+
+
+def _middle(values: Sequence[float]) -> float:
+    return float(np.median(values))
+
+
+def time_imports(repeats: int = 3) -> float:
+    """Processor seconds until `wavebatch run` can begin."""
+    command = [sys.executable, "-c", f"{_IMPORTS}; print(r.ru_utime + r.ru_stime)"]
+    found = [subprocess.run(command, check=True, capture_output=True, text=True).stdout for _ in range(repeats)]
+    return _middle([float(text) for text in found])
+
+
+def measure_worker() -> float:
+    """Processor seconds of a worker process that does nothing."""
+    _, _, before = _usage()
+    with Workers(2) as workers:
+        for future in [workers.submit(time.sleep, 0.5), workers.submit(time.sleep, 0.5)]:
+            future.result()
+    return (_usage()[2] - before) / 2
+
+
+def time_preparation(strip: Path, folder: Path) -> float:
+    """Processor seconds of scan and survey."""
+    (job,), _ = plan_run([strip], folder, overwrite=True)
+    begin = time.process_time()
+    prepare_strip(job).scan.close()
+    return time.process_time() - begin
+
+
+def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
+    """Take the strip from file to file."""
+    planned = plan_run([strip], folder, jobs=jobs, overwrite=True)
+    before = _usage()
+    result = run_batch(*planned)
+    after = _usage()
+    for outcome in result.outcomes:
+        if outcome.error is not None:
+            raise outcome.error
+    elapsed, own, workers = (late - early for early, late in zip(before, after, strict=True))
+    return Lap(elapsed, own, workers, result.report.count("waveforms"))
+
+
+def run_small(strip: Path, folder: Path) -> float:
+    """Processor seconds per strip of the process that writes, from a batch of copies of a small strip."""
+    folder.mkdir(parents=True)
+    copies = [folder / f"{number}{strip.suffix}" for number in range(SMALL_STRIPS)]
+    for copy in copies:
+        copy.write_bytes(strip.read_bytes())
+    planned = plan_run(copies, folder / "clouds", jobs=2)
+    _, before, _ = _usage()
+    run_batch(*planned)
+    return (_usage()[1] - before) / SMALL_STRIPS
+
+
+def _usage() -> tuple[float, float, float]:
+    """Seconds that have passed, and processor seconds of this process and of its ended children."""
+    try:
+        import resource
+    except ImportError as error:
+        raise InputError("--jobs-model: this system does not say what processes used; run it on Linux") from error
+    own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return time.perf_counter(), own.ru_utime + own.ru_stime, children.ru_utime + children.ru_stime
+
+
+def format_jobs(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> str:
+    """The parts, the runs, and the table of the model."""
+    lines = [
+        f"{strip}: {parts.waveforms} waveforms; processor time, medians of {len(laps[1])} runs with one job and two",
+        f"  start: {parts.start:.2f} s; of a worker, at the same time: {parts.start_worker:.2f} s",
+        f"  scan and survey of the strip, by one process: {parts.prepare:.2f} s",
+        f"  one job: {1e6 * parts.single:.2f} us per waveform",
+        f"  two jobs: {1e6 * parts.work:.2f} us per waveform in the workers",
+        f"  the process that writes: {1e6 * parts.write:.3f} us per waveform, or {1e3 * parts.strip:.1f} ms per strip",
+        f"  elapsed, without the start: {_list_elapsed(laps[1])} s with one job, {_list_elapsed(laps[2])} s with two",
+        "",
+        "Predicted from these parts, with a core for every process:",
+        f"{'jobs':>5}  {'this strip':>12}  {'times':>6}  {f'{MANY} strips':>12}  {'times':>6}  waveforms/s",
+    ]
+    for jobs in JOBS:
+        one, many = parts.predict(jobs), parts.predict(jobs, MANY)
+        lines.append(
+            f"{jobs:5}  {one:10.2f} s  {parts.predict(1) / one:6.2f}  {many:10.0f} s  "
+            f"{parts.predict(1, MANY) / many:6.2f}  {MANY * parts.waveforms / many:11,.0f}"
+        )
+    return "\n".join([*lines, f"The process that writes is the slowest from {parts.most:.0f} jobs on."])
+
+
+def _list_elapsed(laps: Sequence[Lap]) -> str:
+    return ", ".join(f"{lap.elapsed:.2f}" for lap in laps)
+
+
+def to_document(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> dict[str, Any]:
+    """The same for `--json`."""
+    predicted = {str(jobs): {"strip_s": parts.predict(jobs), "many_s": parts.predict(jobs, MANY)} for jobs in JOBS}
+    runs = {str(jobs): [asdict(lap) for lap in of] for jobs, of in laps.items()}
+    return {
+        "strip": strip, "parts": asdict(parts), "strips": MANY, "predicted": predicted, "most_jobs": parts.most,
+        "runs": runs,
+    }  # fmt: skip

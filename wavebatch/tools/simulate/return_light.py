@@ -1,0 +1,212 @@
+"""How much light each return of a cloud sends back, how wide its echo is, and which share of the beam it takes.
+
+`from_returns` makes waveforms of it. Shares are the partial footprints A_i over A of Ussyshkin and Theriault (2011):
+the light that one return takes is missing for the others of its pulse, so that its shares are at most 1 together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.files.cloud.column_reader import ColumnReader
+from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+
+EQUAL = "equal"
+"""Word in place of a column of shares: the returns of a pulse take the same share each, as many as it had."""
+
+WIDEST = 50.0
+"""Largest standard deviation of an echo [ns]; the least is half a sample."""
+
+_TOLERANCE = 1e-4
+"""Shares that are stored as float32 or in steps of 1e-4 may be above 1 by so much."""
+
+
+@dataclass(frozen=True, slots=True)
+class Radar:
+    """Parameters of the lidar equation besides range and reflectance, see kernels.physics.radar."""
+
+    height: float
+    """Height of the sensor, in the height system of the cloud [m]."""
+    power: float = 1.0
+    """Peak power of the pulse [W]; matters only with a gain."""
+    aperture: float = 0.1
+    """Diameter of the receiver [m]."""
+    divergence: float = 0.5e-3
+    """Full angle of the beam [rad]."""
+    efficiency: float = 0.5
+    """Share of the light that the optics let through."""
+    attenuation: float = 0.22
+    """Attenuation by the air [dB/km]."""
+
+    def __post_init__(self) -> None:
+        positive = (self.power, self.aperture, self.divergence, self.efficiency)
+        if not (min(positive) > 0 and self.attenuation >= 0):
+            raise ConfigError("power, aperture, divergence and efficiency must be above 0, attenuation not below 0")
+
+
+@dataclass(slots=True)
+class LightCounts:
+    """What was assumed about widths and shares."""
+
+    own_width: int = 0
+    """Returns with a width in the cloud; the others have the width of the pulse."""
+    limited_width: int = 0
+    """Of these, returns whose width lies outside of half a sample to WIDEST, and was set to that limit."""
+    own_share: int = 0
+    """Returns with a share in the cloud."""
+    assumed_share: int = 0
+    """Returns that take, together and evenly, what the others of their pulse leave."""
+    over_one: int = 0
+    """Pulses whose shares were more than 1 together, and were divided by their sum."""
+    pulses: int = 0
+    """Pulses with shares."""
+    shares: float = 0.0
+    """Sum of all shares."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Light:
+    """k returns of whole pulses."""
+
+    strength: np.ndarray
+    """Peak of each before the gain: intensity, or received power [W], f8 (k,)."""
+    sigma: np.ndarray
+    """Standard deviation of each echo [ns], f8 (k,)."""
+
+
+@dataclass(slots=True)
+class LightModel:
+    """Gives the light of the returns of one cloud; `open_light` makes it."""
+
+    path: Path
+    radar: Radar | None
+    """None: intensities are peaks."""
+    sigma: float
+    """Of the pulse [ns]."""
+    spacing: float
+    read_width: Callable[[np.ndarray], np.ndarray] | None
+    """From raw records to widths [ns]; None: the column echo_width, where the cloud has it."""
+    read_share: Callable[[np.ndarray], np.ndarray] | None
+    share_column: str | None
+    """Column of the shares, EQUAL, or None for returns that fill the beam each."""
+    counts: LightCounts = field(default_factory=LightCounts)
+
+    def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> Light:
+        """The light of returns (k,), RETURN_DTYPE, with their raw records; starts: first return of each pulse.
+
+        Raises InputError for shares that are none, and for points above the sensor.
+        """
+        sigma = self._measure_sigma(rows["echo_width"] if self.read_width is None else self.read_width(records))
+        intensity = rows["intensity"].astype(np.float64)
+        if self.radar is None:
+            return Light(intensity, sigma)
+        power = _receive(intensity / 65535, rows, self.radar, self.path)
+        # The power is that of an echo as short as the pulse: a wider one spreads the same energy over a longer time.
+        power *= self.sigma / sigma
+        if self.share_column is not None:
+            power *= self._measure_shares(rows, records, starts)
+        return Light(power, sigma)
+
+    def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
+        known = width > 0
+        measured = np.where(known, width, 0.0) / FWHM_PER_SIGMA
+        limited = np.clip(measured, 0.5 * self.spacing, WIDEST)
+        self.counts.own_width += int(np.count_nonzero(known))
+        self.counts.limited_width += int(np.count_nonzero(known & (limited != measured)))
+        return np.where(known, limited, self.sigma)
+
+    def _measure_shares(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        if self.read_share is None:
+            share = share_equally(rows["total"], starts)
+            self._count_shares(share, 0, 0, starts)
+            return share
+        share = self.read_share(records).astype(float)
+        wrong = np.flatnonzero((share < 0) | (share > 1 + _TOLERANCE))
+        if len(wrong):
+            raise InputError(
+                f"{self.path}: {self.share_column} holds {share[wrong[0]]:g}, which is no share of a footprint: shares "
+                "are 0 to 1; give a column with such values to --shares"
+            )
+        known = int(np.count_nonzero(np.isfinite(share)))
+        share, over = fill_shares(share, starts)
+        self._count_shares(share, known, over, starts)
+        return share
+
+    def _count_shares(self, share: np.ndarray, known: int, over: int, starts: np.ndarray) -> None:
+        counts = self.counts
+        counts.own_share += known
+        counts.assumed_share += len(share) - known
+        counts.over_one += over
+        counts.pulses += len(starts)
+        counts.shares += float(share.sum())
+
+
+def share_equally(total: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Equal shares of the returns of whole pulses, f8 (k,).
+
+    total: number of returns that the points state, (k,): returns that the cloud lacks take their share, too. starts:
+    first return of each pulse.
+    """
+    number = np.diff(np.append(starts, len(total)))
+    return 1.0 / np.maximum(np.repeat(number, number), total)
+
+
+def fill_shares(share: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, int]:
+    """Shares of the returns of whole pulses, at most 1 together, without gaps.
+
+    share: f8 (k,), NaN for no data: such returns take, evenly, what the others of their pulse leave. starts: first
+    return of each pulse. Returns the shares, and the number of pulses with more than 1, divided by their sum.
+    """
+    if not len(starts):
+        return share, 0
+    known = np.isfinite(share)
+    pulse = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(share))))
+    total = np.add.reduceat(np.where(known, share, 0.0), starts)
+    unknown = np.add.reduceat((~known).astype(np.float64), starts)
+    rest = np.clip(1.0 - total, 0.0, 1.0) / np.maximum(unknown, 1.0)
+    filled = np.where(known, share, rest[pulse]) / np.maximum(total, 1.0)[pulse]
+    return filled, int(np.count_nonzero(total > 1.0 + _TOLERANCE))
+
+
+def open_light(
+    path: Path, radar: Radar | None, sigma: float, spacing: float, *, widths: str | None, shares: str | None
+) -> LightModel:
+    """The model of a cloud; widths, shares: columns, or EQUAL for shares.
+
+    Raises ConfigError if the cloud has no such column, or in another unit.
+    """
+    read = {"widths": None, "shares": None}
+    wanted = {"widths": (widths, ("-", "ns")), "shares": (None if shares == EQUAL else shares, ("-",))}
+    for name, (column, units) in wanted.items():
+        if column is None:
+            continue
+        with ExitStack() as stack:
+            reader = stack.enter_context(ColumnReader(path, column))
+            if reader.facts.unit not in units:
+                raise ConfigError(f"{path}: --{name} {column}: is in [{reader.facts.unit}], needed is [{units[-1]}]")
+            read[name] = reader.find_value(column)
+    return LightModel(path, radar, sigma, spacing, read["widths"], read["shares"], shares)
+
+
+def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:
+    """Received power of surfaces that fill the beam [W]."""
+    distance = (radar.height - rows["xyz"][:, 2]) / np.cos(np.radians(np.clip(rows["angle"], -80, 80)))
+    if len(distance) and distance.min() <= 0:
+        highest = rows["xyz"][:, 2].max()
+        raise InputError(f"{path}: points as high as {highest:g} m lie above the sensor at {radar.height:g} m")
+    return receive_power(
+        spread_cross_section(reflectance, distance, radar.divergence),
+        distance,
+        transmitted=radar.power,
+        aperture=radar.aperture,
+        divergence=radar.divergence,
+        efficiency=radar.efficiency,
+        attenuation=radar.attenuation,
+    )
