@@ -123,6 +123,8 @@ def draw_value(option: click.Option, rng: random.Random) -> str | None:
         )
     if isinstance(kind, click.Choice):
         return rng.choice([*map(str, kind.choices), *map(str, kind.choices), "x", "", str(kind.choices[0]).upper()])
+    if name == "jobs":  # processes take seconds to start, and time in them is not seen
+        return rng.choice(["-1", "1", "2", "", "nan", "1.5", "one"])
     if name in _MANY:
         return rng.choice(_FEW)
     if isinstance(kind, OutputPath):  # outputs may replace other files, but not the sound inputs of all cases
