@@ -155,7 +155,7 @@ class Attacker:
         words = [sys.executable, "-m", "wavebatch", *self._words(name, out)]
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            start_new_session=True, env={**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"},
+            start_new_session=True, preexec_fn=_listen, env={**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"},
         )  # fmt: skip
 
     def _words(self, name: str, out: Path) -> list[str]:
@@ -287,6 +287,12 @@ def in_child(work: Callable[[], object]) -> None:
         said = file.read()
     if os.waitpid(pid, 0)[1]:
         raise AssertionError(said)
+
+
+def _listen() -> None:
+    """In the new process: a shell lets its background jobs, such as this program, ignore Ctrl-C."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _empty(folder: Path) -> None:
