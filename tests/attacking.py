@@ -153,9 +153,10 @@ class Attacker:
 
     def _start(self, name: str, out: Path, temporary: Path) -> subprocess.Popen:
         words = [sys.executable, "-m", "wavebatch", *self._words(name, out)]
+        env = {**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"}
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            start_new_session=True, preexec_fn=_listen, env={**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"},
+            start_new_session=True, preexec_fn=_listen, env=env,
         )  # fmt: skip
 
     def _words(self, name: str, out: Path) -> list[str]:

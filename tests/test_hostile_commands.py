@@ -262,3 +262,14 @@ def test_closed_streams_do_no_harm(tmp_path, closed):
     assert done.returncode == 0 and (tmp_path / "out" / "a.report.json").exists()
     words = f"'{sys.executable}' -m wavebatch run '{tmp_path}/none.las' -o '{tmp_path}/out' {closed}"
     assert subprocess.run(["sh", "-c", words], capture_output=True, check=False).returncode == 4
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is full")
+def test_a_full_stderr_does_not_stop_the_batch(tmp_path):
+    """The first message of a strip ended the whole run."""
+    for name in ("a", "b"):
+        simulate_strip("flat", tmp_path / f"{name}.las", pulses=60, seed=1)
+    words = [sys.executable, "-m", "wavebatch", "run", tmp_path, "-o", tmp_path / "out", "--profile", "fast"]
+    with open("/dev/full", "wb") as full:
+        assert subprocess.run(words, stderr=full, check=False).returncode == 0
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.json")) == ["a.report.json", "b.report.json"]
