@@ -99,6 +99,7 @@ CASES = {
     "bench --scene empty --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability": "bench/1",
     "bench --real STRIP --no-stability": "bench-real/1",
     "bench --against ROOT --scene flat --pulses 300 --repeat 1": "bench-against/1",
+    "bench --jobs-model --scene flat --pulses 300 --repeat 1": "bench-jobs/1",
     "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
