@@ -63,7 +63,15 @@ SIGNALS: dict[str, tuple[int, ...]] = {
     "INT INT": (signal.SIGINT, signal.SIGINT), "TERM INT TERM": (signal.SIGTERM, signal.SIGINT, signal.SIGTERM),
     "INT KILL": (signal.SIGINT, signal.SIGKILL),
 }  # fmt: skip
-ATTACKS = (*SIGNALS, "group INT", "group TERM", "worker KILL", "worker STOP CONT", "worker STOP INT", "worker STOP KILL")
+ATTACKS = (
+    *SIGNALS,
+    "group INT",
+    "group TERM",
+    "worker KILL",
+    "worker STOP CONT",
+    "worker STOP INT",
+    "worker STOP KILL",
+)
 
 
 class Attack(NamedTuple):
@@ -145,9 +153,10 @@ class Attacker:
 
     def _start(self, name: str, out: Path, temporary: Path) -> subprocess.Popen:
         words = [sys.executable, "-m", "wavebatch", *self._words(name, out)]
+        env = {**os.environ, "TMPDIR": str(temporary), "PYTHONFAULTHANDLER": "1"}
         return subprocess.Popen(
             words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-            start_new_session=True, env={**os.environ, "TMPDIR": str(temporary)},
+            start_new_session=True, preexec_fn=_listen, env=env,
         )  # fmt: skip
 
     def _words(self, name: str, out: Path) -> list[str]:
@@ -170,7 +179,7 @@ class Attacker:
         try:
             said = process.communicate(timeout=LONGEST)[1]
         except subprocess.TimeoutExpired:
-            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid)))
+            return is_ready, "hangs", "; ".join(map(_describe, _session(process.pid))) + _stacks(process)
         return is_ready, process.returncode, said
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
@@ -234,16 +243,18 @@ class Attacker:
         if code == 0 and whole.keys() != sound.keys():
             return f"exit code 0, but {sorted(sound.keys() - whole.keys())} are missing"
         for name in whole:
-            if name.endswith(".report.json") and not {name.replace(".report.json", s) for s in (".laz", ".las")} & set(whole):
+            if name.endswith(".report.json") and not {name.replace(".report.json", s) for s in (".laz", ".las")} & set(
+                whole
+            ):
                 return f"{name} without its cloud"
         return ""
 
     def _judge_again(self, name: str, out: Path) -> str:
         """The same command again ends as if nothing had happened."""
-        again = "--resume" if name.startswith("run") else "--overwrite"
+        again = ["--resume", "--jobs", "1"] if name.startswith("run") else ["--overwrite"]
 
         def work() -> None:
-            done = CliRunner().invoke(main, [*self._words(name, out), again])
+            done = CliRunner().invoke(main, [*self._words(name, out), *again])
             assert done.exit_code == 0, done.output
 
         try:
@@ -253,7 +264,9 @@ class Attacker:
         found = {**_contents(out), "all.json": self.sound[name].get("all.json")}  # it says what is new
         if found["all.json"] is None:
             del found["all.json"]
-        different = sorted(key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key))
+        different = sorted(
+            key for key in found.keys() | self.sound[name].keys() if found.get(key) != self.sound[name].get(key)
+        )
         return f"run again: other bytes in {different}" if different else ""
 
 
@@ -275,6 +288,12 @@ def in_child(work: Callable[[], object]) -> None:
         said = file.read()
     if os.waitpid(pid, 0)[1]:
         raise AssertionError(said)
+
+
+def _listen() -> None:
+    """In the new process: a shell lets its background jobs, such as this program, ignore Ctrl-C."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 def _empty(folder: Path) -> None:
@@ -335,6 +354,18 @@ def _describe(pid: int) -> str:
     return " ".join(found)
 
 
+def _stacks(process: subprocess.Popen) -> str:
+    """Where the threads of a process that hangs are, as faulthandler writes it."""
+    for pid in _session(process.pid):
+        if pid != process.pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+    process.send_signal(signal.SIGABRT)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return process.communicate(timeout=10)[1][-3000:]
+    return ""
+
+
 def _session(number: int) -> list[int]:
     """Living processes of a session."""
     found = []
@@ -347,14 +378,18 @@ def _session(number: int) -> list[int]:
     return found
 
 
-def attack_all(folder: Path, runs: int, seed: int) -> Iterator[tuple[Attack, str]]:
-    """Run so many attacks; yield those that break a promise, then say how all ended."""
+def attack_all(folder: Path, runs: int, seed: int, minutes: float = 1e9) -> Iterator[tuple[Attack, str]]:
+    """Run so many attacks, or so long; yield those that break a promise, then say how all ended."""
     attacker, rng = Attacker(folder), random.Random(seed)
+    end = time.monotonic() + 60 * minutes
     for _ in range(runs):
+        if time.monotonic() > end:
+            break
         attack = attacker.draw(rng)
         why = attacker.attack(attack)
         if why:
             yield attack, why
+    print(f"{sum(attacker.ended.values())} attacks with seed {seed}")
     for (kind, code), number in sorted(attacker.ended.items(), key=str):
         print(f"{kind:20} exit code {code!s:25} {number:6}")
 
@@ -363,13 +398,14 @@ def _start() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     options = parser.parse_args()
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
-        for attack, why in attack_all(Path(folder), options.runs, options.seed):
+        for attack, why in attack_all(Path(folder), options.runs, options.seed, options.minutes):
             failures += 1
             print(f"{attack.name}, {attack.kind}, at {attack.share:.3f} of its time: {why}", flush=True)
-    print(f"{options.runs} attacks with seed {options.seed}, {failures} failures")
+    print(f"{failures} failures")
     return failures > 0
 
 

@@ -68,7 +68,15 @@ def _repack(data: bytes, name: str, edit: Edit) -> bytes:
             for member in old.namelist():
                 content = old.read(member)
                 new.writestr(zipfile.ZipInfo(member), apply_edits(content, [edit]) if member == name else content)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, OSError, EOFError, ValueError, NotImplementedError, zipfile.zlib.error):
+    except (
+        zipfile.BadZipFile,
+        zipfile.LargeZipFile,
+        OSError,
+        EOFError,
+        ValueError,
+        NotImplementedError,
+        zipfile.zlib.error,
+    ):
         return data  # an earlier edit has damaged the file
     return packed.getvalue()
 
@@ -115,7 +123,12 @@ def _damage_bytes(data: bytes, fields: list[tuple[int, str, int, int]], rng: ran
     if choice < 0.3:
         return ["insert", at, rng.randbytes(rng.choice([1, 4])).hex(), rng.choice([1, 15])]
     if choice < 0.4:
-        return ["fill", at, rng.choice([100, 1000, 10_000]), rng.choice(["00", "ff", "80", "7f", rng.randbytes(7).hex()])]
+        return [
+            "fill",
+            at,
+            rng.choice([100, 1000, 10_000]),
+            rng.choice(["00", "ff", "80", "7f", rng.randbytes(7).hex()]),
+        ]
     width = rng.choice([1, 2, 4, 8])
     values = [b"\xff" * width, bytes(width), rng.randbytes(width), bytes(width - 1) + b"\x80", b"\0" * 6 + b"\xf8\x7f"]
     return ["set", at, rng.choice(values).hex()]
@@ -137,12 +150,23 @@ def odd_value(now: bytes, form: str, rng: random.Random) -> bytes:
     size = struct.calcsize("<" + form)
     now = now.ljust(size, b"\0")
     if form.endswith("s"):
-        texts = [b"", b"\xff" * size, b"\x1b[2J", b"a" * size, rng.randbytes(size), now[::-1], b"LASF_Spec", b"\0" + now]
+        texts = [
+            b"",
+            b"\xff" * size,
+            b"\x1b[2J",
+            b"a" * size,
+            rng.randbytes(size),
+            now[::-1],
+            b"LASF_Spec",
+            b"\0" + now,
+        ]
         return rng.choice(texts)[:size].ljust(size, b"\0")
     if form in "fd":
         value = struct.unpack("<" + form, now)[0]
         values = [0.0, -0.0, float("nan"), float("inf"), float("-inf"), 1e-38, 3e38, -3e38, 1e-9, 1.0, -1.0, 1e6]
-        values += [value * factor for factor in (-1, 2, 0.5, 1000, 1e-3, 1.001)] + [5e-324, 1e300, -1e300] * (form == "d")
+        values += [value * factor for factor in (-1, 2, 0.5, 1000, 1e-3, 1.001)] + [5e-324, 1e300, -1e300] * (
+            form == "d"
+        )
         try:
             return struct.pack("<" + form, rng.choice(values))
         except (OverflowError, ValueError):
@@ -218,12 +242,24 @@ def list_fields(data: bytes, kind: str) -> list[tuple[int, str, int, int]]:
 
 _HEADER = [
     (4, "H"), (6, "H"), (8, "16s"), (24, "B"), (25, "B"), (26, "32s"), (58, "32s"), (94, "H"), (96, "I"), (100, "I"),
-    (104, "B"), (105, "H"), (107, "I"), *((111 + 4 * k, "I") for k in range(5)), *((131 + 8 * k, "d") for k in range(12)),
+    (104, "B"), (105, "H"), (107, "I"),
+    *((111 + 4 * k, "I") for k in range(5)), *((131 + 8 * k, "d") for k in range(12)),
     (227, "Q"),
 ]  # fmt: skip
 _HEADER_14 = [(235, "Q"), (243, "I"), (247, "Q"), *((255 + 8 * k, "Q") for k in range(15))]
 _DESCRIPTOR = [(0, "B"), (1, "B"), (2, "I"), (6, "I"), (10, "d"), (18, "d")]
-_EXTRA = [(2, "B"), (3, "B"), (4, "32s"), (40, "d"), (40, "Q"), (64, "d"), (88, "d"), (112, "d"), (136, "d"), (160, "32s")]
+_EXTRA = [
+    (2, "B"),
+    (3, "B"),
+    (4, "32s"),
+    (40, "d"),
+    (40, "Q"),
+    (64, "d"),
+    (88, "d"),
+    (112, "d"),
+    (136, "d"),
+    (160, "32s"),
+]
 _LASZIP = [(0, "H"), (2, "H"), (4, "B"), (5, "B"), (6, "H"), (8, "I"), (12, "I"), (16, "q"), (24, "q"), (32, "H")]
 _OLD_POINT = [(0, "i"), (4, "i"), (8, "i"), (12, "H"), (14, "B"), (15, "B"), (16, "b"), (17, "B"), (18, "H"), (20, "d")]
 _NEW_POINT = [(0, "i"), (4, "i"), (8, "i"), (12, "H"), (14, "B"), (15, "B"), (16, "B"), (17, "B"), (18, "h"), (20, "H"),
@@ -259,7 +295,10 @@ def _las_fields(data: bytes) -> Iterator[tuple[int, str, int, int]]:
     packets = read(227, "Q")
     if packets and packets + 60 < len(data):
         yield from [(packets + place, form, 0, 1) for place, form in ((0, "H"), (2, "16s"), (18, "H"), (20, "Q"))]
-        yield from [(packets + 60, "B", 1, len(data) - packets - 60), (packets + 60, "H", 2, (len(data) - packets) // 2 - 30)]
+        yield from [
+            (packets + 60, "B", 1, len(data) - packets - 60),
+            (packets + 60, "H", 2, (len(data) - packets) // 2 - 30),
+        ]
 
 
 def _vlr_fields(data: bytes, at: int, read: Callable[[int, str], int]) -> Iterator[tuple[int, str, int, int]]:

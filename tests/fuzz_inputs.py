@@ -170,7 +170,8 @@ one, {out}: an empty folder, {resumed}: a folder with a finished cloud and the d
 IN_RESUMED = ("strip.report.json", "flight.system.toml")
 """Kinds that lie in the output folder of an earlier run."""
 
-BESIDE = {"beside.wdp": ("beside.las",), "beside.las": ("beside.wdp",), "list.txt": ("strip.las", "beside.las", "beside.wdp"),
+BESIDE = {"beside.wdp": ("beside.las",), "beside.las": ("beside.wdp",),
+          "list.txt": ("strip.las", "beside.las", "beside.wdp"),
           "settings.toml": ("strip.las",)}  # fmt: skip
 """Sound files in the folder of the damaged one."""
 
@@ -182,7 +183,8 @@ def build_inputs(base: Path) -> None:
     """Write a sound input of every kind; the same bytes each time."""
     options = {
         "strip.las": StripOptions(), "packed.laz": StripOptions(version="1.4", point_format=9),
-        "ten.las": StripOptions(version="1.4", point_format=10), "beside.las": StripOptions(internal=False, point_format=5),
+        "ten.las": StripOptions(version="1.4", point_format=10),
+        "beside.las": StripOptions(internal=False, point_format=5),
     }  # fmt: skip
     for name, chosen in options.items():
         simulate_strip("urban", base / name, pulses=120, seed=1, truth=base / f"{name}.npz", options=chosen)
@@ -218,7 +220,8 @@ def _write_texts(base: Path) -> None:
     )
     (base / "settings.toml").write_text(
         '[run]\nprofile = "fast"\nclasses = [0, 1, 2]\nblock-size = 64\nformat = "las"\nno-data = "nan"\n'
-        'where = "amplitude > 3"\n\n[slice]\nsigma = 2.5\nlines = "0:2"\n\n[voxelize]\nmethod = "gold"\niterations = 3\n'
+        'where = "amplitude > 3"\n\n[slice]\nsigma = 2.5\nlines = "0:2"\n\n[voxelize]\nmethod = "gold"\n'
+        "iterations = 3\n"
         '\n[stats]\narea = "5"\n'
     )
 

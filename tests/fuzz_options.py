@@ -10,8 +10,8 @@ import shlex
 from collections.abc import Iterator
 
 import click
-
 from fuzz_damage import _damage_text, apply_edits
+
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
 
@@ -39,7 +39,8 @@ WEIGHTS = {"plot": 0.2, "bench": 0.05, "voxelize": 0.5, "calibrate": 0.5, "stage
 _INTEGERS = ["0", "-1", "1", "2", "3", "7", "64", "255", "256", "65535", "65536", "2147483648", "9223372036854775808",
              "1" + "0" * 400, "1.5", "nan", "", " ", "1e3", "0x10", "٣", "1_000", "+5", "--", "one"]  # fmt: skip
 _FEW = ["0", "-1", "1", "2", "60", "", "nan", "1e3", "one", "1.5"]
-_FLOATS = ["0", "-0.0", "-1", "1", "0.5", "2", "1e-9", "1e-300", "1e9", "1e300", "-1e300", "nan", "inf", "-inf", "1e400",
+_FLOATS = ["0", "-0.0", "-1", "1", "0.5", "2", "1e-9", "1e-300", "1e9", "1e300", "-1e300", "nan", "inf", "-inf",
+           "1e400",
            "", " ", "1,5", "x", "1e", "0x1p3", "100", "1000", "٣", "1_0", "9" * 400]  # fmt: skip
 _TEXTS = {
     "where": 'number_of_returns == 2 and not (classification == 7 or echo_width >= 8.5) or "amplitude" < -1e3',
@@ -53,9 +54,10 @@ _TEXTS = {
 _PLACES = [
     "{out}", "{out}/x", "{out}/x.las", "{out}/x.laz", "{out}/x.csv", "{out}/x.npz", "{out}/x.toml", "{out}/x.tif",
     "{out}/x.html", "{out}/x.json", "{out}/x.svg", "{out}/none/x.laz", "{folder}/loop", "{folder}/loop/x.laz",
-    "{folder}/dangling", "{folder}/pipe", "{folder}/full", "{folder}/null", "{folder}/zero", "", ".", "/", "-", "~",
+    "{folder}/dangling", "{folder}/pipe", "{folder}/full", "{folder}/null", "{folder}/zero", "", ".", "-", "~",
     "x" * 300 + ".laz", "a/" * 3000, "{out}/\udcff.laz", "{out}/\x1b[31m\n.laz", "{out}/größe 点.laz",
-    "@{base}/list.txt", "@{folder}/pipe", "@{folder}/zero", "@", "*", "{out}/*.las", "[", "{base}/*.toml", "/proc/self/cmdline",
+    "@{base}/list.txt", "@{folder}/pipe", "@{folder}/zero", "@", "*", "{out}/*.las", "[", "{base}/*.toml",
+    "/proc/self/cmdline",
     "{folder}/zero.las", "{folder}/pipe.las", "{folder}/folder.las", "/dev/stdin", "{base}/none.las",
 ]  # fmt: skip
 _READ = ["{base}", "{base}/strip.las", "{base}/cloud.laz", "{base}/truth.npz", "{base}/cal.toml", "{base}/system.toml",
@@ -92,7 +94,9 @@ class Options:
         """Return a command line and variables."""
         name = rng.choices(list(self._commands), self._weights)[0]
         words, variables = shlex.split(SOUND[name]), {}
-        options = [one for one in self._commands[name].params if isinstance(one, click.Option) and one.name not in _NEVER]
+        options = [
+            one for one in self._commands[name].params if isinstance(one, click.Option) and one.name not in _NEVER
+        ]
         if rng.random() < 0.15 and len(words) > len(name.split()):
             place = rng.randrange(len(name.split()), len(words))
             words[place] = rng.choice([*_PLACES, *_READ])
@@ -114,9 +118,13 @@ def draw_value(option: click.Option, rng: random.Random) -> str | None:
     if option.is_flag:
         return None
     if rng.random() < 0.03:
-        return rng.choice(["x" * 100_000, "(" * 10_000, "\x1b[31m", "\udcff", "a\nb", "'", '"', "%s", "{0}", "../" * 20])
+        return rng.choice(
+            ["x" * 100_000, "(" * 10_000, "\x1b[31m", "\udcff", "a\nb", "'", '"', "%s", "{0}", "../" * 20]
+        )
     if isinstance(kind, click.Choice):
         return rng.choice([*map(str, kind.choices), *map(str, kind.choices), "x", "", str(kind.choices[0]).upper()])
+    if name == "jobs":  # processes take seconds to start, and time in them is not seen
+        return rng.choice(["-1", "1", "2", "", "nan", "1.5", "one"])
     if name in _MANY:
         return rng.choice(_FEW)
     if isinstance(kind, OutputPath):  # outputs may replace other files, but not the sound inputs of all cases

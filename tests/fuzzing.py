@@ -13,8 +13,8 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import importlib
 import faulthandler
+import importlib
 import json
 import os
 import random
@@ -74,7 +74,12 @@ class Fuzzer:
         self._options = Options()
         self._weights = {kind: [weight(command) for command in COMMANDS[kind]] for kind in COMMANDS}
         self._kept = _state(self.base)
-        for name in ("matplotlib.figure", "matplotlib.backends.backend_agg", "matplotlib.backends.backend_svg", "rasterio"):
+        for name in (
+            "matplotlib.figure",
+            "matplotlib.backends.backend_agg",
+            "matplotlib.backends.backend_svg",
+            "rasterio",
+        ):
             with contextlib.suppress(ImportError):  # once, not in every process
                 importlib.import_module(name)
 
@@ -98,7 +103,9 @@ class Fuzzer:
             wrong += self.run_some(cases[len(wrong) :])
         return wrong
 
-    def run_some(self, cases: Sequence[Case], see: Callable[[Case, dict], object] = lambda case, done: None) -> list[str]:
+    def run_some(
+        self, cases: Sequence[Case], see: Callable[[Case, dict], object] = lambda case, done: None
+    ) -> list[str]:
         """What is wrong with the first cases, up to one that fails; see: gets each case and what it did."""
         source, target = os.pipe()
         pid = os.fork()
@@ -123,7 +130,10 @@ class Fuzzer:
             os.waitpid(pid, 0)
         changed = _state(self.base) ^ self._kept
         if changed:
-            raise AssertionError(f"sound inputs were changed by one of {[case.command for case in cases[: len(wrong)]]}: {sorted({one[0] for one in changed})}")
+            raise AssertionError(
+                f"sound inputs were changed by one of {[case.command for case in cases[: len(wrong)]]}: "
+                f"{sorted({one[0] for one in changed})}"
+            )
         return wrong
 
     def _child(self, cases: Sequence[Case], target: int) -> None:
@@ -155,7 +165,7 @@ class Fuzzer:
         done = CliRunner().invoke(main, words, env=case.variables)
         is_bug = not isinstance(done.exception, SystemExit | None)
         error = "".join(traceback.format_exception(done.exception)) if is_bug else ""
-        found: dict[str, Any] = {"code": done.exit_code, "out": done.stdout[-5000:], "err": done.stderr[-5000:]}
+        found: dict[str, Any] = {"code": done.exit_code, "out": done.stdout, "err": done.stderr}
         found |= {"error": error, "peak": _read_peak(), "wall": "--jobs" in words}
         why = _judge(found, folder / "out", before, case)
         if not why and inputs - _state(folder, below=False):
@@ -167,7 +177,7 @@ class Fuzzer:
         del done
         if not why and len(os.listdir("/proc/self/fd")) > opened + 20:
             why = "leaves files open"
-        return {**found, "why": why}
+        return {**found, "out": found["out"][-5000:], "err": found["err"][-5000:], "why": why}
 
     def _prepare(self, case: Case, folder: Path) -> tuple[list[str], set[str]]:
         """The command with the damaged input in place, and the names that its folder holds before."""
@@ -224,7 +234,10 @@ class _Watch:
             if select.select([self._source], [], [], 0.5)[0]:
                 data = os.read(self._source, 1 << 20)
                 if not data:
-                    return b"", f"the process ended with status {os.waitid(os.P_PID, self._pid, os.WEXITED | os.WNOWAIT).si_status}"
+                    return (
+                        b"",
+                        f"the process ended with status {_wait_for(self._pid)}",
+                    )
                 self._read += data
             elif self._used() - used > MOST_SECONDS:
                 return b"", f"ran for more than {MOST_SECONDS} s"
@@ -256,6 +269,11 @@ def _in_child(work: Callable[[], object]) -> None:
         finally:
             os._exit(1)
     assert os.waitpid(pid, 0)[1] == 0, "the sound inputs cannot be made"
+
+
+def _wait_for(pid: int) -> int:
+    """The status of a child, which is left to be waited for."""
+    return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT).si_status
 
 
 def _reset_peak() -> None:
@@ -364,9 +382,12 @@ def check_whole(path: Path) -> str:
             with rasterio.open(path) as file:
                 small = file.width * file.height < 10_000_000
                 file.read() if small else file.read(window=((0, 256), (0, 256)))
-        elif path.suffix == ".png" and not path.read_bytes().endswith(b"IEND\xaeB`\x82"):
-            return "the picture has no end"
-        elif path.suffix == ".svg" and not path.read_bytes().rstrip().endswith(b"</svg>"):
+        elif (
+            path.suffix == ".png"
+            and not path.read_bytes().endswith(b"IEND\xaeB`\x82")
+            or path.suffix == ".svg"
+            and not path.read_bytes().rstrip().endswith(b"</svg>")
+        ):
             return "the picture has no end"
     except Exception as error:
         return f"{type(error).__name__}: {error}"

@@ -169,4 +169,6 @@ def test_two_minutes_of_damaged_inputs_break_no_promise(tmp_path):
     assert list(fuzz(tmp_path, 120, seed, tell=said.append)) == []
     assert int(said[-1].split()[0]) > 100  # cases
     inside = {line.split()[0]: int(line.split()[-6]) for line in said[1:-1]}
-    assert sum(number > 0 for number in inside.values()) > 0.6 * len(inside)  # commands and kinds of which some end well
+    assert sum(number > 0 for number in inside.values()) > 0.6 * len(
+        inside
+    )  # commands and kinds of which some end well

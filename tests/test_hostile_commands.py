@@ -202,7 +202,8 @@ def test_a_chain_can_come_through_a_pipe(tmp_path):
 
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="a device that never ends")
 @pytest.mark.parametrize("words", ["run {a} -o {o} --chain /dev/zero", "run @/dev/zero -o {o}", "info /dev/zero",
-                                   "run {a} -o {o} --trajectory /dev/zero", "stats {a} --polygons /dev/zero"])  # fmt: skip
+                                   "run {a} -o {o} --trajectory /dev/zero",
+                                   "stats {a} --polygons /dev/zero"])  # fmt: skip
 def test_a_device_that_never_ends_is_no_input(tmp_path, words):
     strip = make_raw(60).write(tmp_path / "a.las")
     done = CliRunner().invoke(main, words.format(a=strip, o=tmp_path / "out").split())
@@ -227,7 +228,7 @@ def test_damaged_settings_are_wrong_usage(tmp_path, text):
 
 
 def test_damaged_arrays_are_one_line(tmp_path):
-    """Errors of zipfile, zlib and Python's tokenizer came through, and sizes that a damaged header claims were taken."""
+    """Errors of zipfile, zlib and Python's tokenizer came through; sizes that a damaged header claims were taken."""
     import io
     import zipfile
 
@@ -248,3 +249,27 @@ def test_damaged_arrays_are_one_line(tmp_path):
             cube.write_bytes(plain.replace(old, new))
         done = CliRunner().invoke(main, ["plot", "cube", str(cube), "-o", str(tmp_path / "a.png")])
         assert done.exit_code == 1 and "holds no cube" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX systems")
+@pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_do_no_harm(tmp_path, closed):
+    """As a daemon has them: run asked whether stderr is a terminal, and files got the numbers of the streams."""
+    strip = tmp_path / "a.las"
+    simulate_strip("flat", strip, pulses=60, seed=1)
+    words = f"'{sys.executable}' -m wavebatch run '{strip}' -o '{tmp_path}/out' --profile fast {closed}"
+    done = subprocess.run(["sh", "-c", words], capture_output=True, check=False)
+    assert done.returncode == 0 and (tmp_path / "out" / "a.report.json").exists()
+    words = f"'{sys.executable}' -m wavebatch run '{tmp_path}/none.las' -o '{tmp_path}/out' {closed}"
+    assert subprocess.run(["sh", "-c", words], capture_output=True, check=False).returncode == 4
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is full")
+def test_a_full_stderr_does_not_stop_the_batch(tmp_path):
+    """The first message of a strip ended the whole run."""
+    for name in ("a", "b"):
+        simulate_strip("flat", tmp_path / f"{name}.las", pulses=60, seed=1)
+    words = [sys.executable, "-m", "wavebatch", "run", tmp_path, "-o", tmp_path / "out", "--profile", "fast"]
+    with open("/dev/full", "wb") as full:
+        assert subprocess.run(words, stderr=full, check=False).returncode == 0
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.json")) == ["a.report.json", "b.report.json"]

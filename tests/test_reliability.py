@@ -1,4 +1,4 @@
-"""Every sentence of docs/reliability.md, "What can be relied on", has tests that hold it: tests/reliability_tests.txt."""
+"""Every sentence of docs/reliability.md, "What can be relied on", has its tests: tests/reliability_tests.txt."""
 
 import ast
 import re
@@ -68,5 +68,6 @@ def test_sentences_are_split_at_their_ends():
     text = "# A\n\nOne, e.g. this. Two\nlines: `x`. **Bold.** Three.\n\n- item one. More.\n- two;\n\n"
     text += "| a | b |\n|---|---|\n| 1 | c |\n"
     assert split_sentences(text) == [
-        "One, e.g. this.", "Two lines: `x`.", "**Bold.** Three.", "item one.", "More.", "two;", "| a | b |", "| 1 | c |",
+        "One, e.g. this.", "Two lines: `x`.", "**Bold.** Three.", "item one.", "More.", "two;",
+        "| a | b |", "| 1 | c |",
     ]  # fmt: skip

@@ -14,6 +14,7 @@ def main() -> None:
 def _run() -> None:
     import os
 
+    _open_closed_streams()
     from wavebatch.core.memory import ONE_THREAD
 
     for name in ONE_THREAD:  # before NumPy is imported; what the user has set stays
@@ -21,6 +22,24 @@ def _run() -> None:
     from wavebatch.cli import main
 
     main.main()
+
+
+def _open_closed_streams() -> None:
+    """Put the null device where stdin, stdout or stderr are closed, as daemons and `2>&-` do.
+
+    Else the first file that is opened would get their number, and the messages of a library would go into it.
+    """
+    import os
+    import sys
+
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+        if getattr(sys, name) is None:
+            mode = "w" if number else "r"
+            setattr(sys, name, open(number, mode, errors="backslashreplace", closefd=False))  # noqa: SIM115
 
 
 if __name__ == "__main__":

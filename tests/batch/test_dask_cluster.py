@@ -45,7 +45,8 @@ class Dask:
 
     def _start(self, *command, **env):
         with open(self.folder / f"log{len(self.processes)}", "wb") as log:
-            process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env={**os.environ, **self._env, **env})
+            env = {**os.environ, **self._env, **env}
+            process = subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env=env)
         self.processes.append(process)
         return process
 

@@ -6,7 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import Future
 
 import pytest
 
@@ -128,6 +130,49 @@ def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, ea
     script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
     assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr
+
+
+def test_an_interrupt_at_any_line_of_a_wait_leaves_no_lock_taken():
+    """The thread that settles the future waited for a lock of the interrupted `wait`, and `cancel` for that thread."""
+    workers = Workers(1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        for number in range(1, 200):
+            future: Future = Future()
+            thread = threading.Timer(0.01, future.set_result, (1,))
+            thread.daemon = True
+            thread.start()
+            seen = _interrupt_at(number, workers.wait, [future])
+            thread.join(5)
+            assert not thread.is_alive(), f"line {number}"
+            if not seen:
+                break
+        assert number > 50  # lines
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt_at(number, function, *arguments):
+    """Send SIGINT when the function runs this line of the library of threads; whether it came so far."""
+    count = 0
+
+    def trace(frame, event, argument):
+        nonlocal count
+        if event == "line" and frame.f_code.co_filename.endswith(("threading.py", "_base.py")):
+            count += 1
+            if count == number:
+                sys.settrace(None)
+                os.kill(os.getpid(), signal.SIGINT)
+        return trace
+
+    try:
+        sys.settrace(trace)
+        function(*arguments)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        sys.settrace(None)
+    return count >= number
 
 
 def die_elsewhere(parent, number):

@@ -202,3 +202,10 @@ def test_positions_beyond_all_places_are_dropped():
     xyz = np.zeros((5, 3))
     xyz[1] = 1e308
     assert Trajectory.build(time, xyz).time.tolist() == [0.0, 2.0, 4.0]
+
+
+def test_positions_at_almost_the_same_time_are_dropped():
+    """Velocities of half of them overflow."""
+    time, xyz = np.array([0.0, 5e-324, 1.0, 1.0 + 2e-10, 2.0]), np.arange(15.0).reshape(5, 3)
+    built = Trajectory.build(time, xyz)
+    assert built.time.tolist() == [0.0, 1.0, 2.0] and np.isfinite(built.velocity).all()

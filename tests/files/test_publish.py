@@ -235,3 +235,13 @@ def test_a_full_disk_is_told_as_such_by_compressors_and_on_closing_too(tmp_path,
     assert done.returncode == (4 if command == "run" else 1) and done.stderr.count("\n") == 1, done.stderr
     assert "File too large; free space or choose another output folder" in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_next_draft_in_a_folder_removes_what_killed_processes_left(tmp_path):
+    """Of any command, not only of run; files that are locked stay."""
+    left = tmp_path / ".wavebatch-1-abc.tmp"
+    left.write_text("half")
+    with Draft(tmp_path / "a", overwrite=False) as first:
+        assert not left.exists() and first.path.exists()
+        with Draft(tmp_path / "b", overwrite=False):
+            assert first.path.exists()

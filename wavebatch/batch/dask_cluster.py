@@ -18,11 +18,11 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, InvalidStateError, wait
+from concurrent.futures import BrokenExecutor, Future, InvalidStateError
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.processes import settle
+from wavebatch.batch.processes import settle, wait_uninterrupted
 from wavebatch.batch.worker_check import (
     compare_workers,
     describe_worker,
@@ -148,7 +148,7 @@ class Cluster:
         """Wait for at least one future and return those done; BrokenExecutor where the cluster is lost."""
         futures = list(futures)
         self._heard = time.monotonic()
-        while not (done := wait(futures, timeout=_POLL, return_when=FIRST_COMPLETED).done):
+        while not (done := wait_uninterrupted(futures, _POLL)):
             with contextlib.suppress(Exception):
                 if self._client.sync(self._client.scheduler.ncores, workers=None, callback_timeout=_POLL):
                     self._heard = time.monotonic()

@@ -34,6 +34,10 @@ from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, rem
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
+
+_LATENCY = 0.1
+"""Seconds after which Ctrl-C is seen at the latest while results are waited for."""
+
 _NAME = "wavebatch"
 """Start of the names of our processes."""
 
@@ -125,7 +129,7 @@ class Workers:
     def wait(self, futures: Iterable[Future]) -> set[Future]:
         """Wait for at least one future and return those that are done."""
         futures = list(futures)
-        while not (done := wait(futures, timeout=_POLL, return_when=FIRST_COMPLETED).done):
+        while not (done := wait_uninterrupted(futures, _POLL)):
             for worker in self._workers:
                 worker.look()
             if not any(worker.serves for worker in self._workers):  # calls that no process has taken
@@ -266,6 +270,20 @@ def _unpack(answer: bytes) -> tuple[Any, BaseException | None]:
         return pickle.loads(answer)
     except Exception as error:
         return None, error
+
+
+def wait_uninterrupted(futures: list[Future], seconds: float) -> set[Future]:
+    """Return the futures that are done within so many seconds, or as soon as one is.
+
+    An interrupt inside `wait` may leave a lock taken. The thread that settles this future would then hold it for ever,
+    and so would `cancel`. So interrupts come between short waits only.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        with uninterrupted():
+            done = wait(futures, timeout=_LATENCY, return_when=FIRST_COMPLETED).done
+        if done or time.monotonic() > deadline:
+            return done
 
 
 def _settle(future: Future, result: Any = None, error: BaseException | None = None) -> None:

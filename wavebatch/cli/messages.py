@@ -122,8 +122,22 @@ class NearestGroup(click.Group):
 
 def talk(message: str) -> None:
     """One line on stderr, and in the file of --log-file."""
-    click.echo(printable(message), err=True)
+    _write_message(printable(message))
     log_file.log(printable(message))
+
+
+def _write_message(line: str) -> None:
+    """One line on stderr; where it cannot be written, later ones are dropped, and the work goes on."""
+    try:
+        click.echo(line, err=True)
+    except (OSError, ValueError):
+        _drop_output(sys.stderr)
+
+
+def _drop_output(stream: Any) -> None:
+    """Let the stream write to the null device, else Python would fail with what is left at its end."""
+    with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), stream.fileno())
 
 
 def printable(text: str) -> str:
@@ -166,8 +180,7 @@ def print_safely(text: str) -> bool:
         return True
     except (OSError, ValueError) as error:
         talk(f"error: stdout: cannot be written: {getattr(error, 'strerror', None) or error}")
-        with contextlib.suppress(OSError, ValueError), open(os.devnull, "wb") as nothing:
-            os.dup2(nothing.fileno(), sys.stdout.fileno())  # else Python would fail with what is left at its end
+        _drop_output(sys.stdout)
         return False
 
 
@@ -323,7 +336,7 @@ class Progress:
     def _say(self, line: str) -> None:
         if self._bar is not None:
             self._bar.clear()
-        click.echo(line, err=True)
+        _write_message(line)
         log_file.log(line)
         if self._bar is not None:
             self._bar.refresh()

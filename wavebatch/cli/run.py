@@ -263,7 +263,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     if level > 0:
         timing = result.to_json()["timing"]
         parts = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in sorted(timing["seconds"].items()))
-        talk(f"{timing['elapsed_seconds']:.1f} s elapsed; of the processes' time: {parts}")
+        talk(f"{timing['elapsed_seconds']:.1f} s elapsed" + (f"; of the processes' time: {parts}" if parts else ""))
         if result.advice:
             talk(result.advice)
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written

@@ -24,6 +24,9 @@ LONGEST_GAP = 1.0
 FARTHEST, LATEST = 1e9, 1e12
 """Largest coordinate [m] and time [s] of a position; damaged files have larger ones, whose squares overflow."""
 
+LEAST_STEP = 1e-9
+"""Positions that follow sooner [s] are dropped: clocks of sensors are not finer, and velocities would overflow."""
+
 GAP_STEPS = 5.0
 """Gaps up to this many usual steps are bridged too."""
 
@@ -45,7 +48,7 @@ class Trajectory:
     def build(
         cls, time: np.ndarray, xyz: np.ndarray, velocity: np.ndarray | None = None, gap: float | None = None
     ) -> Trajectory:
-        """A trajectory from positions in any order; rows with NaN, beyond all times and places, and repeated times are dropped.
+        """A trajectory from positions in any order; rows with NaN, beyond FARTHEST and LATEST, and of equal times go.
 
         Parameters
         ----------
@@ -68,6 +71,7 @@ class Trajectory:
         good = np.flatnonzero((np.abs(time) <= LATEST) & near)
         _, first = np.unique(time[good], return_index=True)
         rows = good[first]
+        rows = rows[np.diff(time[rows], prepend=-np.inf) >= LEAST_STEP]
         if len(rows) < 2:
             raise InputError(f"{len(rows)} usable positions of the sensor; at least two are needed")
         time, xyz = time[rows], np.ascontiguousarray(xyz[rows])

@@ -66,6 +66,9 @@ class Draft(contextlib.AbstractContextManager):
         if is_stream(self.target):
             raise InputError(_no_file(self.target))
         check_target(self.target, overwrite=True)
+        if self.target.parent not in _cleared:
+            _cleared.add(self.target.parent)
+            remove_stale(self.target.parent)
         with uninterrupted(), reporting(self.target):
             self.path, descriptor = locks.make_locked(lambda: _create(self.target.parent))
             self.file = os.fdopen(descriptor, "w+b", buffering=1 << 20)
@@ -112,6 +115,9 @@ class Draft(contextlib.AbstractContextManager):
             with contextlib.suppress(OSError):
                 os.unlink(self.target)
 
+
+_cleared: set[Path] = set()
+"""Folders from which this process has removed what killed ones had left."""
 
 _open: set[Draft | Claim] = set()
 """What is neither published nor discarded."""

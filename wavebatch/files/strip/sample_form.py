@@ -162,7 +162,9 @@ class _Votes:
         for fill in (find_fill(samples, *tops), find_fill(largest - samples, *tops)):
             if fill is not None:
                 values[fill] = np.nan
-        values -= np.nanmedian(values, axis=1, keepdims=True) if np.isnan(values).any() else _medians(values)
+        gaps = np.isnan(values)
+        values[gaps.all(axis=1)] = 0.0  # nothing but fill: no vote
+        values -= np.nanmedian(values, axis=1, keepdims=True) if gaps.any() else _medians(values)
         np.nan_to_num(values, copy=False)
         up, down = values.max(axis=1), -values.min(axis=1)
         self.up += int(np.count_nonzero((up >= LEAST_HEIGHT) & (up >= CLEAR * down)))

@@ -6,6 +6,9 @@ readable, and a key that is taken out by hand must only take its check away.
 
 from __future__ import annotations
 
+import contextlib
+import datetime
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,7 +17,7 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.text_file import read_text
-from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml
+from wavebatch.files.toml_file import REQUIRED, TomlTable, format_toml, parse_toml, shorten
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 
 CALIBRATION_SCHEMA = "wavebatch.calibration/1"
@@ -35,6 +38,8 @@ _NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
     ),
 }  # fmt: skip
 """Numbers of the file by key: field of Calibration, least and largest value, default, meaning."""
+
+_DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
 _TEXTS = ("strip", "date", "conditions", "sensor", "flight", "chain", "decomposer")
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
@@ -86,6 +91,11 @@ def parse_calibration(text: str, name: str) -> Calibration:
     values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
     section = values.pop("section_constant")
     texts = {key: str(table.values.get(key, "")) for key in _TEXTS}
+    if texts["flight"]:
+        with contextlib.suppress(ValueError):
+            texts["flight"] = datetime.date.fromisoformat(texts["flight"]).isoformat()
+        if not _DAY.fullmatch(texts["flight"]):
+            raise ConfigError(f"{name}: flight must be a day such as 2026-05-31, it is {shorten(texts['flight'])}")
     channels: dict[tuple[int, int], ChannelConstant] = {}
     for row in table.tables("channel"):
         channel = _read_channel(row)

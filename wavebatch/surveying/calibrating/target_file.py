@@ -126,7 +126,8 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
     if not LEAST_REFLECTANCE <= reflectance <= 1.5 or len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
-        raise ConfigError(f"{where}: reflectance must lie in 0 to 1.5 and above {LEAST_REFLECTANCE:g}, and the outline needs three corners")
+        limits = f"in 0 to 1.5 and above {LEAST_REFLECTANCE:g}"
+        raise ConfigError(f"{where}: reflectance must lie {limits}, and the outline needs three corners")
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
     return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)

@@ -26,6 +26,9 @@ STATISTICS = ("mean", "median", "min", "max", "count", "density")
 MOST_CELLS = 4_000_000
 """Most cells of a grid; a picture cannot show more."""
 
+LARGEST_SIZE = 1e9
+"""Largest side of a cell [m]: more than the world; larger ones overflow."""
+
 LEAST_SIZE = 1e-6
 """Least side of a cell [m]: smaller than any scale of LAS coordinates in use."""
 
@@ -142,8 +145,8 @@ def grid_values(
 def _check(statistic: str, size: float | None, bounds: tuple[float, float, float, float] | None) -> None:
     if statistic not in STATISTICS:
         raise ConfigError(f"statistic {statistic!r} is not one of {', '.join(STATISTICS)}")
-    if size is not None and not (LEAST_SIZE <= size < math.inf):
-        raise ConfigError(f"cells must be at least {LEAST_SIZE:g} m long, got {size:g}")
+    if size is not None and not (LEAST_SIZE <= size <= LARGEST_SIZE):
+        raise ConfigError(f"cells must be at least {LEAST_SIZE:g} and at most {LARGEST_SIZE:g} m long, got {size:g}")
     if bounds is not None:
         west, south, east, north = bounds
         if not (math.isfinite(east - west) and math.isfinite(north - south) and west < east and south < north):

@@ -24,6 +24,9 @@ from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
 from wavebatch.tools.rasters.cells import STATISTICS, compute_cells
 
+LARGEST_SIZE = 1e9
+"""Largest side of a cell: more than the world; larger ones overflow."""
+
 MOST_SIDE = 2_000_000
 """Most cells along a side: more is damage of coordinates, or a size that was meant in another unit."""
 
@@ -109,8 +112,8 @@ def _check(options: GridOptions) -> None:
         raise ConfigError(f"statistic {options.statistic!r} is not one of {', '.join(STATISTICS)}")
     if not options.columns and options.statistic not in ("count", "density"):
         raise ConfigError(f"--statistic {options.statistic} needs a --column; only count and density need none")
-    if not 0 < options.size < math.inf:
-        raise ConfigError(f"--size must be more than 0, got {options.size:g}")
+    if not 0 < options.size <= LARGEST_SIZE:
+        raise ConfigError(f"--size must be more than 0 and at most {LARGEST_SIZE:g}, got {options.size:g}")
     if not (math.isnan(options.no_data) or abs(options.no_data) <= float(np.finfo(np.float32).max)):
         raise ConfigError(f"--no-data must be nan or a number that float32 holds, got {options.no_data:g}")
     if options.bounds is not None:

@@ -135,5 +135,6 @@ class TruthReader(Closing):
             raise InputError(f"{self.path}: ends too early; simulate the strip again")
         values = np.frombuffer(data, dtype)
         if dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
-            raise InputError(f"{self.path}: column {name} holds {np.nanmax(np.abs(values)):g}; simulate the strip again")
+            most = np.nanmax(np.abs(values))
+            raise InputError(f"{self.path}: column {name} holds {most:g}; simulate the strip again")
         return values

@@ -133,7 +133,8 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
     values, time, number = read_npz(path, names, what, "make it again").values()
     if not values.size or values.shape[2] != len(time) or values.shape[0] != len(number):
         raise InputError(f"{path}: holds no {what}: its arrays do not fit")
-    if not (np.abs(time) < _LARGEST).all() or (np.abs(values) > _LARGEST).any() or not np.isfinite(values).any() or (len(time) > 1 and not time[0] < time[1]):
+    ascends = (np.abs(time) < _LARGEST).all() and (np.diff(time) > 0).all()
+    if not ascends or (np.abs(values) > _LARGEST).any() or not np.isfinite(values).any():
         raise InputError(f"{path}: holds no {what}: its times do not ascend, or its values are none; make it again")
     spacing = float(time[1] - time[0]) if len(time) > 1 else 1.0
     if all(value is None for value in wanted.values()):
