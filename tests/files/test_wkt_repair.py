@@ -1,16 +1,19 @@
 """RIEGL's RiPROCESS writes metres as the unit of longitudes: whatever wavebatch writes lies where the strip lies."""
 
 import json
+import struct
 
 import pytest
 from batch_tools import run_one
 from click.testing import CliRunner
 from strips import add_record
+from writer_tools import plan_output, write_source
 
 from wavebatch.cli import main
+from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.las.crs import parse_wkt, read_crs_definition
 from wavebatch.files.las.geotiff_wkt import build_utm
-from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, is_projection, read_header
+from wavebatch.files.las.header import WKT_ID, Vlr, build_wkt, find_evlrs, is_projection, read_header
 from wavebatch.files.wkt_repair import repair_records, repair_wkt
 from wavebatch.tools.simulate import simulate_strip
 
@@ -117,6 +120,54 @@ def test_the_cloud_lies_where_the_strip_lies_and_says_what_changed(strip, tmp_pa
         report = json.loads((tmp_path / str(number) / "s.report.json").read_text())
         assert any("as RiPROCESS writes it" in line for line in report["remarks"])
     assert _longitude(read_crs_definition(cloud, header)) == pytest.approx(15.6567, abs=1e-3)
+
+
+def _with_record(path, version, point_format, *, vlrs=(), evlrs=()):
+    points = write_source(path, point_format, version, vlrs=list(vlrs), evlrs=list(evlrs))
+    return points, plan_output(path, [], las_version="1.3" if version < (1, 4) else "1.4")
+
+
+def _write(layout, target, rows):
+    with CloudWriter(layout, target, provenance={}) as cloud:
+        cloud.write(rows)
+        cloud.commit()
+
+
+def test_an_extended_record_is_right_in_the_cloud_too(tmp_path):
+    """All else of the extended records stays, also after one that has become longer."""
+    others = [(b"mine", WKT_ID, RIPROCESS.encode()), (b"last", 6, bytes(1000))]
+    for name, wkt in (("wrong", RIPROCESS), ("right", build_utm(32633))):
+        evlrs = [others[0], (b"LASF_Projection", WKT_ID, wkt.encode() + b"\0"), others[1]]
+        points, layout = _with_record(tmp_path / f"{name}.las", (1, 4), 9, evlrs=evlrs)
+        target = tmp_path / f"{name}.laz"
+        _write(layout, target, layout.rows(points))
+        header = read_header(target)
+        found, missing = find_evlrs(target, header)
+        payloads = [target.read_bytes()[evlr.start + 60 :][: evlr.length] for evlr in found]
+        assert payloads == [others[0][2], repair_wkt(wkt).encode() + b"\0", others[1][2]] and missing == 0
+        assert [(evlr.user, evlr.record_id) for evlr in found] == [(user.decode(), key) for user, key, _ in evlrs]
+        assert any("as RiPROCESS writes it" in note for note in layout.notes) == (name == "wrong")
+        assert read_crs_definition(target, header) == repair_wkt(wkt)
+
+
+def test_las_1_3_has_no_wrong_wkt_beside_its_keys(tmp_path):
+    keys = Vlr(b"LASF_Projection", 34735, struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, 32633))
+    points, layout = _with_record(tmp_path / "a.las", (1, 3), 4, vlrs=[keys, build_wkt(RIPROCESS)])
+    _write(layout, tmp_path / "b.las", layout.rows(points))
+    header = read_header(tmp_path / "b.las")
+    assert header.version == (1, 3) and any("as RiPROCESS writes it" in note for note in layout.notes)
+    payloads = [vlr.payload for vlr in header.vlrs if is_projection(vlr)]
+    assert payloads == [keys.payload, repair_wkt(RIPROCESS).encode() + b"\0"]
+
+
+def test_so_do_synthetic_strips(strip, tmp_path):
+    words = ["synthesize", strip, "-o", tmp_path / "s.las"]
+    result = CliRunner().invoke(main, list(map(str, words)))
+    assert result.exit_code == 0, result.output
+    definition = read_crs_definition(tmp_path / "s.las", read_header(tmp_path / "s.las"))
+    assert definition == repair_wkt(RIPROCESS)
+    records = [vlr.payload for vlr in read_header(tmp_path / "s.las").vlrs if vlr.record_id == WKT_ID]
+    assert records == [repair_wkt(RIPROCESS).encode() + b"\0"]
 
 
 def test_so_do_rasters_and_voxels(strip, tmp_path):
