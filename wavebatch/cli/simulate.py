@@ -35,6 +35,7 @@ from wavebatch.tools.simulate.from_returns import (
     SynthesisSummary,
     synthesize_strip,
 )
+from wavebatch.tools.simulate.return_light import EQUAL
 
 _RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""
@@ -182,7 +183,7 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     settings = from_options(SynthesisOptions, options, bits=int(options["bits"]), radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
-    print_summary(options, summary.to_json() if options["as_json"] else summary, _list_lines(output, summary))
+    print_summary(options, summary.to_json() if options["as_json"] else summary, _list_lines(output, summary, options["shares"]))
 
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:
@@ -200,7 +201,7 @@ def _build_radar(options: dict[str, Any]) -> Radar | None:
     return Radar(height, **given)
 
 
-def _list_lines(output: Path, summary: SynthesisSummary) -> Iterator[str]:
+def _list_lines(output: Path, summary: SynthesisSummary, shares: str | None) -> Iterator[str]:
     yield f"{output}: {count(summary.points, 'point')}, {count(summary.packets, 'packet')}, gain {summary.gain:.4g}"
     if summary.without_packet:
         yield f"note: {count(summary.without_packet, 'point')} without a packet: the pulse lasts too long"
@@ -210,11 +211,11 @@ def _list_lines(output: Path, summary: SynthesisSummary) -> Iterator[str]:
         yield f"note: {count(summary.scattered, 'pulse')} incomplete in the cloud; sort the cloud by GPS time if needed"
     share = f" ({summary.energy_recorded / summary.energy:.1%})" if summary.energy else ""
     yield f"energy: {summary.energy:.4g} DN ns modelled, {summary.energy_recorded:.4g} DN ns in the samples{share}"
-    yield from _list_light(summary)
+    yield from _list_light(summary, shares)
 
 
-def _list_light(summary: SynthesisSummary) -> Iterator[str]:
-    """What was assumed about widths and shares."""
+def _list_light(summary: SynthesisSummary, shares: str | None) -> Iterator[str]:
+    """What was assumed about widths and shares; shares: the option."""
     light, points = summary.light, summary.points
     if light.own_width:
         yield f"widths: {light.own_width} of the cloud, {points - light.own_width} of the pulse"
@@ -223,7 +224,9 @@ def _list_light(summary: SynthesisSummary) -> Iterator[str]:
     if light.pulses:
         found = f"{light.own_share} of the cloud, {light.assumed_share} assumed"
         yield f"shares: {found}; the returns of a pulse take {summary.light_used:.1%} of its light on average"
-    if light.pulses and summary.scattered:
+    if shares == EQUAL and summary.scattered:
+        yield "note: equal shares count the returns that the points state, also those that the cloud lacks"
+    elif light.pulses and summary.scattered:
         yield "note: shares of incomplete pulses are those of the points that are there in a row"
     if light.over_one:
         yield f"note: {count(light.over_one, 'pulse')} with shares above 1 together, scaled to 1"
