@@ -35,8 +35,8 @@ class DeadZone:
     """Distance [m], to 1 cm, below which at most one pair in a thousand lies. NaN with fewer than LEAST_PAIRS, and
     where it lies in the last bin, which holds all larger distances too (100 m)."""
     error: float
-    """How much shorter the sensor's own distance may well be [m]: where pairs are rare, none is at the very edge. To 1 mm; NaN
-    where the size is."""
+    """How much shorter the sensor's own distance may well be [m]: where pairs are rare, none is at the very edge. To
+    1 mm; NaN where the size is."""
 
 
 class Distances:
