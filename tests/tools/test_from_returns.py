@@ -286,6 +286,65 @@ def test_energy_says_what_saturation_loses(cloud, tmp_path):
     assert summary.saturated > 100 and summary.energy_recorded < 0.9 * summary.energy
 
 
+@pytest.mark.parametrize(
+    ("baseline", "noise", "level"), [(0.0, 2.0, 0.7), (3.0, 2.0, 3.03), (12.4, 0.0, 12.0), (12.4, 1.0, 12.4)]
+)
+def test_energy_that_is_not_of_echoes_is_shown(cloud, tmp_path, baseline, noise, level):
+    """Noise that is cut off at 0, or a fraction of a count, moves every sample without an echo."""
+    words = ("--baseline", baseline, "--noise", noise, "--gain", 0.01, "--bits", 16)
+    result = run(cloud, "-o", tmp_path / "s.las", *words, "--json")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    samples = np.concatenate([block.samples[:, :4].ravel() for block in read_blocks(tmp_path / "s.las")])
+    error = 5 * max(samples.std(), 1e-6) / np.sqrt(samples.size)
+    assert document["level"] == pytest.approx(level, abs=0.12) and document["level"] == pytest.approx(
+        samples.mean(), abs=error
+    )
+    excess = document["energy_recorded"] - document["energy"]
+    assert excess == pytest.approx(document["energy_of_level"], rel=0.4, abs=0.01 * document["energy"])
+    is_off = abs(document["energy_of_level"]) > 0.001 * document["energy"]
+    assert is_off == (abs(level - baseline) > 0.01)
+    assert ("are not of echoes" in result.stderr) == is_off, result.stderr
+
+
+def test_the_ratio_of_energies_leaves_out_echoes_without_a_packet(tmp_path, cloud):
+    las = laspy.read(cloud)
+    first = np.flatnonzero(las.return_number == 1)[las.number_of_returns[las.return_number == 1] > 1][:300]
+    las.z[first] = las.z[first] + 3000.0  # no waveform is so long
+    las.write(tmp_path / "far.las")
+    result = run(tmp_path / "far.las", "-o", tmp_path / "s.las", "--bits", 16, "--gain", 5, "--json")
+    document = json.loads(result.stdout)
+    assert document["without_packet"] >= 600 and document["energy_without_packet"] > 0.1 * document["energy"]
+    packed = document["energy"] - document["energy_without_packet"]
+    assert document["energy_recorded"] == pytest.approx(packed, rel=0.003)
+    assert f"({document['energy_recorded'] / packed:.1%})" in result.stderr
+    assert f"{document['energy_without_packet']:.4g} DN ns without a packet" in result.stderr
+
+
+@pytest.mark.parametrize("gain", [(), ("--gain", "0.05")])
+def test_a_column_that_holds_no_widths_is_refused(cloud, tmp_path, gain):
+    """Fields of LAS are no widths; of other columns most values must be possible ones."""
+    points = len(laspy.read(cloud))
+    some, many = np.full(points, 5.0), np.full(points, 5.0)
+    some[: int(0.4 * points)], many[: int(0.6 * points)] = 4000.0, 4000.0
+    given = add_columns(cloud, tmp_path / "c.las", some=some, many=many)
+    target = tmp_path / "s.las"
+    for name in ("intensity", "classification", "Point Source ID", "return_number", "user_data"):
+        result = run(given, "-o", target, "--widths", name, *gain)
+        assert result.exit_code == 2 and "is the LAS field" in result.stderr and result.stderr.count("\n") == 1
+    figures = ("--intensity", "reflectance", "--sensor-height", 1200)
+    result = run(given, "-o", target, *figures, "--shares", "scan_direction_flag", *gain)
+    assert result.exit_code == 2 and "LAS field scan_direction_flag" in result.stderr
+    result = run(given, "-o", target, "--widths", "many", *gain)
+    assert (
+        result.exit_code == 2
+        and f"{int(0.6 * points)} of {points} values are outside of 1.2 to 118 ns" in result.stderr
+    )
+    assert not target.exists()
+    result = run(given, "-o", target, "--widths", "some", *gain)
+    assert result.exit_code == 0 and "some states no unit; its values were taken as nanoseconds" in result.stderr
+
+
 def test_wrong_shares_and_widths_are_one_line(cloud, tmp_path):
     points = len(laspy.read(cloud))
     columns = {"percent": np.full(points, 40.0), "share[%]": np.full(points, 0.4), "minus": np.full(points, -0.1)}
@@ -325,9 +384,13 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     assert first.scattered == np.count_nonzero(number > 1)
     starts = np.array([0, 2, 3])
     assert return_light.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
-    said = run(tmp_path / "first.las", "-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200,
-               "--shares", "equal")  # fmt: skip
-    assert "shares of incomplete pulses" in said.stderr
+    words = ("-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200, "--overwrite")
+    said = run(tmp_path / "first.las", *words, "--shares", "equal")
+    assert "equal shares count the returns that the points state" in said.stderr
+    assert "shares of incomplete pulses" not in said.stderr  # they are not those of the points that are there
+    given = add_columns(tmp_path / "first.las", tmp_path / "g.las", footprint=np.full(len(las.points), 0.3))
+    said = run(given, *words, "--shares", "footprint")
+    assert "shares of incomplete pulses are those of the points that are there" in said.stderr
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,7 @@ def test_dead_zones_by_return_number_are_those_of_the_receiver(tmp_path, rng, pa
         one = found[name]
         assert one.pairs == (3 * pairs if name == "all" else pairs)
         assert one.size - 3 * one.error - 0.01 <= true <= one.size + 0.01
+        assert len(f"{one.size!r}".split(".")[1]) <= 2 and len(f"{one.error!r}".split(".")[1]) <= 3  # as they are known
         assert one.error < max(100 / pairs, 0.03)
 
 
@@ -206,7 +207,9 @@ def test_few_pairs_have_no_dead_zone_and_the_text_says_why(tmp_path, rng):
     text = CliRunner().invoke(stats, [str(path)]).stdout
     assert text.count("no-data: fewer than 100 pairs") == 3
     far = _write_pairs(tmp_path / "f.las", (150, 150, 150), 200, rng)
-    assert CliRunner().invoke(stats, [str(far)]).stdout.count("no-data: all far") == 4
+    assert CliRunner().invoke(stats, [str(far)]).stdout.count("no-data: nearly all 100 m or more apart") == 4
+    zones = json.loads(CliRunner().invoke(stats, [str(far), "--json"]).stdout)["total"]["dead_zones"]
+    assert zones["all"] == {"pairs": 600, "size": None, "error": None}
 
 
 def test_hidden_pairs_are_those_that_as_many_as_just_above_the_zone_would_be(tmp_path):

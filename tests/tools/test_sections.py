@@ -1,5 +1,6 @@
 """`plot section`, `plot profile`, `slice --cube` and `plot cube`: what is drawn equals a plain count."""
 
+import json
 from pathlib import Path
 
 import laspy
@@ -241,8 +242,10 @@ def test_profile_of_the_segments_of_a_strip(riegl, tmp_path):
         ("s.csv --flags-with WEAK", 2, "--flags-with selects points"), ("s.csv --column lenght", 2, "'length'"),
         ("s.csv --statistic mean", 2, "needs a --column"), ("empty.csv", 1, "holds no segment"),
         ("other.csv", 1, "'z1' is missing"), ("bad.csv", 1, "holds no segments"), ("nan.csv", 1, "segment 1 holds"),
-        ("bad.geojson", 1, "holds no segments"), ("list.geojson", 1, "holds no segments"), ("none.csv", 1, "none.csv"),
-        ("flat.geojson", 1, "holds no segments"),
+        ("bad.geojson", 1, "holds no segments"), ("list.geojson", 1, "holds no segments"),
+        ("none.csv", 1, "none.csv: cannot be read: No such file"),
+        ("flat.geojson", 1, "holds no segments"), ("x*.csv", 2, "x*.csv: matches no .las, .laz, .csv or .geojson file"),
+        ("deep.geojson", 1, "holds no segments"), ("folder.csv", 2, "the folder holds no"),
     ],
 )  # fmt: skip
 def test_wrong_segments_are_one_line(cloud, tmp_path, monkeypatch, words, code, message):
@@ -255,11 +258,42 @@ def test_wrong_segments_are_one_line(cloud, tmp_path, monkeypatch, words, code, 
              "nan.csv": f"{head}\n" + ",".join([*row[:4], "nan", *row[5:]]) + "\n",
              "flat.geojson": '{"features": [{"properties": {}, "geometry": {"coordinates": [[1, 2], [3, 4]]}}]}',
              }  # fmt: skip
+    texts["deep.geojson"] = "[" * 100_000
+    (tmp_path / "folder.csv").mkdir()
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     result = run("plot", "profile", *words.split(), "-o", "p.png")
     assert result.exit_code == code and message in result.stderr, result.output
     assert result.stderr.count("\n") == 1 and not (tmp_path / "p.png").exists()
+    damaged = code == 1 and words not in ("none.csv", "empty.csv")
+    assert result.stderr.endswith("; make it again with `wavebatch slice`\n") == damaged
+    assert ("holds no segments of" in result.stderr) == (damaged and words != "nan.csv")
+
+
+@pytest.mark.parametrize("given", ["s*.csv", "segs", "@list.txt", "segs/*.*", "segs/s.csv segs/../segs/t.csv"])
+def test_segments_are_found_as_clouds_are(tmp_path, monkeypatch, given):
+    """By pattern, folder and list, each file once; a folder with clouds gives these."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "segs").mkdir()
+    for folder in (tmp_path, tmp_path / "segs"):
+        for name in ("s.csv", "t.csv" if folder.name == "segs" else "s2.csv"):
+            _write_segments(folder / name, [(1, 2), (3, 4)], [1, 2])
+    (tmp_path / "list.txt").write_text("s*.csv\n")
+    result = run("plot", "profile", *given.split(), "-o", "p.png", "--json", "-q")
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert len(document["clouds"]) == 2 and document["values"] == 4
+
+
+def test_a_folder_with_clouds_and_tables_gives_the_clouds(cloud, tmp_path):
+    pytest.importorskip("matplotlib")
+    _write_segments(tmp_path / "s.csv", [(1, 2), (3, 4)], [1, 2])
+    result = run("plot", "profile", tmp_path, "-o", tmp_path / "p.png", "--json", "-q")
+    assert json.loads(result.stdout)["clouds"] == [str(cloud)]
+    (tmp_path / "list.txt").write_text("s.csv\n")
+    result = run("plot", "section", f"@{tmp_path / 'list.txt'}", "-o", tmp_path / "q.png")
+    assert result.exit_code == 2 and "segments have no side view" in result.stderr
 
 
 @pytest.mark.parametrize("many", [40, 3000, 30_000])

@@ -38,7 +38,7 @@ from wavebatch.tools.simulate.from_returns import (
     synthesize_strip,
 )
 from wavebatch.tools.simulate.render import LEAST_SPACING, MOST_NOISE, MOST_NOISE_GAIN, MOST_SPACING
-from wavebatch.tools.simulate.return_light import MOST_HEIGHT, RADAR_LIMITS
+from wavebatch.tools.simulate.return_light import EQUAL, MOST_HEIGHT, RADAR_LIMITS
 
 _RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""
@@ -46,6 +46,9 @@ _RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gai
 _SPACING = {"type": click.FloatRange(LEAST_SPACING, MOST_SPACING), "metavar": "NS"}
 _NOISE = {"type": click.FloatRange(0.0, MOST_NOISE), "metavar": "DN"}
 _RADAR = ("power", "aperture", "divergence", "efficiency", "attenuation")
+_SEEN = 0.001
+"""Share of the energy that is worth a note where it is not of echoes."""
+
 _SCENE_LINES = "\n\n".join(
     [f"{name}: {scene.meaning}." for name, scene in SCENES.items()]
     + [f"canopy.{name}: {meaning}." for name, (meaning, _) in CANOPIES.items()]
@@ -200,7 +203,8 @@ def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     settings = from_options(SynthesisOptions, options, bits=int(options["bits"]), radar=_build_radar(options))
     with counting("points", options["quiet"]) as bar:
         summary = synthesize_strip(cloud, output, settings, overwrite=options["overwrite"], progress=bar.update)
-    print_summary(options, summary.to_json() if options["as_json"] else summary, _list_lines(output, summary))
+    lines = _list_lines(output, summary, settings)
+    print_summary(options, summary.to_json() if options["as_json"] else summary, lines)
 
 
 def _build_radar(options: dict[str, Any]) -> Radar | None:
@@ -218,7 +222,7 @@ def _build_radar(options: dict[str, Any]) -> Radar | None:
     return Radar(height, **given)
 
 
-def _list_lines(output: Path, summary: SynthesisSummary) -> Iterator[str]:
+def _list_lines(output: Path, summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:
     yield f"{output}: {count(summary.points, 'point')}, {count(summary.packets, 'packet')}, gain {summary.gain:.4g}"
     if summary.without_packet:
         yield f"note: {count(summary.without_packet, 'point')} without a packet: the pulse lasts too long"
@@ -226,22 +230,34 @@ def _list_lines(output: Path, summary: SynthesisSummary) -> Iterator[str]:
         yield f"note: {count(summary.saturated, 'return')} above the digitizer's range; lower --gain"
     if summary.scattered:
         yield f"note: {count(summary.scattered, 'pulse')} incomplete in the cloud; sort the cloud by GPS time if needed"
-    share = f" ({summary.energy_recorded / summary.energy:.1%})" if summary.energy else ""
-    yield f"energy: {summary.energy:.4g} DN ns modelled, {summary.energy_recorded:.4g} DN ns in the samples{share}"
-    yield from _list_light(summary)
+    packed = summary.energy_in_packets
+    share = f" ({summary.energy_recorded / packed:.1%})" if packed else ""
+    without = f", {summary.energy_without_packet:.4g} DN ns without a packet" * bool(summary.without_packet)
+    yield f"energy: {packed:.4g} DN ns modelled, {summary.energy_recorded:.4g} DN ns in the samples{share}{without}"
+    if abs(summary.energy_of_level) > _SEEN * packed:
+        yield (
+            f"note: samples without an echo hold {summary.level:.4g} DN on average, not the baseline of "
+            f"{settings.baseline:g} DN: about {summary.energy_of_level:+.2g} DN ns in the samples are not of echoes; "
+            "give a whole --baseline of 3 times --noise or more"
+        )
+    yield from _list_light(summary, settings)
 
 
-def _list_light(summary: SynthesisSummary) -> Iterator[str]:
+def _list_light(summary: SynthesisSummary, settings: SynthesisOptions) -> Iterator[str]:
     """What was assumed about widths and shares."""
     light, points = summary.light, summary.points
     if light.own_width:
         yield f"widths: {light.own_width} of the cloud, {points - light.own_width} of the pulse"
+    if light.assumed_unit:
+        yield f"note: column {settings.widths} states no unit; its values were taken as nanoseconds"
     if light.limited_width:
         yield f"note: {count(light.limited_width, 'width')} outside of half a sample to 118 ns, set to that limit"
     if light.pulses:
         found = f"{light.own_share} of the cloud, {light.assumed_share} assumed"
         yield f"shares: {found}; the returns of a pulse take {summary.light_used:.1%} of its light on average"
-    if light.pulses and summary.scattered:
+    if settings.shares == EQUAL and summary.scattered:
+        yield "note: equal shares count the returns that the points state, also those that the cloud lacks"
+    elif light.pulses and summary.scattered:
         yield "note: shares of incomplete pulses are those of the points that are there in a row"
     if light.over_one:
         yield f"note: {count(light.over_one, 'pulse')} with shares above 1 together, scaled to 1"

@@ -33,7 +33,7 @@ from wavebatch.files.geojson import load_polygons
 from wavebatch.files.inputs import find_files
 from wavebatch.files.text_file import write_text
 from wavebatch.tools.return_stats.areas import RANKS, AreaStats, Grid, PolygonSet, Separation, describe_pairs
-from wavebatch.tools.return_stats.dead_zones import LEAST_PAIRS, DeadZone
+from wavebatch.tools.return_stats.dead_zones import BIN, BINS, LEAST_PAIRS, DeadZone
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
 
 EXIT_UNREADABLE = 1
@@ -52,8 +52,8 @@ _ZONE = ("dead_zone_m", "dead_zone_err_m")
 @recursive_option
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
-@file_option("--polygons", text="Also count in the polygons of this GeoJSON file; where polygons overlap, the first "
-             "one counts.")
+@file_option("--polygons", text="Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the "
+             "file names, or in the coordinates of the clouds; where polygons overlap, the first one counts.")
 @where_option("Count only points")
 @output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
 @common_options("overwrite", "json")
@@ -125,7 +125,9 @@ def _list_zones(found: ReturnStats) -> Iterator[str]:
     yield f"{'dead zone':<14}  {'pairs':>10}  {'size m':>10}  {'error m':>10}  {'ns':>10}"
     for name, one in found.dead_zones.items():
         if math.isnan(one.size):
-            words = f"  no-data: fewer than {LEAST_PAIRS} pairs" if one.pairs < LEAST_PAIRS else "  no-data: all far"
+            few = one.pairs < LEAST_PAIRS
+            why = f"fewer than {LEAST_PAIRS} pairs" if few else f"nearly all {BIN * BINS:g} m or more apart"
+            words = f"  no-data: {why}"
         else:
             words = f"  {one.size:>10.2f}  {one.error:>10.2f}  {one.size / HALF_C:>10.1f}"
         yield f"{name:>14}  {one.pairs:>10}{words}"

@@ -40,6 +40,9 @@ The default that others use; no source for it was found (docs/algorithms.md 5, 9
 MEDIAN_ERROR = math.sqrt(math.pi / 2.0)
 """Standard deviation of the median of many normal numbers, in that of their mean."""
 
+_MOST_DECIMALS = 6
+"""Numbers that need more are hard to read; `format_measure` then writes powers of ten."""
+
 MAD_TO_STD = 1.4826
 """Median absolute deviation of a normal distribution times this is its standard deviation."""
 
@@ -57,15 +60,19 @@ def format_measure(value: float, error: float, sign: str = "+-") -> str:
     Returns
     -------
     str
-        `-` for a value that is not finite.
+        `-` for a value that is not finite. Errors below 1e-5 are `1.0e-08`, and small values have powers of ten too.
     """
     if not math.isfinite(value):
         return "-"
     if not (math.isfinite(error) and error > 0):
         return f"{value:.7g}"
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 6)
+    digits = max(1 - math.floor(math.log10(error)), 0)
     if round(error, digits) >= 10.0 ** (2 - digits) and digits:  # 0.0996 is 0.10
         digits -= 1
+    if digits > _MOST_DECIMALS:
+        places = digits + 1 + math.floor(math.log10(abs(value))) if value else 1
+        shown = f"{value:#.{places}g}" if places > 1 else f"{value:.1g}"
+        return f"{shown} {sign} {error:#.2g}"
     return f"{value:.{digits}f} {sign} {error:.{digits}f}"
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError
@@ -20,18 +20,21 @@ LONGEST_PATTERN = 4096
 """Characters of a pattern: a longer one is taken as a name, which no file can have. 100,000 brackets took minutes."""
 
 
-def find_files(arguments: Iterable[str], *, recursive: bool = False) -> list[Path]:
+def find_files(
+    arguments: Iterable[str], *, recursive: bool = False, kinds: Sequence[Sequence[str]] = (SUFFIXES,)
+) -> list[Path]:
     """Return the files of the arguments, each once, in the order of the arguments.
 
     A folder gives its LAS and LAZ files by name; recursive: with those of all its subfolders, but not of hidden ones.
     `@list.txt` holds one argument per line, relative to the folder of the list; empty lines and lines that start with #
     are skipped. A file that does not exist or a folder that cannot be read is kept: it fails in its turn, so that the
     other files are still processed.
+    kinds: suffixes of the files that folders and patterns give, kind after kind: the first that is there is taken.
     Raises ConfigError if a folder, pattern or list gives no file, or if there is no argument.
     """
     files: dict[str, Path] = {}
     for argument in arguments:
-        for path in _expand(argument, Path(), recursive):
+        for path in _expand(argument, Path(), recursive, kinds):
             files.setdefault(_real_name(path), path)
     if not files:
         raise ConfigError("no file given; name files, folders, patterns or @list.txt")
@@ -53,13 +56,13 @@ def find_strips(arguments: Iterable[str], *, recursive: bool = False) -> list[Pa
     return strips
 
 
-def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
+def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
     if argument.startswith("@"):
-        yield from _read_list(folder / argument[1:], recursive)
+        yield from _read_list(folder / argument[1:], recursive, kinds)
         return
     path = folder / argument
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
-        path = folder / os.path.expanduser(argument)
+        path = folder / _expand_home(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
@@ -71,11 +74,14 @@ def _expand(argument: str, folder: Path, recursive: bool) -> Iterator[Path]:
         yield path
         return
     else:
-        found, problem = map(Path, sorted(glob.glob(str(path), recursive=True))), f"{argument}: matches"
-    strips = [entry for entry in found if _is_strip(entry)]
-    if not strips:
-        raise ConfigError(f"{problem} no .las or .laz file")
-    yield from strips
+        found, problem = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))], f"{argument}: matches"
+    for suffixes in kinds:
+        chosen = [entry for entry in found if _is_visible(entry, suffixes)]
+        if chosen:
+            yield from chosen
+            return
+    *names, last = [suffix for suffixes in kinds for suffix in suffixes]
+    raise ConfigError(f"{problem} no {', '.join(names)} or {last} file")
 
 
 def _walk(folder: Path) -> list[str]:
@@ -95,11 +101,18 @@ def _real_name(path: Path) -> str:
         return os.path.abspath(path)
 
 
-def _is_strip(path: Path) -> bool:
-    return path.suffix.lower() in SUFFIXES and os.path.isfile(path) and not path.name.startswith(".")
+def _expand_home(name: str) -> str:
+    try:
+        return os.path.expanduser(name)
+    except ValueError:  # no user can have this name
+        return name
 
 
-def _read_list(path: Path, recursive: bool) -> Iterator[Path]:
+def _is_visible(path: Path, suffixes: Sequence[str]) -> bool:
+    return path.suffix.lower() in suffixes and os.path.isfile(path) and not path.name.startswith(".")
+
+
+def _read_list(path: Path, recursive: bool, kinds: Sequence[Sequence[str]]) -> Iterator[Path]:
     protect([path])
     empty = True
     for number, line in enumerate(read_text(path, "the list", MOST_LIST).splitlines(), 1):
@@ -108,6 +121,6 @@ def _read_list(path: Path, recursive: bool) -> Iterator[Path]:
             if entry.startswith("@"):
                 raise ConfigError(f"{path}: line {number}: a list cannot name another list")
             empty = False
-            yield from _expand(entry, path.parent, recursive)
+            yield from _expand(entry, path.parent, recursive, kinds)
     if empty:
         raise ConfigError(f"{path}: the list names no file; write one file, folder or pattern per line")

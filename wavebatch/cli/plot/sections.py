@@ -16,7 +16,7 @@ from wavebatch.cli.messages import count, print_json, talk
 from wavebatch.cli.program.completion import complete_columns
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.figure_file import check_picture
-from wavebatch.files.inputs import find_files
+from wavebatch.files.inputs import SUFFIXES, find_files
 
 _output = shared.output_option("Picture to write: .png, .svg or .pdf.")
 
@@ -47,17 +47,27 @@ def _read_line(context: click.Context, parameter: click.Parameter, text: str | N
     return None if text is None else shared.parse_floats(text, "X0,Y0,X1,Y1")
 
 
-def _find(clouds: Sequence[Path], options: dict[str, Any]) -> list[Path]:
-    """Clouds, or one file of voxels."""
-    segments = [path for path in clouds if path.suffix.lower() in (".csv", ".geojson")]
-    if segments:
+def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> tuple[list[Path], bool]:
+    """Clouds, files of segments, or one file of voxels; and whether they are of segments.
+
+    A folder or pattern gives segments where it has no clouds.
+    """
+    from wavebatch.tools.slices.output import SEGMENT_SUFFIXES
+    from wavebatch.tools.slices.read_segments import check_alone, is_segments
+
+    kinds = (SUFFIXES, SEGMENT_SUFFIXES) if or_segments else (SUFFIXES,)
+    paths = find_files(map(str, clouds), recursive=options["recursive"], kinds=kinds)
+    segments = [path for path in paths if is_segments(path)]
+    voxels = [path for path in paths if path.suffix.lower() == ".npz"]
+    if segments and or_segments:
+        check_alone(paths, options)
+    elif segments:
         raise ConfigError(f"{segments[0]}: segments have no side view; use `plot profile`, or `slice --overview`")
-    voxels = [path for path in clouds if path.suffix.lower() == ".npz"]
-    if voxels and len(clouds) > 1:
+    if voxels and len(paths) > 1:
         raise ConfigError(f"{voxels[0]}: a file of voxels is drawn alone")
     if voxels and options["where"] is not None:
         raise ConfigError(f"{voxels[0]}: --where is for points; give it to `wavebatch voxelize`")
-    return list(clouds) if voxels else find_files(map(str, clouds), recursive=options["recursive"])
+    return paths, bool(segments)
 
 
 @click.command()
@@ -85,7 +95,7 @@ def section(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import cut_section
 
-    paths = _find(clouds, options)
+    paths, _ = _find(clouds, options)
     check_picture(output, overwrite=options["overwrite"])
     column = column or ("energy" if paths[0].suffix.lower() == ".npz" else "z")
     found = cut_section(paths, select(column, options), line=options["line"], width=options["width"])
@@ -120,21 +130,18 @@ def profile(clouds: Sequence[Path], output: Path, column: str | None, **options:
     """Draw how many points, or how much of a column, of CLOUDs, voxels or segments lie at each height.
 
     CLOUD is a LAS or LAZ file, a glob, a folder, or @list.txt with one of these per line; or one .npz of `wavebatch
-    voxelize`; or .csv or .geojson files of `wavebatch slice`, whose segments count in each bin by the share of their
-    height there (columns: length, slope, residual, pulses, weight). Heights are those of the coordinates, not above
-    ground. Far outliers in height are left out and counted.
+    voxelize`; or .csv or .geojson files of `wavebatch slice` (a folder gives these where it has no clouds), whose
+    segments count in each bin by the share of their height there (columns: length, slope, residual, pulses, weight).
+    Heights are those of the coordinates, not above ground. Far outliers in height are left out and counted.
 
     Exit code: 0 done, 1 a cloud cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
     from wavebatch.tools.plots.section_data import measure_profile
-    from wavebatch.tools.slices.read_segments import check_alone, is_segments, profile_segments
+    from wavebatch.tools.slices.read_segments import profile_segments
 
     statistic = options["statistic"] or ("count" if column is None else "sum")
     how = {"size": options["size"], "each": options["each"]}
-    segments = any(map(is_segments, clouds))
-    if segments:
-        check_alone(clouds, options)
-    paths = list(dict.fromkeys(clouds)) if segments else _find(clouds, options)
+    paths, segments = _find(clouds, options, or_segments=True)
     check_picture(output, overwrite=options["overwrite"])
     if segments:
         found = profile_segments(paths, column, statistic, **how)

@@ -53,6 +53,8 @@ class ColumnFacts:
     """Difference between two neighbouring values that can be stored; 0 for floating-point numbers."""
     is_flags: bool = False
     """Whether values are EchoFlag bits, which have no mean."""
+    is_standard: bool = False
+    """Whether it is a field of the point format, not an extra dimension."""
 
     @property
     def label(self) -> str:
@@ -152,7 +154,7 @@ class ColumnReader(CloudReader):
             step = abs(float(self.scales["xyz".index(name)]))
         elif name == "scan_angle":
             step = ANGLE_UNIT
-        return ColumnFacts(name, _UNITS.get(name, "-"), "", step)
+        return ColumnFacts(name, _UNITS.get(name, "-"), "", step, is_standard=True)
 
     def _read_standard(self, raw: np.ndarray, name: str) -> np.ndarray:
         if name in "xyz":

@@ -32,9 +32,11 @@ class DeadZone:
 
     pairs: int
     size: float
-    """Distance [m], to 1 cm, below which at most one pair in a thousand lies; NaN with fewer than LEAST_PAIRS."""
+    """Distance [m], to 1 cm, below which at most one pair in a thousand lies. NaN with fewer than LEAST_PAIRS, and
+    where it lies in the last bin, which holds all larger distances too (100 m)."""
     error: float
-    """How much shorter the sensor's own distance may well be [m]: where pairs are rare, none is at the very edge."""
+    """How much shorter the sensor's own distance may well be [m]: where pairs are rare, none is at the very edge. To
+    1 mm; NaN where the size is."""
 
 
 class Distances:
@@ -70,9 +72,9 @@ def find_zone(bins: np.ndarray) -> DeadZone:
         return DeadZone(pairs, math.nan, math.nan)
     below = np.cumsum(bins)
     edge = int(np.searchsorted(below, EDGE * pairs, side="right"))
-    if edge == BINS - 1:  # holds all larger distances
+    if edge == BINS - 1:
         return DeadZone(pairs, math.nan, math.nan)
     # The pairs that were left out may be pairs of surfaces: then the edge is as many gaps between pairs below.
     rank = int(EDGE * pairs) + 1
     gap = (int(np.searchsorted(below, rank + _NEXT)) - edge) * BIN / _NEXT
-    return DeadZone(pairs, round(edge * BIN, 2), max(rank * gap, BIN))
+    return DeadZone(pairs, round(edge * BIN, 2), round(max(rank * gap, BIN), 3))

@@ -65,7 +65,8 @@ class ReturnStats:
     depth: float
     """Mean height of the first above the last return of these pulses [m]; NaN without any."""
     dead_zone: float
-    """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs."""
+    """Distance [m] below which only one pair in a thousand lies; NaN with fewer than a hundred pairs, and where nearly
+    all of them are farther apart than the histogram reaches, see `DeadZone`."""
     dead_zones: dict[str, DeadZone]
     """The same with its error, for `all` pairs and by return number: `1-2`, `2-3`, `3-4` and `4-` (all higher ones)."""
     hidden: float

@@ -22,6 +22,7 @@ from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.wkt_repair import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
@@ -129,9 +130,20 @@ class SynthesisSummary:
     """Of those without a packet."""
     energy_recorded: float = 0.0
     """Sum of the samples above the baseline [DN ns]: less than modelled where the digitizer saturates, and where echoes
-    are lower than half a count."""
+    are lower than half a count; more or less by about `energy_of_level`, and by the sum of the noise, which is 0 on
+    average. Compare it with `energy_in_packets`."""
+    level: float = 0.0
+    """Mean of the samples without an echo [DN]: above the baseline where noise below 0 is cut off, and not on it where
+    rounding without noise cannot hold a fraction."""
+    energy_of_level: float = 0.0
+    """What this adds to `energy_recorded`, if no echo covers it [DN ns]."""
     light: LightCounts = field(default_factory=LightCounts)
     """Whose widths and shares were known."""
+
+    @property
+    def energy_in_packets(self) -> float:
+        """Of the modelled echoes with a packet [DN ns]."""
+        return self.energy - self.energy_without_packet
 
     @property
     def light_used(self) -> float:
@@ -178,7 +190,7 @@ def synthesize_strip(
     around them have at their scan angle. All points keep their coordinates and fields (extra bytes are left out); point
     formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. Memory does not grow with the cloud.
     Raises InputError where the cloud cannot be read or has no GPS times, or the target exists, ConfigError where it
-    lacks a column; no file remains then.
+    lacks a column, or a column holds no widths or shares; no file remains then.
     """
     options = options or SynthesisOptions()
     recordings = [options.recording(length) for length in _LENGTHS]
@@ -193,17 +205,20 @@ def synthesize_strip(
         light = model()
         # A model counts what it sees: each pass over the cloud has one.
         gain = _choose_gain(reader, options, model()) if options.gain is None else options.gain
-        summary = SynthesisSummary(gain=gain, light=light.counts)
+        summary = SynthesisSummary(gain=gain, light=light.counts, level=recordings[0].empty_level)
+        rise = options.spacing * (summary.level - options.baseline)
         with _open_writer(reader, Path(target), options, overwrite) as writer:
             for number, (rows, records) in enumerate(_read_pulses(reader)):
                 rng = np.random.default_rng(np.random.SeedSequence(options.seed, spawn_key=(number,)))
                 pulses = _model_pulses(rows, records, options, gain, light, rng)
                 offset, energy = _write_packets(writer, recordings, pulses, rng)
                 summary.energy_recorded += energy
+                summary.energy_of_level += rise * float(np.append(_LENGTHS, 0)[pulses.kind].sum())
                 writer.write_points(_fill_points(writer.dtype, records, pulses, offset, options))
                 _count(summary, pulses, recordings[0])
                 if progress:
                     progress(len(rows))
+            light.check_widths()
             writer.commit()
     return summary
 
@@ -233,7 +248,7 @@ def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, 
         digitizers=[Digitizer(number, options.bits, length, options.spacing) for number, length in lengths],
         scales=reader.scales,
         offsets=reader.offsets,
-        records=[vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)],
+        records=repair_records(vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)),
         overwrite=overwrite,
     )
 
@@ -248,6 +263,7 @@ def _choose_gain(reader: ReturnReader, options: SynthesisOptions, light: LightMo
     if reader.point_count and not total:
         rest = " or share 0" if options.shares else ""
         raise InputError(f"{reader.path}: all returns have intensity 0{rest}, so there is nothing to model")
+    light.check_widths()
     level = int(np.searchsorted(np.cumsum(counts), 0.999 * total))
     room = FULL_SHARE * ((1 << options.bits) - 1 - options.baseline)
     return float(room / _LEVELS[min(level, len(_LEVELS) - 1)])

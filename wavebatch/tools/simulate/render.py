@@ -86,6 +86,14 @@ class Recording:
         return float(np.hypot(self.noise_std, QUANTISATION_STD))
 
     @property
+    def empty_level(self) -> float:
+        """Mean of the recorded samples without signal [count]: clipping and rounding may move it off the baseline."""
+        spread = float(np.hypot(self.noise_std, self.baseline_spread))
+        place = np.linspace(-8.0, 8.0, 16_000)  # an even number: a baseline on a whole count has no ties
+        counts = np.clip(np.floor(self.baseline + 0.5 + spread * place), 0, self.clip)
+        return float(np.average(counts, weights=np.exp(-0.5 * place**2)))
+
+    @property
     def duration(self) -> float:
         """Time of the last sample [ns]."""
         return (self.n_samples - 1) * self.spacing

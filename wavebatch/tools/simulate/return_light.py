@@ -24,6 +24,9 @@ EQUAL = "equal"
 WIDEST = 50.0
 """Largest standard deviation of an echo [ns]; the least is half a sample."""
 
+_MOST_LIMITED = 0.5
+"""Largest share of the widths of a column that may be limited: with more, the column is not what was meant."""
+
 RADAR_LIMITS = {
     "power": (1e-6, 1e12),
     "aperture": (1e-4, 100.0),
@@ -74,6 +77,8 @@ class LightCounts:
     """Returns with a width in the cloud; the others have the width of the pulse."""
     limited_width: int = 0
     """Of these, returns whose width lies outside of half a sample to WIDEST, and was set to that limit."""
+    assumed_unit: bool = False
+    """Whether the column of the widths states no unit, and its values were taken as ns."""
     own_share: int = 0
     """Returns with a share in the cloud."""
     assumed_share: int = 0
@@ -111,6 +116,8 @@ class LightModel:
     read_share: Callable[[np.ndarray], np.ndarray] | None
     share_column: str | None
     """Column of the shares, EQUAL, or None for returns that fill the beam each."""
+    width_column: str | None = None
+    """Column of the widths; None where no option names it."""
     counts: LightCounts = field(default_factory=LightCounts)
 
     def measure(self, rows: np.ndarray, records: np.ndarray, starts: np.ndarray) -> Light:
@@ -128,6 +135,16 @@ class LightModel:
         if self.share_column is not None:
             power *= self._measure_shares(rows, records, starts)
         return Light(power, sigma)
+
+    def check_widths(self) -> None:
+        """Raises ConfigError where most widths of the named column had to be limited: they are no widths in ns."""
+        counts = self.counts
+        if self.width_column is not None and counts.limited_width > _MOST_LIMITED * counts.own_width:
+            least, most = 0.5 * self.spacing * FWHM_PER_SIGMA, WIDEST * FWHM_PER_SIGMA
+            raise ConfigError(
+                f"{self.path}: --widths {self.width_column}: {counts.limited_width} of {counts.own_width} values are "
+                f"outside of {least:.2g} to {most:.0f} ns; give a column with the width of each echo in ns"
+            )
 
     def _measure_sigma(self, width: np.ndarray) -> np.ndarray:
         known = width > 0
@@ -195,9 +212,11 @@ def open_light(
 ) -> LightModel:
     """The model of a cloud; widths, shares: columns, or EQUAL for shares.
 
-    Raises ConfigError if the cloud has no such column, or in another unit.
+    Raises ConfigError if the cloud has no such column, or in another unit, or if it is a field that LAS itself defines:
+    none of these is a width or a share, and integers such as the class pass for both.
     """
     read = {"widths": None, "shares": None}
+    counts = LightCounts()
     wanted = {"widths": (widths, ("-", "ns")), "shares": (None if shares == EQUAL else shares, ("-",))}
     for name, (column, units) in wanted.items():
         if column is None:
@@ -206,8 +225,16 @@ def open_light(
             reader = stack.enter_context(ColumnReader(path, column))
             if reader.facts.unit not in units:
                 raise ConfigError(f"{path}: --{name} {column}: is in [{reader.facts.unit}], needed is [{units[-1]}]")
+            if reader.facts.is_standard:
+                needed = "the width of each echo in ns" if name == "widths" else "the share of each return, 0 to 1"
+                raise ConfigError(
+                    f"{path}: --{name} {column}: is the LAS field {reader.facts.name}; give an extra dimension with "
+                    f"{needed}"
+                )
+            if name == "widths":
+                counts.assumed_unit = reader.facts.unit == "-"
             read[name] = reader.find_value(column)
-    return LightModel(path, radar, sigma, spacing, read["widths"], read["shares"], shares)
+    return LightModel(path, radar, sigma, spacing, read["widths"], read["shares"], shares, widths, counts)
 
 
 def _receive(reflectance: np.ndarray, rows: np.ndarray, radar: Radar, path: Path) -> np.ndarray:

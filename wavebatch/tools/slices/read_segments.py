@@ -30,6 +30,9 @@ _COLUMNS = {
 }  # fmt: skip
 """Columns that can be summed or averaged, with unit and meaning."""
 
+REMEDY = "make it again with `wavebatch slice`"
+"""What to do about a damaged file."""
+
 _PIECE = 100_000
 
 
@@ -41,7 +44,7 @@ def is_segments(path: Path) -> bool:
 def read_segments(path: Path, column: str | None) -> tuple[np.ndarray, np.ndarray]:
     """Heights of both ends f8 (n, 2), and the values of a column (n,), ones without a column.
 
-    Raises InputError for a file that holds no segments, ConfigError for another column.
+    Raises InputError for a file that cannot be read or holds no segments, ConfigError for another column.
     """
     if column is not None and column not in _COLUMNS:
         raise ConfigError(f"{path}: has no column {column!r}; {nearest(column, _COLUMNS)}")
@@ -49,14 +52,16 @@ def read_segments(path: Path, column: str | None) -> tuple[np.ndarray, np.ndarra
         with path.open(encoding="utf-8", newline="") as file:
             rows = _read_features(json.load(file)) if path.suffix.lower() == ".geojson" else csv.DictReader(file)
             found = [_read_row(row, column) for row in rows]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; check the name and the access") from error
     except KeyError as error:
-        raise InputError(f"{path}: holds no segments of `wavebatch slice`: {error} is missing") from error
-    except (OSError, ValueError, TypeError, AttributeError, IndexError, csv.Error) as error:
-        raise InputError(f"{path}: holds no segments of `wavebatch slice` ({error})") from error
+        raise InputError(f"{path}: holds no segments of `wavebatch slice`: {error} is missing; {REMEDY}") from error
+    except (ValueError, TypeError, AttributeError, IndexError, RecursionError, csv.Error) as error:
+        raise InputError(f"{path}: holds no segments of `wavebatch slice` ({error}); {REMEDY}") from error
     values = np.array(found, np.float64).reshape(-1, 3)
     if not np.isfinite(values).all():
         bad = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0]) + 1
-        raise InputError(f"{path}: segment {bad} holds a value that is no finite number")
+        raise InputError(f"{path}: segment {bad} holds a value that is no finite number; {REMEDY}")
     return values[:, :2], values[:, 2]
 
 
