@@ -350,6 +350,7 @@ def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
 @pytest.mark.parametrize(
     "wrong",
     [
+        {"n_samples": 10**400},
         {"spacing": 1e300},
         {"spacing": 1e-9},
         {"noise_std": 1e300},

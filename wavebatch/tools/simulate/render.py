@@ -61,7 +61,7 @@ class Recording:
             f"noise_gain must lie from 0 to {MOST_NOISE_GAIN:g}": 0 <= self.noise_gain <= MOST_NOISE_GAIN,
             f"the pulse's sigma, {self.pulse.sigma:g} ns, must be no longer than the "
             f"waveform, {self.n_samples} samples {self.spacing:g} ns apart": self.pulse.sigma
-            <= self.n_samples * self.spacing,
+            <= min(self.n_samples, MAX_SAMPLES) * self.spacing,
             "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": abs(self.rho - self.color / (self.color + 1)) < 0.006,
             "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,
             "saturation must be a count that the bits can hold": 0 < self.clip < 1 << self.bits,
