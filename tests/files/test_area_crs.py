@@ -3,12 +3,14 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from strips import add_record
 
+import wavebatch
 from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
@@ -109,8 +111,48 @@ def test_coordinates_of_the_strip_stay(strip, plain, tmp_path):
         assert polygon.place(path, read_header(path)).rings[0].tolist() == _box(path).tolist()
     # A strip with local coordinates near the origin has areas there: they are no degrees.
     near = type("H", (), {"mins": (0, 0, 0), "maxs": (80, 60, 9), "vlrs": ()})()
-    file = AreaFile("a.geojson", None, True)
+    file = read_area_file("a.geojson", None, [np.eye(2)])
     assert place_rings(file, [np.eye(2)], strip, near)[0].tolist() == np.eye(2).tolist()
+
+
+def _local(path, low=0.0, high=400.0):
+    """The header of a strip as if it lay in a local grid, and were larger than degrees are."""
+    return replace(read_header(path), mins=(low, low, low), maxs=(high, high, high))
+
+
+@pytest.mark.parametrize("has_crs", [False, True])
+def test_small_coordinates_inside_of_a_strip_are_those_of_the_strip(strip, plain, has_crs):
+    path = strip if has_crs else plain
+    boxes = [_square(10, 80), _square(-50, -10)]
+    file = read_area_file("a.geojson", None, boxes)
+    for box in boxes:  # the second misses the strip; all areas of a file are in one CRS
+        assert place_rings(file, [box], path, _local(path))[0].tolist() == box.tolist()
+    alone = read_area_file("a.geojson", None, boxes[1:])  # can only be in degrees
+    if has_crs:
+        pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+        assert np.abs(place_rings(alone, boxes[1:], path, _local(path))[0]).max() > 1e6
+    else:
+        with pytest.raises(InputError, match="is in degrees"):
+            place_rings(alone, boxes[1:], path, _local(path))
+
+
+def test_one_point_at_the_origin_does_not_make_degrees_coordinates_of_the_strip(strip):
+    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    header = read_header(strip)
+    box = _project(_box(strip), "EPSG:32633", "EPSG:4326")
+    file = read_area_file("a.geojson", None, [box])
+    placed = place_rings(file, [box], strip, replace(header, mins=(0.0, 0.0, 0.0)))[0]
+    assert placed.tolist() == place_rings(file, [box], strip, header)[0].tolist() and placed.min() > 1e5
+
+
+def test_extents_that_are_no_numbers_hold_nothing(plain):
+    broken = _local(plain, np.nan, np.nan)
+    with pytest.raises(InputError, match="is in degrees"):
+        place_rings(read_area_file("a.geojson", None, [_square(10, 80)]), [_square(10, 80)], plain, broken)
+
+
+def _square(low, high):
+    return np.array([[low, low], [high, low], [high, high], [low, high]], np.float64)
 
 
 def test_what_cannot_be_placed_is_one_line(strip, plain, tmp_path, monkeypatch):
@@ -121,11 +163,42 @@ def test_what_cannot_be_placed_is_one_line(strip, plain, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
     with pytest.raises(ConfigError, match=r"a.geojson: is in OGC:CRS84, .*needs pyproj: .*pip install .*; or write"):
         polygon.place(strip, read_header(strip))
-    # Without pyproj, areas that lie in the strip are taken as its own: the name may be that of the same CRS.
-    (inside,) = load_polygons(_write(tmp_path / "b.geojson", _box(strip), "my grid"))
-    assert inside.place(strip, read_header(strip)).rings[0].tolist() == _box(strip).tolist()
     with pytest.raises(ConfigError, match="its member crs has no name"):
         read_area_file("c.geojson", {"type": "link"}, [])
+
+
+def test_without_pyproj_only_the_strips_own_code_is_taken(strip, tmp_path, monkeypatch):
+    """Two CRS of the same zone differ by hundreds of metres: that the areas lie in the strip says nothing."""
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    header, box = read_header(strip), _box(strip)
+    names = ("EPSG:32633", "epsg:32633", "urn:ogc:def:crs:EPSG::32633", "urn:x-ogc:def:crs:EPSG:6.9:32633",
+             "http://www.opengis.net/def/crs/EPSG/0/32633", ZONE)  # fmt: skip
+    for name in names:
+        (polygon,) = load_polygons(_write(tmp_path / "a.geojson", box, name))
+        assert polygon.place(strip, header).rings[0].tolist() == box.tolist()
+    for name in ("EPSG:23033", "EPSG:25833", "my grid", "x" * 10_000):
+        (polygon,) = load_polygons(_write(tmp_path / "a.geojson", box, name))
+        with pytest.raises(ConfigError, match=r"is in EPSG:32633; .*needs pyproj: .*pip install .*; or") as caught:
+            polygon.place(strip, header)
+        assert name[:60] in str(caught.value) and len(str(caught.value)) < 600
+
+
+def test_a_strip_without_a_crs_takes_no_small_coordinates_of_a_named_one(plain):
+    """They could be degrees of that CRS; large ones can only be metres."""
+    header = read_header(plain)
+    for name in ("EPSG:4258", "EPSG:31467"):
+        file = AreaFile("a.geojson", name, (10, 10, 80, 80))
+        with pytest.raises(InputError, match=f"a.geojson: is in {name}, and .*plain.las has no CRS"):
+            place_rings(file, [_square(10, 80)], plain, _local(plain))
+    file = read_area_file("a.geojson", {"properties": {"name": "EPSG:31467"}}, [_box(plain)])
+    assert place_rings(file, [_box(plain)], plain, header)[0].tolist() == _box(plain).tolist()
+
+
+def test_degrees_of_a_strip_in_degrees_stay(plain, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    monkeypatch.setattr("wavebatch.files.area_crs.read_crs_definition", lambda path, header: "EPSG:4326")
+    file = read_area_file("a.geojson", {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, [_square(10, 80)])
+    assert place_rings(file, [_square(10, 80)], plain, _local(plain))[0].tolist() == _square(10, 80).tolist()
 
 
 def test_an_unknown_crs_is_one_line(strip, tmp_path):
@@ -149,6 +222,40 @@ def test_a_bare_polygon_and_a_single_feature_are_geojson_too(strip, tmp_path):
         (tmp_path / "a.geojson").write_text(json.dumps(document))
         (polygon,) = load_polygons(tmp_path / "a.geojson")
         assert polygon.rings[0].tolist() == _box(strip).tolist()
+
+
+def test_a_crs_counts_wherever_it_stands(tmp_path):
+    """GDAL names it in the document, PostGIS in each geometry."""
+    member = {"type": "name", "properties": {"name": "EPSG:32632"}}
+    shape = {"type": "Polygon", "coordinates": [_square(10, 80).tolist()]}
+    parts = {"type": "MultiPolygon", "coordinates": [shape["coordinates"]]}
+    named = {"geometry": {**shape, "crs": member}, "type": "Feature"}
+    documents = [{**shape, "crs": member}, {**parts, "crs": member}, named,
+                 {"type": "Feature", "geometry": shape, "crs": member},
+                 {"type": "FeatureCollection", "features": [named, named]},
+                 {"type": "FeatureCollection", "features": [{"geometry": shape}, named], "crs": member},
+                 {"type": "FeatureCollection", "features": [{"geometry": shape}], "crs": member}]  # fmt: skip
+    for document in documents:
+        (tmp_path / "a.geojson").write_text(json.dumps(document))
+        assert {polygon.file.crs for polygon in load_polygons(tmp_path / "a.geojson")} == {"EPSG:32632"}
+    other = {"type": "name", "properties": {"name": "EPSG:4326"}}
+    for more in ({"geometry": shape}, {"geometry": shape, "crs": other}):
+        (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [named, more]}))
+        with pytest.raises(ConfigError, match=r"its areas name more than one CRS \(EPSG:32632, (none|EPSG:4326)\)"):
+            load_polygons(tmp_path / "a.geojson")
+
+
+def test_resume_sees_another_crs_of_the_same_corners(strip, tmp_path):
+    pytest.importorskip("pyproj", reason="pyproj (extra gis) is not installed")
+    file, words = tmp_path / "a.geojson", ["run", strip, "-o", tmp_path / "o", "--polygon", tmp_path / "a.geojson"]
+    said = []
+    for crs in ("EPSG:32633", "urn:ogc:def:crs:EPSG::32633", "EPSG:23033", "EPSG:23033"):
+        _write(file, _box(strip), crs)
+        result = CliRunner().invoke(main, list(map(str, [*words, "--resume"])))
+        assert result.exit_code == 0, result.output
+        report = json.loads((tmp_path / "o" / "utm.report.json").read_text())
+        said.append(("skipped" in result.stderr, report["request"]["selection"]["polygon"]["crs"]))
+    assert said == [(False, "EPSG:32633"), (True, "EPSG:32633"), (False, "EPSG:23033"), (True, "EPSG:23033")]
 
 
 def test_run_stats_and_calibrate_use_placed_areas(strip, tmp_path):
@@ -191,3 +298,11 @@ def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_pat
     facts = type("F", (), {"path": strip, "header": read_header(strip)})()
     placed = chosen.place(facts)
     assert placed.describe() == chosen.describe() and placed.areas != chosen.areas
+
+
+def test_help_says_in_which_coordinates_areas_are():
+    for command, more in (("run", ""), ("stats", ""), ("calibrate", "in the coordinates of the strips only")):
+        result = CliRunner().invoke(main, [command, "--help"])
+        text = " ".join(result.output.split())
+        assert "in WGS 84, in the CRS that the file names, or in the coordinates of the" in text and more in text
+    assert "in the CRS that the file names" in wavebatch.run.__doc__

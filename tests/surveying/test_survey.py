@@ -79,7 +79,8 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])
 def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     scene = make_scene("flat", noise_gain=gain, pulse=find_pulse("leica"), n_samples=100)
-    assert survey_block(make_block(scene, 3000, seed=6)[0]).system.noise_gain == pytest.approx(gain, rel=0.2)
+    found = [survey_block(make_block(scene, 3000, seed=seed)[0]).system.noise_gain for seed in (6, 7, 8)]
+    assert np.mean(found) == pytest.approx(gain, rel=0.2)
 
 
 def test_any_waveforms_can_be_surveyed(rng):

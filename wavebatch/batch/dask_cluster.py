@@ -285,6 +285,7 @@ def _connected(address: str) -> Iterator[Any]:
 
     try:
         _knock(address)
+        _check_keys(address)
         options = {"timeout": _CONNECT, "set_as_default": False, "name": "wavebatch"}
         client = _call_in_time(_CONNECT + 0.5, lambda: Client(address, **options))
     except Exception as error:
@@ -307,6 +308,14 @@ def _knock(address: str) -> None:
     if not host or not port.isdigit():
         raise ValueError("it has no host and port")
     socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
+
+
+def _check_keys(address: str) -> None:
+    """Raise ValueError where TLS is wanted and dask has no keys; a client that fails complains again when it ends."""
+    from distributed.security import Security
+
+    if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
+        raise ValueError("dask has no certificate and key here (distributed.comm.tls in its configuration); set them")
 
 
 def _call_in_time(seconds: float, function: Callable) -> Any:

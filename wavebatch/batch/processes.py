@@ -35,19 +35,20 @@ from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, rem
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
 
+_PATIENCE = 3.0
+"""Seconds that processes have to end by themselves."""
+
 _LATENCY = 0.1
 """Seconds after which Ctrl-C is seen at the latest while results are waited for."""
 
 _NAME = "wavebatch"
 """Start of the names of our processes."""
 
-_SET_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of linux/prctl.h."""
-
 _FIRST_MODULE = "wavebatch.batch.row_transfer"
 """What a new process imports while it waits: with it comes nearly all that calls need."""
-_PATIENCE = 3.0
-"""Seconds that processes have to end by themselves."""
+
+_SET_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of linux/prctl.h."""
 
 
 class WorkerDied(Exception):
@@ -162,7 +163,7 @@ class Workers:
                 self._workers, self._calls = [], queue.SimpleQueue()
 
 
-@atexit.register
+@atexit.register  # called before that of multiprocessing, which is registered earlier
 def _kill_all() -> None:
     """At the end of the program: Python would wait for ever for a stopped process that an interrupt has left here."""
     for process in multiprocessing.active_children():
@@ -177,7 +178,7 @@ def start_early(jobs: int) -> None:
             _early.append(_Process())
 
 
-@atexit.register  # after that of multiprocessing, and so called before it: it would wait for stopped processes
+@atexit.register  # called before that of multiprocessing, which would wait for stopped processes
 def end_early() -> None:
     """End the processes that no Workers took."""
     while _early:
@@ -334,7 +335,7 @@ def _ctrl_c_held() -> Iterator[None]:
 def _work(pipe: Connection) -> None:
     """In a new process: make calls until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
-    _die_with_parent()
+    _wake_when_parent_dies()
     keep_freed_memory()
     threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
     with contextlib.suppress(Exception):  # the call that needs it reports the error
@@ -344,13 +345,16 @@ def _work(pipe: Connection) -> None:
             pipe.send_bytes(_answer(pipe.recv_bytes()))
 
 
-def _die_with_parent() -> None:
-    """Let Linux kill this process when its parent dies: a stopped process cannot see that itself."""
+def _wake_when_parent_dies() -> None:
+    """Let Linux continue this process, if it is stopped, when its parent dies: `_end_with` then cleans up and ends it.
+
+    A signal that kills would leave what the parent shared in memory.
+    """
     if sys.platform == "linux":
         import ctypes
 
         with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGKILL)
+            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGCONT)
 
 
 def _answer(pickled: bytes) -> bytes:

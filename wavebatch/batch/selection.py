@@ -73,16 +73,21 @@ class Selection:
         return self.polygons if self.placed is None else self.placed
 
     def describe(self) -> dict[str, Any]:
-        """Return plain values for the report and for --resume, with the polygons' corners as a hash."""
-        rings = [ring for polygon in self.polygons for ring in polygon.rings]
-        corners = hashlib.sha256(b"".join(ring.tobytes() + b"|" for ring in rings)).hexdigest() if rings else None
+        """Return plain values for the report and for --resume, with the polygons' corners as a hash and their CRS."""
         return {
             "drop_flags": [flag.name for flag in EchoFlag if self.drop_flags & flag],
             "classes": list(self.classes),
             "bbox": None if self.bbox is None else list(self.bbox),
-            "polygon": None if self.polygon is None else {"file": Path(self.polygon).name, "corners_sha256": corners},
+            "polygon": None if self.polygon is None else self._describe_polygons(),
             "where": None if self.where is None else self.where.text,
         }
+
+    def _describe_polygons(self) -> dict[str, Any]:
+        """All that decides where they lie; the strip's part of it is in its header, which --resume compares too."""
+        rings = [ring for polygon in self.polygons for ring in polygon.rings]
+        corners = hashlib.sha256(b"".join(ring.tobytes() + b"|" for ring in rings)).hexdigest() if rings else None
+        crs = next((polygon.file.crs for polygon in self.polygons if polygon.file is not None), None)
+        return {"file": Path(self.polygon).name, "corners_sha256": corners, "crs": crs}
 
     def list_wanted(self) -> tuple[str, ...]:
         """Return the wavebatch columns that --where names exactly, so that the chain gets their stages."""

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
 @shared.recursive_option
-@shared.file_option("--targets", required=True, text="Targets: GeoJSON polygons with the property reflectance, or CSV "
-                    "with reflectance and x, y, radius or vertices.")
+@shared.file_option("--targets", required=True,
+                    text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
+                    "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
+                    "in the coordinates of the strips only.")
 @shared.output_option("Calibration file to write.", "CAL.toml")
 @click.option("--reflectance-error", type=click.FloatRange(0.0, 1.0), default=0.03, show_default=True, metavar="SHARE",
               help="Relative standard deviation of the reflectances of the targets.")

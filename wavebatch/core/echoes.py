@@ -314,6 +314,7 @@ def find_order(waveform: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     waveform : int (m,)
         From 0; memory grows with the largest.
     time : float (m,)
+        Finite; rows of NaN keep their place.
 
     Returns
     -------

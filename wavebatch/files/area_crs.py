@@ -3,7 +3,8 @@
 `run --polygon`, `stats --polygons` and `calibrate --targets` place their areas with `place_rings`, once per strip. The
 standard of GeoJSON (RFC 7946) knows longitude and latitude in WGS 84 only. Files of GDAL, QGIS and wavebatch with
 another CRS name it in the member `crs`; others, which have coordinates of the strip and do not say so, are known by
-their size.
+where they lie. Before you change it: areas in the wrong place are worse than none. Coordinates that name another CRS
+are projected or refused, never used as they are.
 """
 
 from __future__ import annotations
@@ -25,6 +26,12 @@ from wavebatch.files.las.header import LasHeader
 WGS84 = "OGC:CRS84"
 """Longitude and latitude, in this order."""
 
+_SAME_DEGREES = (WGS84, "EPSG:4326")
+"""Names of WGS 84 in files of GIS: x is the longitude in all of them."""
+
+_LONGEST_NAME = 80
+"""Most characters of a CRS in a message."""
+
 _STEP = 100.0
 """Longest edge that is projected as one [m]: a straight line of degrees bends by less than a millimetre over it."""
 
@@ -32,6 +39,15 @@ _MOST_PIECES = 10_000
 """Most parts of an edge."""
 
 _METRES_PER_DEGREE = 111_320.0
+
+_LONGEST_STRIP = 150_000.0
+"""Longest side of a strip whose extent is believed: one point at the origin makes that of a UTM zone longer."""
+
+_CODE = re.compile(
+    r"urn:(?:x-)?ogc:def:crs:(\w+):[^:]*:(\w+)|https?://www\.opengis\.net/def/crs/(\w+)/[^/]*/(\w+)|(EPSG|OGC):(\w+)",
+    re.IGNORECASE,
+)
+"""A CRS by its code as GDAL, QGIS and OGC write it: as a URN, as an address, or EPSG:n."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +57,16 @@ class AreaFile:
     path: str
     crs: str | None
     """That of the member `crs`; None: the file has none."""
-    maybe_degrees: bool
-    """Whether all corners could be longitude and latitude."""
+    extent: tuple[float, float, float, float] | None
+    """West, south, east and north of all its corners, also of those of other areas; None: it has none."""
+
+    @property
+    def maybe_degrees(self) -> bool:
+        """Whether all corners could be longitude and latitude."""
+        if self.extent is None:
+            return True
+        west, south, east, north = self.extent
+        return west >= -180 and south >= -90 and east <= 180 and north <= 90
 
 
 def read_area_file(path: Path | str, member: Any, rings: Sequence[np.ndarray]) -> AreaFile:
@@ -51,17 +75,22 @@ def read_area_file(path: Path | str, member: Any, rings: Sequence[np.ndarray]) -
     member: value of the member `crs` of the file, None without. rings: all corners, f8 (k, 2) each.
     Raises ConfigError for a member that gives no name.
     """
-    name = None
-    if member is not None:
-        try:
-            name = str(member["properties"]["name"]).strip()
-        except (KeyError, TypeError) as error:
-            raise ConfigError(f"{path}: its member crs has no name; write it in WGS 84, without that member") from error
-        found = re.fullmatch(r"urn:(?:x-)?ogc:def:crs:(\w+):[^:]*:(\w+)", name, re.IGNORECASE)
-        name = f"{found[1].upper()}:{found[2].upper()}" if found else name
-    corners = np.concatenate([*rings, np.zeros((0, 2))])
-    degrees = bool(((np.abs(corners[:, 0]) <= 180) & (np.abs(corners[:, 1]) <= 90)).all())
-    return AreaFile(str(path), name, degrees)
+    return AreaFile(str(path), read_crs_name(path, member), _bound(rings))
+
+
+def read_crs_name(path: Path | str, member: Any) -> str | None:
+    """Return the name of a CRS in the member `crs` of GeoJSON, `EPSG:n` where it is a code; None without the member.
+
+    path: for messages. Raises ConfigError for a member that gives no name.
+    """
+    if member is None:
+        return None
+    try:
+        name = str(member["properties"]["name"]).strip()
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: its member crs has no name; write it in WGS 84, without that member") from error
+    found = _CODE.fullmatch(name)
+    return ":".join(part.upper() for part in found.groups() if part) if found else name
 
 
 def place_rings(
@@ -70,7 +99,7 @@ def place_rings(
     """Return the rings in the coordinates of a strip.
 
     Rings are projected where the file names another CRS than that of the strip, or where its corners can only be
-    degrees: the strip does not lie there. Edges get more corners where they are long.
+    degrees. Edges get more corners where they are long.
 
     Parameters
     ----------
@@ -93,28 +122,49 @@ def place_rings(
         Without pyproj.
     """
     rings = [np.asarray(ring, np.float64) for ring in rings]
-    if file is None or not rings or (file.crs is None and not (file.maybe_degrees and not _holds_degrees(header))):
+    source = None if file is None or not rings else _find_source(file, header)
+    if source is None:
         return rings
-    overlap = not describe_miss(rings, header)
     definition = read_crs_definition(strip, header)
-    source = file.crs or WGS84
     if definition is None:
-        if file.crs is not None and not file.maybe_degrees:
-            return rings  # nothing says that it is not the strip's
+        if not file.maybe_degrees:
+            return rings  # nothing says that the CRS is not the strip's
+        what = f"in degrees ({source})" if source in _SAME_DEGREES else f"in {source[:_LONGEST_NAME]}"
         raise InputError(
-            f"{file.path}: is in degrees ({source}), and {strip} has no CRS to project it into; write it in the "
-            "coordinates of the strip"
+            f"{file.path}: is {what}, and {strip} has no CRS to project it into; write it in the coordinates of the "
+            "strip, without a member crs"
         )
-    if _code(definition) == source or definition == source:
+    code = _code(definition) or definition
+    if source in (definition, code) or (source in _SAME_DEGREES and code in _SAME_DEGREES):
         return rings
+    return _project(file, rings, source, strip, definition)
+
+
+def _find_source(file: AreaFile, header: LasHeader) -> str | None:
+    """The CRS of a file of areas; None: that of the strip.
+
+    Areas of a file without a CRS that lie in the strip are in its coordinates, be they small ones: the strip may have a
+    local grid. All areas of a file are in the same CRS, so its whole extent counts.
+    """
+    if file.crs is not None:
+        return file.crs
+    sides = [high - low for low, high in zip(header.mins[:2], header.maxs[:2], strict=True)]
+    inside = file.extent is not None and max(sides) <= _LONGEST_STRIP and _overlaps(file.extent, header)
+    return WGS84 if file.maybe_degrees and not inside and not _holds_degrees(header) else None
+
+
+def _project(
+    file: AreaFile, rings: Sequence[np.ndarray], source: str, strip: Path, definition: str
+) -> list[np.ndarray]:
+    """Rings of the CRS `source` in that of a strip, `definition`."""
     try:
         import pyproj
     except ImportError as error:
-        if overlap:
-            return rings
+        other = _code(definition)
+        own = f"is in {other}" if other else "does not name its CRS by a code"
         raise ConfigError(
-            f"{file.path}: is in {source}, and {strip} is not; projecting it needs pyproj: {advise_install('pyproj')}; "
-            "or write it in the coordinates of the strip"
+            f"{file.path}: is in {source[:_LONGEST_NAME]}, and {strip} {own}; projecting it needs pyproj: "
+            f"{advise_install('pyproj')}; or write it in the coordinates of the strip, without a member crs"
         ) from error
     try:
         target = pyproj.CRS.from_user_input(definition).to_2d()
@@ -133,17 +183,28 @@ def place_rings(
 
 def describe_miss(rings: Sequence[np.ndarray], header: LasHeader) -> str:
     """Say, with both extents, that all rings lie outside a strip by its header; empty where they do not."""
+    extent = _bound(rings)
     (west, south, _), (east, north, _) = header.mins, header.maxs
-    corners = np.concatenate([*rings, np.zeros((0, 2))])
-    if not len(corners) or not all(map(math.isfinite, (west, south, east, north))):
+    if extent is None or not all(map(math.isfinite, (west, south, east, north))) or _overlaps(extent, header):
         return ""
-    (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
-    if left <= east and right >= west and low <= north and high >= south:
-        return ""
+    left, low, right, high = extent
     return (
         f"the area (x {left:.10g} to {right:.10g}, y {low:.10g} to {high:.10g}) lies outside the strip (x {west:.10g} "
         f"to {east:.10g}, y {south:.10g} to {north:.10g}); is it in another CRS?"
     )
+
+
+def _bound(rings: Sequence[np.ndarray]) -> tuple[float, float, float, float] | None:
+    """West, south, east and north of all rings; None without a corner."""
+    corners = np.concatenate([*rings, np.zeros((0, 2))])
+    return (*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()) if len(corners) else None
+
+
+def _overlaps(extent: tuple[float, float, float, float], header: LasHeader) -> bool:
+    """Whether an extent and that of a strip by its header have a point in common."""
+    (west, south, _), (east, north, _) = header.mins, header.maxs
+    left, low, right, high = extent
+    return left <= east and right >= west and low <= north and high >= south
 
 
 def _holds_degrees(header: LasHeader) -> bool:

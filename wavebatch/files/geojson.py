@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import ConfigError
-from wavebatch.files.area_crs import AreaFile, place_rings, read_area_file
+from wavebatch.files.area_crs import AreaFile, place_rings, read_area_file, read_crs_name
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.text_file import MOST_LIST, read_text
 
@@ -97,7 +97,7 @@ def read_features(text: str, path: Path | str) -> tuple[list[tuple[dict[str, Any
         if isinstance(document, dict) and document.get("type") in ("Polygon", "MultiPolygon"):
             document = {"features": [{"geometry": document}]}
         elif isinstance(document, dict) and document.get("type") == "Feature":
-            document = {"features": [document], "crs": document.get("crs")}
+            document = {"features": [document]}
         listed = document["features"]
         listed = list(listed.values()) if isinstance(listed, dict) else list(listed)
     except json.JSONDecodeError as error:
@@ -107,7 +107,24 @@ def read_features(text: str, path: Path | str) -> tuple[list[tuple[dict[str, Any
         raise ConfigError(f"{path}: not GeoJSON with a list of polygons: {_WANTED}") from error
     features = [_read_feature(feature, f"{path}: feature {number}") for number, feature in enumerate(listed, 1)]
     rings = [ring for _, rings in features for ring in rings]
-    return features, read_area_file(path, document.get("crs"), rings)
+    return features, read_area_file(path, _find_member(document, listed, path), rings)
+
+
+def _find_member(document: dict[str, Any], listed: Sequence[dict[str, Any]], path: Path | str) -> Any:
+    """The value of the member `crs` of a document; None without one.
+
+    GDAL and QGIS write it into the document, PostGIS into each geometry. The innermost one of an area counts; they must
+    be the same for all.
+    """
+    found: dict[str | None, Any] = {}
+    for feature in listed:
+        levels = (feature["geometry"].get("crs"), feature.get("crs"), document.get("crs"))
+        member = next((level for level in levels if level is not None), None)
+        found[read_crs_name(path, member)] = member
+    if len(found) > 1:
+        names = ", ".join("none" if name is None else name[:40] for name in list(found)[:3])
+        raise ConfigError(f"{path}: its areas name more than one CRS ({names}); write one file for each")
+    return next(iter(found.values()), document.get("crs"))
 
 
 def _read_feature(feature: Any, where: str) -> tuple[dict[str, Any], list[np.ndarray]]:

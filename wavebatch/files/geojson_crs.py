@@ -15,9 +15,9 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.las.crs import repair_wkt
 from wavebatch.files.las.geotiff_wkt import find_code
 from wavebatch.files.las.header import Vlr
+from wavebatch.files.wkt_repair import repair_wkt
 
 GEOJSON_CRS = ("wgs84", "keep")
 """Values of --geojson-crs."""

@@ -84,7 +84,7 @@ class _Pipe(io.RawIOBase):
     def __init__(self, file: BinaryIO, begin: bytes) -> None:
         self._file, self._begin = file, begin
 
-    def read(self, size: int = -1) -> bytes:
+    def read(self, size: int) -> bytes:
         """Return at most so many bytes."""
         return self._begin + self._file.read(size - len(self._begin))
 

@@ -34,8 +34,9 @@ LEAST_SHARE = 64
 """Waveforms that each strip gives to the survey, however many strips there are."""
 
 HELD = 512
-"""Waveforms of a strip from which it is decided whether it belongs to a flight: their width scatters by 0.6 % (1024: as
-much), far less than NARROWER and WIDER; each 100 take 2 ms."""
+"""Waveforms of a strip from which it is decided whether it belongs to a flight. Their width scatters by 0.6 %, far less
+than NARROWER and WIDER, and each 100 take 2 ms per strip; a saved survey is held against one strip with twice as many.
+"""
 
 CANDIDATES = 32
 """Strips that are tried as the one that most others agree with."""

@@ -6,22 +6,24 @@ COPC take only point formats 6 to 8: so that is what a cloud gets, whatever the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.las.crs import repair_records
 from wavebatch.files.las.geotiff_wkt import convert_geotiff
 from wavebatch.files.las.header import (
     GEOTIFF_ID,
     PROJECTION,
     WAVEFORM_RECORD_ID,
     WKT_ID,
+    Evlr,
     LasHeader,
     find_evlrs,
     has_record,
 )
 from wavebatch.files.las.point_formats import MODERN, choose_format
+from wavebatch.files.wkt_repair import repair_evlr, repair_records
 
 LAS_VERSIONS = ("1.4", "1.3", "keep")
 """Values of --las-version."""
@@ -54,18 +56,18 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
     evlrs, _ = find_evlrs(path, header)
     records = [*header.vlrs, *evlrs]
     only_keys = has_record(records, PROJECTION, GEOTIFF_ID) and not has_record(records, PROJECTION, WKT_ID)
-    repaired = _repair(header)
+    repaired, notes = _repair(path, header, evlrs)
     if wanted == "1.4" and point_format is None and not keep:
         modern = MODERN.get(target, target)
         wkt = convert_geotiff(path, header.vlrs, asked=False) if only_keys else None
         if only_keys and wkt is None:
-            return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern),))
-        return Version(max(header.version, (1, 4)), modern, wkt or repaired, (_REPAIRED,) * bool(repaired))
+            return Version(max(header.version, (1, 4)), target, notes=(_explain_keys(target, modern), *notes))
+        return Version(max(header.version, (1, 4)), modern, wkt or repaired, notes)
     wkt = repaired
     if only_keys and target >= 6:
         wkt = convert_geotiff(path, header.vlrs, asked=header.point_format < 6)
     oldest = (1, 4) if wanted == "1.4" or target >= 6 else header.version
-    return Version(max(header.version, oldest), target, wkt, (_REPAIRED,) * bool(repaired))
+    return Version(max(header.version, oldest), target, wkt, notes)
 
 
 _REPAIRED = (
@@ -74,12 +76,15 @@ _REPAIRED = (
 )
 
 
-def _repair(header: LasHeader) -> str | None:
-    """The WKT of the header as GIS understand it; None where it is right, or where there is none."""
-    for old, new in zip(header.vlrs, repair_records(header.vlrs), strict=True):
-        if new is not old:
-            return new.payload.rstrip(b"\0").decode()
-    return None
+def _repair(path: Path, header: LasHeader, evlrs: Sequence[Evlr] = ()) -> tuple[str | None, tuple[str, ...]]:
+    """The repaired WKT of the header, None where it is right or not there, and the line for the user.
+
+    The writer of the cloud repairs extended records as it copies them; the line is for them too.
+    """
+    pairs = zip(header.vlrs, repair_records(header.vlrs), strict=True)
+    wkt = next((new.payload.rstrip(b"\0").decode() for old, new in pairs if new is not old), None)
+    wrong = wkt is not None or any(repair_evlr(path, evlr) is not None for evlr in evlrs)
+    return wkt, (_REPAIRED,) * wrong
 
 
 def _explain_keys(target: int, modern: int) -> str:
@@ -103,4 +108,5 @@ def _as_1_3(path: Path, header: LasHeader, target: int) -> Version:
         raise InputError(f"{path}: has extended records, which LAS 1.3 cannot hold; leave --las-version out")
     if has_record(header.vlrs, PROJECTION, WKT_ID) and not has_record(header.vlrs, PROJECTION, GEOTIFF_ID):
         raise InputError(f"{path}: its CRS is given as WKT, which LAS 1.3 does not have; leave --las-version out")
-    return Version((1, 3), target)
+    repaired, notes = _repair(path, header)
+    return Version((1, 3), target, repaired, notes)

@@ -7,7 +7,9 @@ path and nothing that depends on the number of processes into the file.
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -42,6 +44,7 @@ from wavebatch.files.las.header import (
     has_record,
 )
 from wavebatch.files.las.write_points import PointFile, copy_bytes, waveform_head
+from wavebatch.files.wkt_repair import repair_evlr
 
 _DESCRIPTORS = range(100, 356)
 MOST_PAYLOAD = 65535
@@ -77,7 +80,12 @@ class CloudWriter(PointFile):
                 source.seek(evlr.start)
                 head = source.read(EVLR_HEADER_SIZE)
                 head = head[:2] + _as_text(head[2:18]) + head[18:28] + _as_text(head[28:])
-                self.append_record(head, source, start, start + evlr.length)
+                repaired = repair_evlr(self._layout.source.path, evlr)
+                if repaired is None:
+                    self.append_record(head, source, start, start + evlr.length)
+                else:
+                    head = head[:20] + struct.pack("<Q", len(repaired)) + head[28:]
+                    self.append_record(head, io.BytesIO(repaired), 0, len(repaired))
         packets = self._layout.packets
         if packets is None:
             return

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from wavebatch.core.errors import InputError
 from wavebatch.files.disk.raw_bytes import read_exactly
-from wavebatch.files.disk.temp_folders import reporting_scratch
 
 LEAST = 1 << 16
 """Fewer bytes than this travel faster through a pipe: making, opening and removing a file takes 50 us."""
@@ -46,8 +46,12 @@ class SharedRows:
 
     def read_into(self, target: np.ndarray) -> None:
         """Fill `target` (n,) of the same dtype; raises InputError if the file is gone."""
-        with reporting_scratch(), open(self.path, "rb", buffering=0) as file:
-            read_exactly(file.fileno(), target.view(np.uint8).reshape(-1), self.start * self.dtype.itemsize)
+        try:
+            with open(self.path, "rb", buffering=0) as file:
+                read_exactly(file.fileno(), target.view(np.uint8).reshape(-1), self.start * self.dtype.itemsize)
+        except OSError as error:
+            where = f"{self.path.parent}: rows that another process has left there cannot be read"
+            raise InputError(f"{where} ({error.strerror or error}); run again, with --jobs 1 if it stays") from error
 
     def discard(self) -> None:
         """Remove the file; may be called twice."""

@@ -10,7 +10,7 @@ import json
 import math
 import re
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,16 +20,13 @@ from wavebatch.files.las.header import (
     GEOTIFF_ID,
     WKT_ID,
     LasHeader,
-    Vlr,
-    build_wkt,
     find_evlrs,
     is_projection,
 )
+from wavebatch.files.wkt_repair import LONGEST_WKT, repair_wkt
 
 DOUBLES_ID, CITATION_ID = 34736, 34737
 _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
-_MAX_RECORD = 1 << 20
-"""Longest record that is read: the WKT of real files has a few kilobytes."""
 
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
@@ -149,39 +146,13 @@ def read_crs_definition(path: Path, header: LasHeader) -> str | None:
     return None if code is None else code.partition("+")[0]  # heights have no place in a raster
 
 
-def repair_wkt(wkt: str) -> str:
-    """Return a WKT with degrees as the unit of its geographic CRS.
-
-    RIEGL's RiPROCESS writes metres there. PROJ then takes a central meridian of 15 for 15 radians: a strip in Austria
-    would lie in Siberia.
-    """
-    start = wkt.find("GEOGCS[")
-    wrong = re.search(r'UNIT\["[Mm]et(?:er|re)",\s*1(?:\.0*)?\s*(,AUTHORITY\["EPSG","9001"\])?\]', wkt[start:])
-    if start < 0 or wrong is None or "PROJECTION[" in wkt[start : start + wrong.start()]:
-        return wkt
-    unit = 'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]]'
-    repaired = wkt[: start + wrong.start()] + unit + wkt[start + wrong.end() :]
-    # RiPROCESS also gives code 0, which GDAL looks up and does not find: a GeoTIFF then has no projection.
-    return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", repaired)
-
-
-def repair_records(vlrs: Iterable[Vlr]) -> list[Vlr]:
-    """Return the records with the WKT among them as `repair_wkt` gives it; records that are right stay as they are."""
-    found = []
-    for vlr in vlrs:
-        text = vlr.payload.split(b"\0")[0].decode("utf-8", "replace")
-        wrong = is_projection(vlr) and vlr.record_id == WKT_ID and repair_wkt(text) != text
-        found.append(build_wkt(repair_wkt(text)) if wrong else vlr)
-    return found
-
-
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
     """Payloads of the CRS records by number; VLRs of the header come before EVLRs after the points."""
     found = {vlr.record_id: vlr.payload for vlr in header.vlrs if is_projection(vlr)}
     evlrs, _ = find_evlrs(path, header)
     for evlr in evlrs:
         new = is_projection(evlr) and evlr.record_id in _IDS and evlr.record_id not in found
-        if new and evlr.length <= _MAX_RECORD:
+        if new and evlr.length <= LONGEST_WKT:
             with open(path, "rb") as file:
                 file.seek(evlr.start + EVLR_HEADER_SIZE)
                 found[evlr.record_id] = file.read(evlr.length)

@@ -123,7 +123,7 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
         raise ConfigError(
             f"{where}: {error.args[0]} is missing; a target has reflectance, and x, y, radius or vertices"
         ) from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: not numbers: {error}") from error
     if not LEAST_REFLECTANCE <= reflectance <= 1.5 or len(corners) < 3 or not (np.abs(corners) <= FARTHEST).all():
         limits = f"in 0 to 1.5 and above {LEAST_REFLECTANCE:g}"

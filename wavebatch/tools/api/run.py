@@ -112,7 +112,8 @@ def run(
     bbox : (float, float, float, float), optional
         Write only points from west, south to east, north, in the coordinates of the strips.
     polygon : path or str, optional
-        Write only points inside the polygons of this GeoJSON file, in WGS 84 or in the coordinates of the strips.
+        Write only points inside the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or in the
+        coordinates of the strips.
     columns : str, optional
         "a,b" writes these columns only, "+a,+b" adds them to the usual ones. Shipped chains get the stages that make
         them.

@@ -22,6 +22,7 @@ from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.las.header import is_projection, read_header
 from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.files.wkt_repair import repair_records
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
 from wavebatch.tools.simulate.pulses import PulseModel
 from wavebatch.tools.simulate.render import Recording, paint_echoes, record_counts
@@ -241,7 +242,7 @@ def _open_writer(reader: ReturnReader, target: Path, options: SynthesisOptions, 
         digitizers=[Digitizer(number, options.bits, length, options.spacing) for number, length in lengths],
         scales=reader.scales,
         offsets=reader.offsets,
-        records=[vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)],
+        records=repair_records(vlr for vlr in read_header(reader.path).vlrs if is_projection(vlr)),
         overwrite=overwrite,
     )
 

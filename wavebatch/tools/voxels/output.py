@@ -18,7 +18,6 @@ from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.npz import NpzWriter
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import Draft
-from wavebatch.files.las.crs import repair_records, repair_wkt
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import (
     PROJECTION,
@@ -33,6 +32,7 @@ from wavebatch.files.las.header import (
 )
 from wavebatch.files.las.write_points import PointFile
 from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.wkt_repair import repair_records, repair_wkt
 from wavebatch.tools.voxels.grid import VoxelColumn
 
 SUFFIXES = (".npz", ".las", ".laz")
