@@ -223,7 +223,9 @@ _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", "
 
 
 def check_toml(target: Path | None) -> None:
-    """Raises ConfigError for a name that says that another kind of file would be written."""
+    """Raises ConfigError for an input, and for a name that says that another kind of file would be written."""
+    if target is not None:
+        refuse_input(target)
     if target is not None and target.suffix.lower() in _NO_TOML:
         more = "; --json prints the figures" if target.suffix.lower() == ".json" else ""
         raise ConfigError(f"{target}: this file is written as TOML; name it {target.with_suffix('.toml').name}{more}")

@@ -30,16 +30,21 @@ from wavebatch.tools.simulate import (
 )
 from wavebatch.tools.simulate.from_returns import (
     INTENSITIES,
+    MOST_GAIN,
+    MOST_WIDTH,
     Radar,
     SynthesisOptions,
     SynthesisSummary,
     synthesize_strip,
 )
-from wavebatch.tools.simulate.return_light import EQUAL
+from wavebatch.tools.simulate.render import LEAST_SPACING, MOST_NOISE, MOST_NOISE_GAIN, MOST_SPACING
+from wavebatch.tools.simulate.return_light import EQUAL, MOST_HEIGHT, RADAR_LIMITS
 
 _RECORDING = ("n_samples", "spacing", "noise_std", "baseline", "rho", "noise_gain", "saturation")
 """Options that change the recording of the scene."""
 
+_SPACING = {"type": click.FloatRange(LEAST_SPACING, MOST_SPACING), "metavar": "NS"}
+_NOISE = {"type": click.FloatRange(0.0, MOST_NOISE), "metavar": "DN"}
 _RADAR = ("power", "aperture", "divergence", "efficiency", "attenuation")
 _SEEN = 0.001
 """Share of the energy that is worth a note where it is not of echoes."""
@@ -62,13 +67,14 @@ _internal = click.option("--internal/--external", default=True,
 @seed_option("Seed of the random numbers; pulse k of a scene and a seed is always the same.")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), help="Bits per sample.  [default: 8]")
 @click.option("--samples", "n_samples", type=int, help="Samples per waveform.  [default: the scene's, 80 or 96]")
-@click.option("--spacing", type=float, help="Time between samples [ns].  [default: 1]")
+@click.option("--spacing", **_SPACING, help="Time between samples [ns].  [default: 1]")
 @click.option("--baseline", type=float, help="Level without signal [DN].  [default: 12]")
-@click.option("--noise", "noise_std", type=float,
+@click.option("--noise", "noise_std", **_NOISE,
               help="Standard deviation of the noise before rounding [DN].  [default: the scene's, 1 or 1.2]")
 @click.option("--rho", type=float,
               help="Correlation of the noise of neighbouring samples: 0, .5, .667, .75 or .8.  [default: 0]")
-@click.option("--noise-gain", type=float, help="Noise variance that the signal adds [DN2 per DN].  [default: 0]")
+@click.option("--noise-gain", type=click.FloatRange(0.0, MOST_NOISE_GAIN), metavar="DN",
+              help="Noise variance that the signal adds [DN2 per DN].  [default: 0]")
 @click.option("--saturation", type=int,
               help="Count at which the receiver saturates [DN].  [default: the largest that the bits can hold]")
 @click.option("--pulse", type=click.Choice(list(PULSES)), help="Shape of the system pulse.  [default: gaussian]")
@@ -88,8 +94,10 @@ _internal = click.option("--internal/--external", default=True,
               help="Direction of the packet vectors: toward or away from the sensor.  [default: toward]")
 @click.option("--sensor", type=click.Choice(["waveform", "discrete"]), default="waveform", show_default=True,
               help="waveform: record every waveform; discrete: record only returns, by a receiver with a dead zone.")
-@click.option("--dead-zone", type=float, help="Discrete: least distance of two returns [m].  [default: 0.65]")
-@click.option("--threshold", type=float, help="Discrete: amplitude that triggers a return [DN].  [default: 12]")
+@click.option("--dead-zone", type=click.FloatRange(0.0, 1e6, min_open=True), metavar="M",
+              help="Discrete: least distance of two returns [m].  [default: 0.65]")
+@click.option("--threshold", type=click.FloatRange(0.0, 1e10), metavar="DN",
+              help="Discrete: amplitude that triggers a return [DN].  [default: 12]")
 @click.option("--most-returns", "most", type=int, help="Discrete: most returns per pulse.  [default: 4]")
 @common_options("overwrite", "json", "quiet")
 def simulate(scene: str, output: Path, seed: int, pulses: int, truth: Path | None, **options: Any) -> None:
@@ -152,8 +160,10 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
 @click.option("--intensity", type=click.Choice(INTENSITIES), default="peak", show_default=True,
               help="Meaning of the intensities: peak amplitudes, or reflectances (65535 is 1), from which the lidar "
               "equation computes amplitudes.")
-@click.option("--gain", type=float, help="DN per unit of intensity, or per W.  [default: fills 80 % of the digitizer]")
-@click.option("--width", default=4.7, show_default=True,
+@click.option("--gain", type=click.FloatRange(0.0, MOST_GAIN, min_open=True), metavar="DN",
+              help="DN per unit of intensity, or per W.  [default: fills 80 % of the digitizer]")
+@click.option("--width", type=click.FloatRange(0.0, MOST_WIDTH, min_open=True), metavar="NS",
+              default=4.7, show_default=True,
               help="Full width of the pulse at half maximum [ns], and of echoes without a width of their own.")
 @click.option("--widths", metavar="COLUMN",
               help="Column with the full width of each echo at half maximum [ns].  [default: echo_width, if present]")
@@ -161,18 +171,25 @@ def _shape_scene(scene: Scene, options: dict[str, Any]) -> Scene:
               help="Reflectance: column with the share of the footprint that each return takes, 0 to 1, or equal. "
               "Returns without data take evenly what the others of their pulse leave; shares above 1 together are "
               "scaled to 1.  [default: each return fills it]")
-@click.option("--spacing", default=1.0, show_default=True, help="Time between samples [ns].")
+@click.option("--spacing", **_SPACING, default=1.0, show_default=True, help="Time between samples [ns].")
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="8", show_default=True, help="Bits per sample.")
 @click.option("--baseline", default=12.0, show_default=True, help="Level without signal [DN].")
-@click.option("--noise", default=0.0, show_default=True, help="Standard deviation of the noise before rounding [DN].")
+@click.option("--noise", **_NOISE, default=0.0, show_default=True,
+              help="Standard deviation of the noise before rounding [DN].")
 @seed_option("Seed of the noise and of the first sample's time.")
 @_internal
-@click.option("--sensor-height", type=float, help="Reflectance: height of the sensor, in the heights of CLOUD [m].")
-@click.option("--power", type=float, help="Reflectance: peak power of the pulse [W].  [default: 1]")
-@click.option("--aperture", type=float, help="Reflectance: diameter of the receiver [m].  [default: 0.1]")
-@click.option("--divergence", type=float, help="Reflectance: full angle of the beam [mrad].  [default: 0.5]")
-@click.option("--efficiency", type=float, help="Reflectance: efficiency of the optics.  [default: 0.5]")
-@click.option("--attenuation", type=float, help="Reflectance: attenuation of the air [dB/km].  [default: 0.22]")
+@click.option("--sensor-height", type=click.FloatRange(-MOST_HEIGHT, MOST_HEIGHT), metavar="M",
+              help="Reflectance: height of the sensor, in the heights of CLOUD [m].")
+@click.option("--power", type=click.FloatRange(*RADAR_LIMITS["power"]), metavar="W",
+              help="Reflectance: peak power of the pulse [W].  [default: 1]")
+@click.option("--aperture", type=click.FloatRange(*RADAR_LIMITS["aperture"]), metavar="M",
+              help="Reflectance: diameter of the receiver [m].  [default: 0.1]")
+@click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
+              help="Reflectance: full angle of the beam [mrad].  [default: 0.5]")
+@click.option("--efficiency", type=click.FloatRange(*RADAR_LIMITS["efficiency"]), metavar="SHARE",
+              help="Reflectance: efficiency of the optics.  [default: 0.5]")
+@click.option("--attenuation", type=click.FloatRange(*RADAR_LIMITS["attenuation"]), metavar="DB_KM",
+              help="Reflectance: attenuation of the air [dB/km].  [default: 0.22]")
 @common_options("overwrite", "json", "quiet")
 def synthesize(cloud: Path, output: Path, **options: Any) -> None:
     """Model waveforms from the discrete returns of CLOUD: one Gaussian per return, from its range and intensity.

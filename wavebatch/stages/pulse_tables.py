@@ -158,12 +158,20 @@ def noise_factors(shape: PulseShape, width: float, correlation: tuple[float, ...
 
 def _pulse_rows(shape: PulseShape, width: float) -> np.ndarray:
     """A pulse of amplitude 1 and its derivatives by time and width, at every sample where it is more than noise."""
+    width = min(max(width, NARROWEST_FACTOR), WIDEST_FACTOR)
     reach = int(np.ceil(5 * width)) + 1
     tail = max([0.0, *(abs(delay) + 3 * width for _, delay, _ in shape.components)])
-    x = np.arange(-reach, max(reach, int(np.ceil(tail))) + 1, dtype=np.float64)
+    x = np.arange(-reach, min(max(reach, int(np.ceil(tail))), FARTHEST_FACTOR) + 1, dtype=np.float64)
     rows = evaluate_pulse(shape, x[:, None], np.zeros(1), np.full(1, width))
     return np.stack([np.asarray(row)[:, 0] for row in rows])
 
+
+NARROWEST_FACTOR, WIDEST_FACTOR = 0.2, 200.0
+"""Widths [samples] beyond which factors stay as they are there. A narrower pulse lies on one sample, so that time and
+width have no derivative; over a wider one, noise is as good as white, and tables would grow with the square."""
+
+FARTHEST_FACTOR = 1024
+"""Samples after the peak to which a pulse counts in factors."""
 
 FACTOR_WIDTHS = 12
 """Widths at which the factors of errors are tabulated."""

@@ -33,6 +33,10 @@ LARGEST_WIDTH, LEAST_WIDTH, LARGEST_MISFIT, LARGEST_NOISE = 1.4, 0.7, 0.15, 3.0
 that of the saved pulse, whose lobes widen either; misfit as a share of the amplitude; ratio of the noise, which such
 files give for thresholds and not of quiet samples."""
 
+NARROWEST, WIDEST = 0.1, 1.0
+"""Limits that hold with `force` too: the saved pulse in samples, and as a share of the waveform. No sensor samples so
+that an echo lies on one sample, or is longer than its waveforms: a damaged descriptor does."""
+
 Form = tuple[float, float]
 """Bits and spacing [ns] of samples."""
 
@@ -78,8 +82,11 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
     Raises
     ------
     InputError
-        Where bits, spacing, noise or width of the strip contradict the survey.
+        Where bits, spacing, noise or width of the strip contradict the survey; with `force`, where no sample can show
+        the saved pulse.
     """
+    if survey is not None and force:
+        _refuse_unseen(reader, scan, survey)
     reason, sure = ("", False) if survey is None else find_contradiction(reader, scan, survey)
     if sure and not force:
         raise InputError(
@@ -87,6 +94,18 @@ def check_saved(reader: StripReader, scan: StripScan, survey: Survey | None, *, 
             "survey the strip, or use it all the same with --force"
         )
     return reason
+
+
+def _refuse_unseen(reader: StripReader, scan: StripScan, survey: Survey) -> None:
+    """Raise InputError where the waveforms of no digitizer can show the saved pulse."""
+    used = [digitizer for index, digitizer in reader.facts.digitizers.items() if index in scan.by_descriptor]
+    sigma = survey.system.sigma_ref
+    if not used or any(NARROWEST * one.spacing <= sigma <= WIDEST * one.n_samples * one.spacing for one in used):
+        return
+    raise InputError(
+        f"{reader.facts.path}: its waveforms ({used[0].n_samples} samples {used[0].spacing:g} ns apart) "
+        f"cannot show the pulse of --system, {sigma:.3g} ns (Gaussian sigma); leave --system out to survey the strip"
+    )
 
 
 def find_contradiction(reader: StripReader, scan: StripScan, survey: Survey) -> tuple[str, bool]:

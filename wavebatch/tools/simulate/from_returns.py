@@ -49,6 +49,12 @@ _PAINTED = 1 << 22
 _LEVELS = np.geomspace(1e-12, 1e12, 4801)
 """Edges of the histogram of strengths, 1.2 % apart, from which the gain is chosen."""
 
+MOST_WIDTH = 1000.0
+"""Largest full width of a pulse [ns]."""
+
+MOST_GAIN = 1e20
+"""Largest gain: amplitudes must stay numbers in float32."""
+
 
 @dataclass(frozen=True, slots=True)
 class SynthesisOptions:
@@ -88,8 +94,8 @@ class SynthesisOptions:
             raise ConfigError(
                 "shares of the beam need intensity reflectance: the peaks of returns hold their shares already"
             )
-        if not (self.width > 0 and (self.gain is None or self.gain > 0)):
-            raise ConfigError("width and gain must be above 0")
+        if not (0 < self.width <= MOST_WIDTH and (self.gain is None or 0 < self.gain <= MOST_GAIN)):
+            raise ConfigError(f"width and gain must be above 0, at most {MOST_WIDTH:g} ns and {MOST_GAIN:g}")
         if self.sigma < 0.5 * self.spacing:
             raise ConfigError(f"a pulse of {self.width} ns is too short for samples every {self.spacing} ns")
 

@@ -19,6 +19,12 @@ from wavebatch.tools.simulate.pulses import PulseModel, main_lobe, spread_lobes
 REACH = 5.5
 """Lobes are painted this many sigma to both sides: beyond it they are below 3e-7 of their height."""
 
+LEAST_SPACING, MOST_SPACING = 0.001, 4000.0
+"""Time between two samples [ns]: descriptors hold it in 32 bits of picoseconds."""
+
+MOST_NOISE, MOST_NOISE_GAIN = 1e10, 1e6
+"""More noise than any digitizer shows, as in the files of surveys: beyond it float32 overflows."""
+
 _ROWS = 2048
 """Waveforms that get noise at a time: few enough for the cache."""
 
@@ -46,12 +52,16 @@ class Recording:
     pulse: PulseModel = field(default_factory=PulseModel)
 
     def __post_init__(self) -> None:
+        known_spacing = LEAST_SPACING <= self.spacing <= MOST_SPACING
         check = {
             "bits must be 8, 16 or 32": self.bits in (8, 16, 32),
             f"n_samples must lie from 8 to {MAX_SAMPLES}": 8 <= self.n_samples <= MAX_SAMPLES,
-            "spacing must be positive": self.spacing > 0,
-            "noise_std must not be negative": self.noise_std >= 0,
-            "noise_gain must not be negative": self.noise_gain >= 0,
+            f"spacing must lie from {LEAST_SPACING} to {MOST_SPACING} ns": known_spacing,
+            f"noise_std must lie from 0 to {MOST_NOISE:g}": 0 <= self.noise_std <= MOST_NOISE,
+            f"noise_gain must lie from 0 to {MOST_NOISE_GAIN:g}": 0 <= self.noise_gain <= MOST_NOISE_GAIN,
+            f"the pulse's sigma, {self.pulse.sigma:g} ns, must be no longer than the "
+            f"waveform, {self.n_samples} samples {self.spacing:g} ns apart": self.pulse.sigma
+            <= self.n_samples * self.spacing,
             "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": abs(self.rho - self.color / (self.color + 1)) < 0.006,
             "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,
             "saturation must be a count that the bits can hold": 0 < self.clip < 1 << self.bits,

@@ -27,6 +27,18 @@ WIDEST = 50.0
 _MOST_LIMITED = 0.5
 """Largest share of the widths of a column that may be limited: with more, the column is not what was meant."""
 
+RADAR_LIMITS = {
+    "power": (1e-6, 1e12),
+    "aperture": (1e-4, 100.0),
+    "divergence": (1e-6, 0.1),
+    "efficiency": (1e-6, 1.0),
+    "attenuation": (0.0, 100.0),
+}
+"""Least and largest values of the lidar equation, in the units of Radar: beyond them no lidar is, and numbers end."""
+
+MOST_HEIGHT = 1e6
+"""Largest height of a sensor [m]."""
+
 _TOLERANCE = 1e-4
 """Shares that are stored as float32 or in steps of 1e-4 may be above 1 by so much."""
 
@@ -49,9 +61,12 @@ class Radar:
     """Attenuation by the air [dB/km]."""
 
     def __post_init__(self) -> None:
-        positive = (self.power, self.aperture, self.divergence, self.efficiency)
-        if not (min(positive) > 0 and self.attenuation >= 0):
-            raise ConfigError("power, aperture, divergence and efficiency must be above 0, attenuation not below 0")
+        for name, (least, most) in RADAR_LIMITS.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ConfigError(f"lidar equation: {name} must lie from {least:g} to {most:g}, it is {value:g}")
+        if not abs(self.height) <= MOST_HEIGHT:
+            raise ConfigError(f"lidar equation: the sensor's height must lie within +-{MOST_HEIGHT:g} m")
 
 
 @dataclass(slots=True)
