@@ -8,6 +8,7 @@ from wavebatch import surveying
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.chain import STAGES
+from wavebatch.stages.pulse_tables import error_factors
 
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
 VARIANTS = [
@@ -90,3 +91,12 @@ def test_a_constant_waveform_holds_no_echo(name, s):
     table = STAGES[name].function(block, noise, system, *given)
     assert set(table.waveform.tolist()) <= {1, 4}
     assert s < 80 or set(table.waveform.tolist()) == {1, 4}
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.9])
+@pytest.mark.parametrize("spacing", [0.001, 1.0, 4000.0])
+def test_factors_of_coloured_noise_are_bounded_for_any_spacing(spacing, kappa):
+    """A pulse on one sample has no derivatives, and one of 10,000 samples no table that fits into memory."""
+    system = SystemPulse(sigma_ref=2.0, baseline=12.0, noise_std=1.0, kappa=kappa, correlation=(0.5, 0.2, -0.1))
+    factors = error_factors(system, spacing, np.array([0.7, 1.0, 4.0]) * 2.0 / spacing)
+    assert np.isfinite(factors).all() and (factors > 0.05).all() and (factors < 3).all()

@@ -103,3 +103,16 @@ def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
     assert "--force: the survey" in (tmp_path / "noisy.report.json").read_text()
     result = run("run", folder / "flat.las", "-o", tmp_path, "--force")
     assert result.exit_code == 2 and "--force is of no use without --system" in result.stderr
+
+
+@pytest.mark.parametrize("picoseconds", [2, 200_000], ids=["all on one sample of the pulse", "pulse on one sample"])
+def test_force_uses_no_pulse_that_the_samples_cannot_show(folder, tmp_path, picoseconds):
+    """A damaged descriptor: tables of the pulse would take gigabytes, or its derivatives be 0."""
+    data = bytearray((folder / "flat.las").read_bytes())
+    at = data.index((80).to_bytes(4, "little") + (1000).to_bytes(4, "little")) + 4
+    data[at : at + 4] = picoseconds.to_bytes(4, "little")
+    (tmp_path / "bad.las").write_bytes(data)
+    saved = folder / "SYSTEM.toml"
+    result = run("run", tmp_path / "bad.las", "-o", tmp_path / "out", "--profile", "fast", "--system", saved, "--force")
+    assert result.exit_code == 4 and "cannot show the pulse of --system, 2" in result.stderr, result.stderr
+    assert not list(tmp_path.glob("out/*.la?"))

@@ -206,3 +206,21 @@ def test_files_from_before_the_skew_stay_readable():
     known = replace(SYSTEM, skew=0.2345678901234567, skew_spread=0.05)
     again = parse_survey(format_survey(SavedSurvey(Survey(known, 1, {}, ()))), "x").survey.system
     assert (again.skew, again.skew_spread) == (known.skew, known.skew_spread)
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("overlapped_share = 1.5", "overlapped_share must"),
+        ("flight_level_waveforms = -1e14", "flight_level_waveforms must"),
+        ("flight_level_std = -1.0", "flight_level_std must"),
+        ("echoes_per_waveform = 1e308", "echoes_per_waveform must"),
+        ("flight_descriptor_1_gain = -1e308", "flight_descriptor_1_gain must"),
+    ],
+)
+def test_figures_that_no_survey_finds_are_refused(line, wrong):
+    """They would overflow or be roots of negative numbers far from the file."""
+    text = TEXT.replace("[figures]\n", f"[figures]\n{line}\n")
+    with pytest.raises(ConfigError, match=wrong) as caught:
+        parse_survey(text, "s.toml")
+    assert "\n" not in str(caught.value)

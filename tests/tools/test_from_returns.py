@@ -67,8 +67,10 @@ def test_samples_are_gaussians_at_the_returns(cloud, tmp_path):
         returns = block.returns
         time = np.arange(block.samples.shape[1]) * 0.5
         model = np.full(block.samples.shape, 300.0)
-        waves = 0.05 * intensity[returns.point][:, None] * np.exp(
-            -0.5 * ((time - returns.time[:, None]) / (6.0 / 2.35482)) ** 2
+        waves = (
+            0.05
+            * intensity[returns.point][:, None]
+            * np.exp(-0.5 * ((time - returns.time[:, None]) / (6.0 / 2.35482)) ** 2)
         )
         np.add.at(model, returns.waveform, waves)
         assert np.abs(block.samples - model).max() < 0.51
@@ -389,3 +391,18 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     given = add_columns(tmp_path / "first.las", tmp_path / "g.las", footprint=np.full(len(las.points), 0.3))
     said = run(given, *words, "--shares", "footprint")
     assert "shares of incomplete pulses are those of the points that are there" in said.stderr
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"aperture": 1e300}, {"divergence": 1e297}, {"attenuation": 1e300}, {"efficiency": 2.0}, {"height": 1e300}],
+)
+def test_a_lidar_that_none_can_be_is_refused(wrong):
+    with pytest.raises(ConfigError, match="lidar equation: "):
+        Radar(**{"height": 1000.0, **wrong})
+
+
+@pytest.mark.parametrize("wrong", [{"width": 1e300}, {"gain": 1e300}])
+def test_gains_and_widths_that_no_number_holds_are_refused(wrong):
+    with pytest.raises(ConfigError, match="width and gain must be above 0, at most"):
+        SynthesisOptions(**wrong)

@@ -345,3 +345,20 @@ def test_a_village_has_roofs_of_all_angles_as_bright_as_they_reflect():
     assert gamma == pytest.approx(4 * np.where(roof, 0.4, 0.2) * np.cos(rays.incidence), rel=1e-5)
     assert np.median(energy[roof]) > np.median(energy[~roof])
     assert (block.samples == block.digitizer.max_count).any(axis=1).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"spacing": 1e300},
+        {"spacing": 1e-9},
+        {"noise_std": 1e300},
+        {"noise_gain": 1e300},
+        {"spacing": 0.01},
+        {"pulse": PulseModel(90.0)},
+    ],
+)
+def test_a_recording_that_no_receiver_has_is_refused(wrong):
+    """Lobes of a pulse longer than the waveform would take all memory; larger noise overflows float32."""
+    with pytest.raises(ConfigError, match="simulated recording: "):
+        Recording(**wrong)

@@ -62,7 +62,7 @@ def _expand(argument: str, folder: Path, recursive: bool, kinds: Sequence[Sequen
         return
     path = folder / argument
     if argument.startswith("~") and not os.path.lexists(path):  # shells expand it, but neither in quotes nor in lists
-        path = folder / os.path.expanduser(argument)
+        path = folder / _expand_home(argument)
     if os.path.isdir(path):
         try:
             names = _walk(path) if recursive else os.listdir(path)
@@ -99,6 +99,13 @@ def _real_name(path: Path) -> str:
         return os.path.realpath(path)
     except (OSError, ValueError):  # no file can have this name
         return os.path.abspath(path)
+
+
+def _expand_home(name: str) -> str:
+    try:
+        return os.path.expanduser(name)
+    except ValueError:  # no user can have this name
+        return name
 
 
 def _is_visible(path: Path, suffixes: Sequence[str]) -> bool:

@@ -438,6 +438,7 @@ def read_flight(survey: Survey) -> tuple[Look, dict[int, Kind]]:
     try:
         level = {name: figures[f"flight_level_{name}"] for name in Level._fields if name != "clip"}
         level |= {"waveforms": int(level["waveforms"]), "samples": int(level["samples"])}
+        level["std"] = max(level["std"], QUANTISATION_STD)
         numbers = (figures[f"flight_{name}"] for name in ("width", "steady", "misfit"))
         look = Look(Level(**level, clip=figures.get("flight_level_clip")), *numbers)
         indices = sorted({int(key.split("_")[2]) for key in figures if key.startswith("flight_descriptor_")})

@@ -16,7 +16,7 @@ from wavebatch import __version__
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import TomlTable, format_toml, parse_toml
 from wavebatch.surveying import Decision, Survey
-from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_numbers, read_system
+from wavebatch.surveying.systems.system_table import REMEDY, comment_system, describe_system, read_figures, read_system
 
 SYSTEM_SCHEMA = "wavebatch.system/1"
 
@@ -86,7 +86,7 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
     survey = Survey(
         system=read_system(table.table("system")),
         waveforms=table.integer("waveforms", 0, 10**12, 0),
-        figures=read_numbers(table.table("figures", {})),
+        figures=read_figures(table.table("figures", {})),
         decisions=tuple(map(_read_decision, table.tables("decision"))),
     )
     texts = (table.get("strip", str, ""), table.get("fingerprint", dict, {}), table.get("version", str, __version__))

@@ -68,6 +68,17 @@ TAIL_LIMITS = ((-1e5, 1e5), (0.0, 10.0))
 MOST_LAGS = 1024
 """Lags that the correlation and the tail of a pulse in a file may have; a survey finds fewer than 64."""
 
+MOST_FIGURE = 1e30
+"""Largest figure of a survey: far above counts and times, far below what overflows when it is squared."""
+
+_FIGURE_LIMITS = {
+    "_share": (0.0, 1.0),
+    "flight_steady": (0.0, 1.0),
+    **{f"flight_{name}": (0.0, MOST_FIGURE) for name in ("width", "misfit")},
+    **{f"flight_level_{name}": (0.0, MOST_FIGURE) for name in ("waveforms", "samples", "spread", "std")},
+}
+"""Allowed figures of a survey by the ends of their names; others are any numbers."""
+
 _NOISE, _COMPONENTS, _DIGITIZERS, _INDEX = "noise_by_kind_dn", "components", "digitizers", "index"
 _CORRELATION, _TAIL, _PATTERN = "correlation", "tail_misfit", "pattern_dn"
 _ABOUT_COMPONENTS = "(weight, delay [ns], sigma [ns]) of each Gaussian of a learned pulse, the main one first"
@@ -165,6 +176,16 @@ def _read_rows(
     )
 
 
-def read_numbers(table: TomlTable, low: float = -math.inf) -> dict[str, float]:
-    """Read a table of finite numbers, none of them below `low`."""
-    return {key: table.number(key, low) for key in table.values}
+def read_figures(table: TomlTable) -> dict[str, float]:
+    """Read the figures of a survey; raises ConfigError for shares, counts and deviations that are none."""
+    figures = read_numbers(table)
+    for key, value in figures.items():
+        for end, limits in _FIGURE_LIMITS.items():
+            if key.endswith(end):
+                check_number(value, *limits, f"{table.where}: {key}")
+    return figures
+
+
+def read_numbers(table: TomlTable, low: float = -MOST_FIGURE) -> dict[str, float]:
+    """Read a table of numbers from `low` to MOST_FIGURE."""
+    return {key: table.number(key, low, MOST_FIGURE) for key in table.values}
