@@ -105,7 +105,7 @@ def test_a_forced_survey_is_a_warning_and_in_the_report(folder, tmp_path):
     assert result.exit_code == 2 and "--force is of no use without --system" in result.stderr
 
 
-@pytest.mark.parametrize("picoseconds", [2, 200_000], ids=["all on one sample of the pulse", "pulse on one sample"])
+@pytest.mark.parametrize("picoseconds", [2, 200_000], ids=["waveform within the pulse", "pulse on one sample"])
 def test_force_uses_no_pulse_that_the_samples_cannot_show(folder, tmp_path, picoseconds):
     """A damaged descriptor: tables of the pulse would take gigabytes, or its derivatives be 0."""
     data = bytearray((folder / "flat.las").read_bytes())
