@@ -23,6 +23,7 @@ from wavebatch.tools.bench import command, peers, report
 from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
 from wavebatch.tools.bench.cases import CASES, list_cases, make_scene
 from wavebatch.tools.bench.command import BenchOptions, run_bench
+from wavebatch.tools.bench.paired import compare, jobs
 from wavebatch.tools.bench.paired.compare import compare_runs, format_paired, simulate_strips
 from wavebatch.tools.bench.paired.jobs import Parts
 from wavebatch.tools.bench.report import format_document
@@ -336,10 +337,9 @@ def test_two_checkouts_take_turns(tmp_path, checkout):
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
 
 
-def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path):
+def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "UNIT_POINTS", 1000)
     options = ["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")]
-    two = CliRunner().invoke(main, ["bench", "--jobs-model", "a.las", "b.las", *options])
-    assert two.exit_code == 2 and "one strip" in two.stderr
     result = CliRunner().invoke(main, ["bench", "--jobs-model", "--json", *options])
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
@@ -347,8 +347,61 @@ def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path):
     assert 2900 < parts["waveforms"] <= 3000
     assert all(parts[name] > 0 for name in ("start", "start_worker", "prepare", "single", "write", "strip"))
     text = (tmp_path / "out" / "jobs.txt").read_text()
-    assert [line.split()[0] for line in text.splitlines()[10:15]] == ["1", "2", "4", "16", "64"]
+    assert [line.split()[0] for line in text.splitlines()[11:16]] == ["1", "2", "4", "16", "64"]
     assert json.loads((tmp_path / "out" / "jobs.json").read_text())["parts"] == parts
+    (warning,) = document["warnings"]  # two units, which is few
+    assert "waveforms are fewer than 10 units" in warning and warning in text and parts["work"] >= 0
+
+
+def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
+    """Of a strip that two jobs cannot share, what a waveform costs is no-data; no cost is negative."""
+    monkeypatch.setattr(jobs.Worker, "call", _call_slow_starter)
+    waveforms = {}
+    for unit in (1000, 1001):
+        monkeypatch.setattr(jobs, "UNIT_POINTS", unit)
+        found = jobs.measure_jobs(tmp_path / "s.las", tmp_path / "t.las", tmp_path, 1, lambda text: None)
+        waveforms[unit] = jobs.format_jobs("s.las", *found), jobs.to_document("s.las", *found)
+    text, document = waveforms[1000]
+    assert document["parts"]["work"] == document["parts"]["tail"] == 0 and set(document["predicted"]) > {"1", "64"}
+    assert "-" not in text.split("Predicted")[1]
+    text, document = waveforms[1001]
+    assert document["predicted"] == {} and document["most_jobs"] is None
+    assert all(document["parts"][name] is None for name in ("single", "work", "write", "tail"))
+    assert "Predicted" not in text and "two jobs: no-data" in text and document["warnings"][0] in text
+    assert "nothing is predicted" in document["warnings"][0]
+
+
+def test_jobs_are_measured_on_enough_waveforms_by_default(monkeypatch):
+    given = []
+    monkeypatch.setattr(compare, "simulate_strips", lambda scenes, pulses, *more: given.append(pulses) or {}["stop"])
+    for words in ([], ["--pulses", "700"]):
+        CliRunner().invoke(main, ["bench", "--jobs-model", *words])
+    assert given[0] > 1.1 * jobs.MANY_UNITS * jobs.UNIT_POINTS and given[1] == 700  # some pulses are empty
+
+
+def _call_slow_starter(self, function, *arguments):
+    """Workers that took longer to start when they did nothing than the whole run."""
+    laps = {jobs.measure_worker: 0.5, jobs.time_preparation: 0.3, jobs.run_small: 0.01}
+    return laps.get(function, jobs.Lap(1.0, 0.5, 1.0, 2000))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--jobs-model a.las b.las", "one strip"), ("--jobs-model --scene flat --scene open", "one scene, not 2"),
+        ("--jobs-model --all-methods", "--all-methods has no meaning with --jobs-model"),
+        ("--jobs-model --tolerance 2cm", "--tolerance has no meaning"), ("--jobs-model --no-peers", "--peers has no"),
+        ("--jobs-model a.las --scene flat", "--scene is for simulated strips"),
+        ("--jobs-model a.las --pulses 50000", "--pulses is for simulated strips"),
+        ("--against . --hazard H5", "--hazard has no meaning with --against"),
+        ("--against . a.las --scene flat", "--scene is for simulated strips"),
+        ("--real a.las --scene flat", "--scene has no meaning with --real"),
+        ("--real a.las --against .", "--against has no meaning with --real"),
+    ],
+)  # fmt: skip
+def test_options_that_a_mode_does_not_use_are_refused(words, message):
+    result = CliRunner().invoke(main, ["bench", *words.split()])
+    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
 
 
 def test_the_slowest_part_bounds_many_jobs():

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from wavebatch.cli.messages import one_line, print_json, print_result, talk
 from wavebatch.cli.options import (
@@ -28,6 +29,17 @@ from wavebatch.cli.options import (
 from wavebatch.cli.program.completion import complete_scenes
 from wavebatch.core.errors import InputError
 
+_MODES = {
+    "real": ("seed", "stability"),
+    "against": ("scenes", "pulses", "repeats", "seed"),
+    "jobs_model": ("scenes", "pulses", "repeats", "seed"),
+}
+"""Modes that measure something else, and the options that they use."""
+_ALWAYS = ("files", "output", "html_file", "as_json", "quiet", "log_file", "log_level", "debug")
+
+JOBS_PULSES = 600_000
+"""Of the strip of --jobs-model: more than ten units."""
+
 SMALL_PULSES = 1_000
 """Of the strips that show what a strip costs, however small."""
 
@@ -39,7 +51,8 @@ SMALL_PULSES = 1_000
 @click.option("--waveforms", type=click.IntRange(1), default=65_536, show_default=True, metavar="N",
               help="Simulated waveforms per scene.")
 @click.option("--pulses", type=click.IntRange(0), default=50_000, show_default=True, metavar="N",
-              help="Pulses of the strip that is timed from file to file; 0: time the algorithms only.")
+              help="Pulses of the strip that is timed from file to file; 0: time the algorithms only.  "
+              "[with --jobs-model: 600000]")
 @click.option("--repeat", "repeats", type=click.IntRange(1), default=3, show_default=True, metavar="N",
               help="Repetitions of the timing.")
 @seed_option("Seed of the simulated waveforms.")
@@ -80,7 +93,8 @@ def bench(
     With --real nothing is simulated: clear echoes of each STRIP, scaled and shifted, are added to its other waveforms.
     The tables show which of them are found, how right their errors are, false echoes, and surveys of halves and tiles.
 
-    With --jobs-model runs of STRIP, or of one scene, take turns with one and with two jobs.
+    With --jobs-model runs of STRIP, or of one scene, take turns with one and with two jobs. The strip should have
+    500,000 waveforms or more; below 100,000 nothing is predicted.
 
     With --against nothing but speed is measured, of this wavebatch and another: speeds of a shared machine change,
     ratios of runs that take turns hardly do.
@@ -92,6 +106,7 @@ def bench(
     from wavebatch.tools.bench.report import format_document, write_outputs
 
     check_html(html_file)
+    _refuse_others(click.get_current_context())
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
@@ -108,6 +123,8 @@ def bench(
     if options["jobs_model"]:
         if html_file is not None or len(files) > 1 or len(strips) < len(files):
             raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
+        if len(options["scenes"]) > 1:
+            raise click.UsageError(f"--jobs-model times one scene, not {len(options['scenes'])}; give --scene once")
         _bench_jobs(strips, output, options, say)
         return
     if len(strips) > 1:
@@ -132,6 +149,28 @@ def bench(
         write_bench_page(html_file, document, text)
         talk(f"{html_file}: written")
     print_result(options["as_json"], document, [text])
+
+
+def _list_given(context: click.Context) -> dict[str, str]:
+    """The parameters that the command line gives, by name, as they are written there."""
+    return {
+        one.name: one.opts[0]
+        for one in context.command.params
+        if context.get_parameter_source(one.name) is ParameterSource.COMMANDLINE
+    }
+
+
+def _refuse_others(context: click.Context) -> None:
+    """UsageError for options of the command line that the mode does not use, or that need no STRIP."""
+    given = _list_given(context)
+    mode = next((name for name in _MODES if name in given), None)
+    if mode is None:
+        return
+    for name in given.keys() - {mode, *_MODES[mode], *_ALWAYS}:
+        raise click.UsageError(f"{given[name]} has no meaning with {given[mode]}")
+    if "files" in given:
+        for name in given.keys() & {"scenes", "pulses"}:
+            raise click.UsageError(f"{given[name]} is for simulated strips: leave it or STRIP out")
 
 
 def _bench_against(
@@ -171,12 +210,13 @@ def _bench_jobs(
     from wavebatch.tools.bench.paired.compare import simulate_strips
     from wavebatch.tools.bench.paired.jobs import format_jobs, measure_jobs, to_document
 
-    if not strips and not options["pulses"]:
+    pulses = options["pulses"] if "pulses" in _list_given(click.get_current_context()) else JOBS_PULSES
+    if not strips and not pulses:
         raise click.UsageError("--jobs-model times strips: --pulses must be more than 0")
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
         folder = Path(name)
         scene = (options["scenes"] or ("mixed",))[0]
-        strip = strips[0] if strips else simulate_strips([scene], options["pulses"], options["seed"], folder)[scene]
+        strip = strips[0] if strips else simulate_strips([scene], pulses, options["seed"], folder)[scene]
         (folder / "small").mkdir()
         small = simulate_strips([scene], SMALL_PULSES, options["seed"], folder / "small")[scene]
         found = measure_jobs(strip, small, folder / "out", options["repeats"], say)

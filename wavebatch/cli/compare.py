@@ -1,19 +1,19 @@
 """`wavebatch compare`: two clouds, two chains, or one of them with the vendor's returns or the truth.
 
-Reads options, checks thresholds and prints tables; the figures come from `wavebatch.tools.compare`.
+Reads options and checks thresholds; the figures come from `wavebatch.tools.compare`, the tables from `compare_tables`.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from wavebatch.cli.messages import count, print_result, row, talk
+from wavebatch.cli.compare_tables import list_angles, list_lines, list_match, list_overlap
+from wavebatch.cli.messages import print_result, talk
 from wavebatch.cli.options import (
     check_html,
     common_options,
@@ -31,14 +31,10 @@ from wavebatch.tools.compare.clouds import Comparison, compare_clouds, compare_t
 if TYPE_CHECKING:
     from wavebatch.tools.compare.angles import AngleAgreement
     from wavebatch.tools.compare.chains import Matchup
-    from wavebatch.tools.compare.differences import Spread
     from wavebatch.tools.compare.overlap import OverlapComparison
 
 EXIT_VIOLATED = 1
 """A threshold was not met."""
-
-_BAR = 40
-"""Characters of the longest bar of a histogram."""
 
 _SHARE = {"type": click.FloatRange(0.0, 1.0), "metavar": "SHARE"}
 _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
@@ -106,12 +102,12 @@ def compare(
         check_target(output, overwrite=overwrite)
     if overlap:
         found = _measure_overlap(a, b, {**options, "strip": strip, "truth": truth, "angles": angles or None})
-        print_result(as_json, found, _list_overlap(found), "overlap")
+        print_result(as_json, found, list_overlap(found), "overlap")
         _write_page(html_file, found, [])
         return
     if angles:
         agreement = _measure_angles(a, b, {**options, "strip": strip, "truth": truth})
-        print_result(as_json, agreement, _list_angles(agreement), "angles")
+        print_result(as_json, agreement, list_angles(agreement), "angles")
         _write_page(html_file, agreement, [])
         return
     result = _match(a, b, strip, truth, options) if strip else _compare(a, b, truth, options)
@@ -120,7 +116,7 @@ def compare(
         from wavebatch.tools.compare.table import format_comparison
 
         write_text(output, format_comparison(result.to_json()), overwrite=overwrite)
-    lines = [*_list_lines(between), *(_list_match(result) if strip else [])]
+    lines = [*list_lines(between), *(list_match(result) if strip else [])]
     print_result(as_json, result.to_json(), lines, "chains" if strip else "")
     if not between.matched and between.echoes_a and between.echoes_b:
         talk("warning: A and B have no echo in common; are they results of one strip, in one CRS?")
@@ -210,82 +206,6 @@ def _check_thresholds(result: Comparison, options: dict) -> list[str]:
     return lines
 
 
-def _list_lines(result: Comparison) -> Iterator[str]:
-    """The tables of every comparison of echoes."""
-    a, b = result.correctness, result.completeness
-    yield from (f"A {result.a}", f"B {result.b}", f"matched by {result.matched_by}, within {result.tolerance_ns:g} ns")
-    if result.left_out_a or result.left_out_b:
-        yield f"left out      A {result.left_out_a:>12}   B {result.left_out_b:>12}   by --where"
-    yield from ("", f"echoes        A {result.echoes_a:>12}   B {result.echoes_b:>12}")
-    yield f"identical     {result.matched:>14}   missed {result.missed}   extra {result.extra}"
-    yield f"completeness  {b:>14.4f}   correctness {a:.4f}"
-    yield f"identical are {a:>14.2%} of A's   {b:.2%} of B's   {result.identical:.2%} of both"
-    yield f"more points   {result.gain:>+14.2%} in A than in B"
-    if result.pulses:
-        yield f"exact count   {result.exact_count:>14.4f}   of {count(result.pulses, 'pulse')}"
-        yield from ("", "echoes per pulse")
-        for n in sorted({*result.counts_a, *result.counts_b}):
-            yield f"{n:>12}  A {result.counts_a.get(n, 0):>12}   B {result.counts_b.get(n, 0):>12}"
-    yield from ("", row(f"{'A - B':<14}", ("number", "median", "mean", "rms", "nmad")))
-    units = {"time": "time ns", "echo_time": "echo_time ns", "amplitude": "amplitude DN", "echo_width": "width ns"}
-    for name, spread in result.differences.items():
-        yield row(f"{units[name]:<14}", (spread.number, spread.median, spread.mean, spread.rms, spread.nmad), ".4f")
-    for kind, groups in result.differences_by.items():
-        yield from _list_groups(kind, groups, units)
-    yield from _list_breakdown("missed, of B's", result.missed_by)
-    yield from _list_breakdown("extra, of A's", result.extra_by)
-    if result.errors:
-        head = ("number", "bias", "rmse", "rms/bound", "nmad/bound", "rms/_err", "nmad/_err")
-        yield from ("", row(f"{'against truth':<23}", head))
-    for kind, quantities in result.errors.items():
-        for name, one in quantities.items():
-            if one.number:
-                scaled = (one.rms_per_bound, one.nmad_per_bound, one.calibration, one.calibration_nmad)
-                yield row(f"{kind + ' ' + name:<23}", (one.number, one.bias, one.rmse, *scaled), ".4f")
-
-
-def _list_groups(kind: str, groups: dict[str, dict[str, Spread]], units: dict[str, str]) -> Iterator[str]:
-    """Differences by LAS class or by number of echoes, where there are several."""
-    if len(groups) < 2:
-        return
-    yield from ("", row(f"{f'A - B by {kind}':<41}", ("number", "median", "mean", "rms", "nmad")))
-    for name, quantities in groups.items():
-        for quantity, one in quantities.items():
-            title = f"{name}, {units[quantity]}" if kind == "class" else f"{name} of the pulse, {units[quantity]}"
-            yield row(f"{title:<41}", (one.number, one.median, one.mean, one.rms, one.nmad), ".4f")
-
-
-def _list_breakdown(title: str, tables: dict) -> Iterator[str]:
-    """The classes of echoes in which some have no partner."""
-    head = row(f"{title:<41}", ("number", "of")) + f" {'share':>8}"
-    for kind, table in tables.items():
-        for name, (alone, of) in table.items():
-            if alone:
-                yield from ("", head) if head else ()
-                yield row(f"{f'{kind} {name}':<41}", (alone, of)) + f" {alone / of:>8.2%}"
-                head = ""
-
-
-def _list_match(result: Matchup) -> Iterator[str]:
-    """The tables that only chains have: points per waveform and per return, and the goodness of fit."""
-    found = f"{count(result.waveforms, 'waveform')}, {count(result.returns, 'return')} of the vendor"
-    yield from ("", f"strip {result.strip}: {found}")
-    yield row(f"{'with the returns':<17}", ("echoes", "/waveform", "/return", "identical", "missed", "extra"))
-    for side, one in result.vendor.items():
-        each = [one.echoes_a / of if of else math.nan for of in (result.waveforms, result.returns)]
-        yield row(f"{side.upper():<17}", (one.echoes_a, *each, one.matched, one.missed, one.extra), ".4f")
-    head = ("waveforms", "mean E", "median E", "mean E0", "median E0")
-    yield from ("", row(f"{'goodness of fit':<17}", head))
-    for side, classes in result.fit.items():
-        for name, fit in classes.items():
-            if fit.waveforms:
-                values = (fit.waveforms, fit.mean, fit.median, fit.floor_mean, fit.floor_median)
-                yield row(f"{side.upper()} {name:<15}", values, ".6f")
-        if not classes:
-            yield f"{side.upper()} no-data: a cloud does not hold the fitted model"
-    yield "E = |f - y|^2 / |f|^2 of model f and waveform y; E0 is the E that noise alone gives"
-
-
 def _measure_angles(a: Path, b: Path | None, options: dict) -> AngleAgreement:
     """The agreement of the angles of one or two clouds; UsageError for options that have no meaning here."""
     from wavebatch.tools.compare.angles import compare_angles
@@ -308,55 +228,3 @@ def _measure_overlap(a: Path, b: Path | None, options: dict) -> OverlapCompariso
     if b is None:
         raise click.UsageError("--overlap needs two clouds, A and B")
     return compare_overlap(a, b)
-
-
-def _list_overlap(result: OverlapComparison) -> Iterator[str]:
-    """A line for the height and for each column that both clouds have."""
-    yield from (f"A {result.a}", f"B {result.b}", f"flat cells of {result.cell:.1f} m with single echoes of both")
-    yield from ("", row(f"{'A against B':<26}", ("cells", "median", "error", "nmad", "stated")))
-    height = result.height
-    yield row(f"{'height, A - B, m':<26}", (height.cells, height.median, height.error, height.nmad, math.nan), ".4f")
-    for name, one in result.columns.items():
-        values = (100 * value for value in (one.median, one.error, one.nmad, one.stated))
-        yield row(f"{name + ', %':<26}", (one.cells, *values), ".3f")
-    if not result.columns:
-        yield "no calibrated or relative column is in both; run both strips with --calibration"
-    elif result.angles == "scan angle":
-        yield "backscatter is taken to a facing surface by the scan angle, on level cells; stated: error of one echo"
-    else:
-        yield "backscatter is taken to a facing surface by incidence_angle_normals; stated: error of one echo"
-
-
-def _list_angles(result: AngleAgreement) -> Iterator[str]:
-    """Figures and histograms as text."""
-    yield from [f"A {result.a}"] + ([f"B {result.b}"] if result.b else [])
-    yield (
-        f"points        {result.points:>12}   with angle from width {result.with_widths}, from normals "
-        f"{result.with_normals}, both {result.number}"
-    )
-    if not result.number:
-        yield "no point has both angles; the report of the run gives the reasons"
-        return
-    share = "no errors" if math.isnan(result.within_error) else f"{100 * result.within_error:.1f} %"
-    yield f"bias          {result.bias:>12.3f}   deg, angle from width less angle from normals"
-    yield f"MAE           {result.mae:>12.3f}   deg"
-    yield f"median abs    {result.median_absolute:>12.3f}   deg"
-    yield f"rms           {result.rms:>12.3f}   deg"
-    yield f"within errors {share:>12}   of the differences within one standard deviation of both"
-    yield from ("", f"{'angle deg':>12}  from width", *_bars(result.edges, result.histogram_widths))
-    yield from (f"{'angle deg':>12}  from normals", *_bars(result.edges, result.histogram_normals))
-    difference = _bars(result.difference_edges, result.histogram_difference)
-    yield from (f"{'difference':>12}  width less normals", *difference)
-
-
-def _bars(edges: tuple[float, ...], counts: tuple[int, ...]) -> list[str]:
-    """A line per bin, from the first to the last that holds a thousandth of all; the rest in one line `beyond`."""
-    filled = [number for number, count in enumerate(counts) if 1000 * count >= sum(counts)]
-    most = max(counts)
-    beyond = sum(counts) - sum(counts[filled[0] : filled[-1] + 1])
-    lines = [
-        f"{edges[number]:>5.0f} to {edges[number + 1]:>3.0f} {counts[number]:>11} "
-        + "#" * math.ceil(_BAR * counts[number] / most)
-        for number in range(filled[0], filled[-1] + 1)
-    ]
-    return [*lines, f"{'beyond':>12} {beyond:>11}"] if beyond else lines

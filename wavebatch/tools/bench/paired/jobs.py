@@ -7,6 +7,7 @@ process does alone, and what it does per waveform.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from wavebatch.batch.processes import Workers
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import InputError
+from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.tools.api.run import plan_run
 from wavebatch.tools.bench.worker import Worker
 
@@ -28,6 +30,9 @@ JOBS = (1, 2, 4, 16, 64)
 """Numbers of jobs of the table."""
 MANY = 1000
 """Strips of the second column of the table: while one is prepared, others are processed."""
+FEWEST_UNITS, MANY_UNITS = 2, 10
+"""Units of a strip below which nothing is predicted, and below which a warning is given: fixed costs of a process
+differ by a tenth of a second from run to run, which is much of the work then."""
 SMALL_STRIPS = 20
 """Strips of a batch that measures what each costs the process that writes."""
 _IMPORTS = "import resource, wavebatch.tools.api.run, wavebatch.cli.run; r = resource.getrusage(resource.RUSAGE_SELF)"
@@ -59,7 +64,7 @@ class Parts:
     prepare: float
     """Scan and survey of a strip, by one process: processor seconds."""
     single: float
-    """One job: seconds per waveform."""
+    """One job: seconds per waveform; NaN for a strip that is too short, as the next ones."""
     work: float
     """Several jobs: seconds of the workers per waveform."""
     write: float
@@ -67,7 +72,12 @@ class Parts:
     strip: float
     """The same per strip, however small."""
     tail: float
-    """Workers wait for the last unit of a strip [s]."""
+    """Workers wait for the last unit of a strip [s]; NaN too for a strip that is too short."""
+
+    @property
+    def is_short(self) -> bool:
+        """Whether the strip is too short for costs per waveform, and for predictions."""
+        return self.waveforms < FEWEST_UNITS * UNIT_POINTS
 
     def predict(self, jobs: int, strips: int = 1) -> float:
         """Return the seconds of a batch of such strips on a machine with a core for every process."""
@@ -94,7 +104,7 @@ def measure_jobs(
     Parameters
     ----------
     strip : Path
-        The longer the better: 10 units or more.
+        The longer the better: MANY_UNITS or more. Below FEWEST_UNITS costs per waveform are NaN.
     small : Path
         A strip of few waveforms.
     folder : Path
@@ -124,18 +134,22 @@ def measure_jobs(
     n = one[0].waveforms
     if not n:
         raise InputError(f"{strip}: has no waveforms to be timed")
-    work = _middle([lap.workers - prepare - 2 * start_worker for lap in two]) / n
-    units = max(n // 50_000, 1)
+    # Where other load moves `prepare` or `start_worker`, no difference may become negative.
+    work = max(_middle([lap.workers - prepare - 2 * start_worker for lap in two]), 0.0) / n
+    single = max(_middle([lap.own - prepare for lap in one]), 0.0) / n
+    write = _middle([lap.own for lap in two]) / n
+    if n < FEWEST_UNITS * UNIT_POINTS:
+        single = work = write = math.nan
     parts = Parts(
         waveforms=n,
         start=time_imports(),
         start_worker=start_worker,
         prepare=prepare,
-        single=_middle([lap.own - prepare for lap in one]) / n,
+        single=single,
         work=work,
-        write=_middle([lap.own for lap in two]) / n,
+        write=write,
         strip=few,
-        tail=work * n / units / 2,
+        tail=work * n / max(n // UNIT_POINTS, 1) / 2,
     )
     return parts, laps
 
@@ -209,10 +223,15 @@ def format_jobs(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> str:
         f"{strip}: {parts.waveforms} waveforms; processor time, medians of {len(laps[1])} runs with one job and two",
         f"  start: {parts.start:.2f} s; of a worker, at the same time: {parts.start_worker:.2f} s",
         f"  scan and survey of the strip, by one process: {parts.prepare:.2f} s",
-        f"  one job: {1e6 * parts.single:.2f} us per waveform",
-        f"  two jobs: {1e6 * parts.work:.2f} us per waveform in the workers",
-        f"  the process that writes: {1e6 * parts.write:.3f} us per waveform, or {1e3 * parts.strip:.1f} ms per strip",
+        f"  one job: {_list_cost(parts.single, 2)}",
+        f"  two jobs: {_list_cost(parts.work, 2)} in the workers",
+        f"  the process that writes: {_list_cost(parts.write, 3)}, or {1e3 * parts.strip:.1f} ms per strip",
         f"  elapsed, without the start: {_list_elapsed(laps[1])} s with one job, {_list_elapsed(laps[2])} s with two",
+        *list_warnings(parts),
+    ]
+    if parts.is_short:
+        return "\n".join(lines)
+    lines += [
         "",
         "Predicted from these parts, with a core for every process:",
         f"{'jobs':>5}  {'this strip':>12}  {'times':>6}  {f'{MANY} strips':>12}  {'times':>6}  waveforms/s",
@@ -226,15 +245,33 @@ def format_jobs(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> str:
     return "\n".join([*lines, f"The process that writes is the slowest from {parts.most:.0f} jobs on."])
 
 
+def list_warnings(parts: Parts) -> list[str]:
+    """What a strip of few units does not show."""
+    if parts.waveforms >= MANY_UNITS * UNIT_POINTS:
+        return []
+    few = f"warning: {parts.waveforms} waveforms are fewer than"
+    longer = f"; give a strip of {MANY_UNITS * UNIT_POINTS} or more, or --pulses"
+    if parts.is_short:
+        share = f"{few} {FEWEST_UNITS} units of {UNIT_POINTS}, which two jobs can share"
+        return [f"{share}: what a waveform costs is no-data, and nothing is predicted{longer}"]
+    return [f"{few} {MANY_UNITS} units of {UNIT_POINTS}: fixed costs of the processes blur all figures{longer}"]
+
+
+def _list_cost(seconds: float, digits: int) -> str:
+    return "no-data" if math.isnan(seconds) else f"{1e6 * seconds:.{digits}f} us per waveform"
+
+
 def _list_elapsed(laps: Sequence[Lap]) -> str:
     return ", ".join(f"{lap.elapsed:.2f}" for lap in laps)
 
 
 def to_document(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> dict[str, Any]:
     """The same for `--json`."""
-    predicted = {str(jobs): {"strip_s": parts.predict(jobs), "many_s": parts.predict(jobs, MANY)} for jobs in JOBS}
+    known = () if parts.is_short else JOBS
+    predicted = {str(jobs): {"strip_s": parts.predict(jobs), "many_s": parts.predict(jobs, MANY)} for jobs in known}
     runs = {str(jobs): [asdict(lap) for lap in of] for jobs, of in laps.items()}
     return {
-        "strip": strip, "parts": asdict(parts), "strips": MANY, "predicted": predicted, "most_jobs": parts.most,
-        "runs": runs,
+        "strip": strip, "parts": {name: None if math.isnan(value) else value for name, value in asdict(parts).items()},
+        "strips": MANY, "predicted": predicted, "most_jobs": None if parts.is_short else parts.most,
+        "runs": runs, "warnings": list_warnings(parts),
     }  # fmt: skip
