@@ -2,7 +2,7 @@
 
 `make fuzz MINUTES=10 SEED=1` runs it. What breaks a promise is made as small as possible and kept as one line of
 `tests/fuzz_regressions.jsonl`: the kind of input, the command, the edits of the sound input, which code builds again,
-and variables. `tests/test_fuzz.py` replays these lines.
+and variables. `tests/fuzz_cases.py` replays these lines.
 
 Cases run in groups, a process per group, because a process per case took half of the time. A case that fails in a
 group runs once more in a process of its own; one that fails only after others is reported with these.
