@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.normal_equations import add_ridge, factor_symmetric, gram_matrix, substitute_back
+from wavebatch.kernels.fit.least_squares import Windows, evaluate_model
+from wavebatch.kernels.fit.normal_equations import (
+    add_ridge,
+    factor_symmetric,
+    fit_errors,
+    gram_matrix,
+    substitute_back,
+)
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])
@@ -35,3 +43,13 @@ def test_products_do_not_depend_on_the_batch(rng):
     np.testing.assert_allclose(whole, rows.astype(float) @ rows.astype(float).transpose(0, 2, 1), rtol=1e-4, atol=1e-4)
     for part in (slice(0, 1), slice(3, 10)):
         np.testing.assert_array_equal(gram_matrix(rows[part]), whole[part])
+
+
+def test_a_lone_echo_of_which_two_samples_are_seen_has_errors(rng):
+    """Rounding of float32 products made the variance of its time less than nothing, and the error 0."""
+    parameters = np.stack([np.full(500, 30.0), rng.uniform(0.0, 4.0, 500), rng.uniform(1.0, 3.0, 500)], axis=1)
+    x = np.tile(np.arange(2, dtype=np.float32), (500, 1))
+    windows = Windows(np.zeros_like(x), x, np.ones(500))
+    rows = evaluate_model(windows, parameters[:, :, None], GAUSSIAN)
+    errors, energy = fit_errors(parameters[:, :, None], windows.std, rows, gram_matrix(rows))
+    assert np.isfinite(errors).all() and (errors > 0).all() and (energy > 0).all()

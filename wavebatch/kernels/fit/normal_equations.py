@@ -105,12 +105,12 @@ def fit_errors(
     """
     functions = gram[:, :-1, :-1]
     variance, joint = invert_parts(add_ridge(functions.copy()))
-    if parameters.shape[2] > 1:
-        inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
-        steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
-        if len(steep):
-            exact = rows[steep, :-1].astype(np.float64)
-            variance[steep], joint[steep] = invert_parts(add_ridge(exact @ exact.transpose(0, 2, 1)))
+    # Also of lone echoes: those at an edge of their window, of which a few samples are seen, had errors of 0.
+    inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
+    steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
+    if len(steep):
+        exact = rows[steep, :-1].astype(np.float64)
+        variance[steep], joint[steep] = invert_parts(add_ridge(exact @ exact.transpose(0, 2, 1)))
     units = parameter_units(parameters, std)
     variance = np.maximum(variance, 0).reshape(parameters.shape)
     # A unit of both rows is the same relative change: 1 / amplitude.
