@@ -376,5 +376,7 @@ def _pickle_error(error: Exception) -> bytes:
 
 def _end_with(parent: Any) -> None:
     parent.join()
-    remove_memory_orphans()  # what the parent shared would take memory until the next run
+    for _ in range(5):  # what the parent shared would take memory until the next run; a process may still write there
+        remove_memory_orphans()
+        time.sleep(0.1)
     os._exit(1)
