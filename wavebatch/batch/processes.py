@@ -30,7 +30,7 @@ from typing import Any
 
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
-from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, remove_memory_orphans, use_scratch
+from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, remove_memory_of, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
@@ -46,6 +46,9 @@ _NAME = "wavebatch"
 
 _FIRST_MODULE = "wavebatch.batch.row_transfer"
 """What a new process imports while it waits: with it comes nearly all that calls need."""
+
+_END = b""
+"""Sent to a process in place of a call: it ends. A pipe that closes without it means that this process was killed."""
 
 _SET_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of linux/prctl.h."""
@@ -242,6 +245,7 @@ class _Worker:
                 result, error = self._ask(call.pickled)
                 self.call = None
                 _settle(call.future, result, error)
+            self._pipe.send_bytes(_END)
         except (EOFError, OSError):  # the process is dead
             self.serves = False
             if self.call is not None:
@@ -333,16 +337,19 @@ def _ctrl_c_held() -> Iterator[None]:
 
 
 def _work(pipe: Connection) -> None:
-    """In a new process: make calls until the pipe is closed."""
+    """In a new process: make calls until the parent process says that there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
     _wake_when_parent_dies()
     keep_freed_memory()
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+    end = threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True)
+    end.start()
     with contextlib.suppress(Exception):  # the call that needs it reports the error
         importlib.import_module(_FIRST_MODULE)
     with contextlib.suppress(EOFError, OSError):
-        while True:
-            pipe.send_bytes(_answer(pipe.recv_bytes()))
+        while (call := pipe.recv_bytes()) != _END:
+            pipe.send_bytes(_answer(call))
+        return
+    end.join()  # else this process would be gone before it has cleaned up
 
 
 def _wake_when_parent_dies() -> None:
@@ -375,8 +382,7 @@ def _pickle_error(error: Exception) -> bytes:
 
 
 def _end_with(parent: Any) -> None:
+    """End this process when its parent has died, without what the parent shared in memory until the next run."""
     parent.join()
-    for _ in range(5):  # what the parent shared would take memory until the next run; a process may still write there
-        remove_memory_orphans()
-        time.sleep(0.1)
+    remove_memory_of(parent.pid, _PATIENCE)
     os._exit(1)
