@@ -104,18 +104,20 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("stopped", [False, True])
-def test_workers_die_with_their_parent(strips, tmp_path, stopped):
+def test_workers_die_with_their_parent(tmp_path, stopped):
     """Also those that are stopped, and cannot see that it is dead."""
-    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"))
-    _wait_for(tmp_path, DRAFT, process)
-    children = _children(process.pid)
-    assert children
-    time.sleep(0.5)  # workers have begun
-    if stopped:
-        for child in children:
+    strips, out = tmp_path / "strips", tmp_path / "out"
+    strips.mkdir()
+    simulate_strip("flat", strips / "a.las", pulses=400_000, seed=1)  # long enough to be disturbed below
+    with subprocess.Popen(_command(strips, out, "--jobs", "2")) as process:
+        _wait_for(out, DRAFT, process)
+        children = _children(process.pid)
+        assert children
+        time.sleep(0.1)  # workers have begun
+        for child in children if stopped else ():
             os.kill(child, signal.SIGSTOP)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
     children = [child for child in children if not _is_tracker(child)]  # it ends when all others have
     deadline = time.monotonic() + 20
     while any(_is_alive(child) for child in children):
