@@ -45,6 +45,18 @@ def test_little_or_nothing_gives_finite_numbers(shape):
     assert np.isfinite(estimate_noise(np.full(shape, 3.0, np.float32), 6)[:5]).all()
 
 
+def test_waveforms_of_which_nothing_was_recorded_do_not_count():
+    signal = record(0.7)
+    missing = np.zeros(signal.shape, bool)
+    missing[:5] = True
+    alone = estimate_noise(signal, 6, missing=missing)
+    lost = np.full((len(signal), 3000), 200.0, np.float32)
+    found = estimate_noise(np.hstack([signal, lost]), 6, missing=np.hstack([missing, np.ones(lost.shape, bool)]))
+    assert found[:5] == pytest.approx(alone[:5], rel=1e-6)
+    assert found.correlation == pytest.approx(alone.correlation, abs=1e-6)
+    assert np.isfinite(estimate_noise(lost, 6, missing=np.ones(lost.shape, bool))[:5]).all()
+
+
 def test_waveforms_without_a_quiet_sample_give_the_first_guess():
     signal = np.tile(np.array([[10.0], [200.0]], np.float32), (20, 50))
     signal[0] = 9.0

@@ -83,7 +83,7 @@ def estimate_noise(
     limit : float
         A smoothed sample further from the level than this many standard deviations is signal.
     missing : bool (s, n), optional
-        Samples that were not recorded.
+        Samples that were not recorded; a waveform without any other does not count.
 
     Returns
     -------
@@ -94,11 +94,14 @@ def estimate_noise(
     docs/algorithms.md H10 (rounding) and H11 (correlation).
     """
     if missing is not None:
-        signal = np.where(missing, np.float32(np.nan), signal)
-        level = np.nan_to_num(np.nanmedian(signal, axis=0))
-        signal = np.where(missing, level, signal)
+        recorded = ~missing.all(axis=0)
+        if not recorded.all():  # a short waveform may be all transient; zeros in its place would count as quiet
+            signal, missing = (np.compress(recorded, values, axis=1) for values in (signal, missing))
     if not signal.size:
         return PooledNoise(0.0, QUANTISATION_STD, QUANTISATION_STD, 0.0, 0.0)
+    if missing is not None:
+        signal = np.where(missing, np.float32(np.nan), signal)
+        signal = np.where(missing, np.nanmedian(signal, axis=0), signal)
     signal = signal.astype(np.float32)
     first, std = first_level(signal)
     found = _estimate_from(signal, first, std, 0.0, reach, limit, missing, 0)
