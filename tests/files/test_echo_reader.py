@@ -1,5 +1,6 @@
 """Clouds of any LAS or LAZ kind: read as laspy reads them, and whatever is damaged is one line, never a crash."""
 
+import json
 import random
 import struct
 
@@ -9,10 +10,14 @@ import pytest
 from strips import make_raw
 from writer_tools import data_file
 
-from wavebatch.core.errors import InputError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.cloud.angle_reader import AngleReader
+from wavebatch.files.cloud.columns_reader import ColumnsReader
 from wavebatch.files.cloud.echo_reader import CloudReader
+from wavebatch.files.cloud.overlap_reader import OverlapReader
 from wavebatch.files.cloud.return_io import ReturnReader
 from wavebatch.files.las.header import STANDARD_DTYPES
+from wavebatch.tools.api.cloud import read_cloud
 
 
 def write_cloud(path, point_format, n=300, extra=()):
@@ -88,6 +93,50 @@ def test_extra_bytes_that_are_no_column_of_that_name_are_left_alone(tmp_path):
         (rows,) = reader.read_pieces()
     assert not rows["flags"].any() and np.isnan(rows["amplitude"]).all() and np.isnan(rows["echo_width"]).all()
     assert np.array_equal(rows["range_err"], np.float32([np.nan, np.nan, 0.25]), equal_nan=True)
+
+
+def write_renamed(path, types, columns):
+    """A cloud with an account of the run that names `columns`, whose extra bytes are of `types`."""
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    for name, kind in types.items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name, kind))
+    header.vlrs.append(laspy.VLR("wavebatch", 1, record_data=json.dumps({"columns": columns}).encode()))
+    cloud = laspy.LasData(header)
+    cloud.points = laspy.ScaleAwarePointRecord.zeros(4, header=header)
+    for name in types:
+        cloud.points.array[name] = 2
+    cloud.write(path)
+    return path
+
+
+ARRAYS = ("2f4", "3u2", "2f8")
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_no_reader_takes_several_numbers_for_a_column_that_the_account_names(tmp_path, kind):
+    """Other programs store what they like under the names of the account; a KeyError or a broadcast would follow."""
+    names = ("amplitude", "echo_width", "amplitude_err", "range_err", "incidence_angle", "reflectance", "echo_flags")
+    types = {name: kind for name in names} | {"echo_time": "f4"}
+    path = write_renamed(tmp_path / "a.las", types, {name: name for name in types} | {"not_known": "echo_time"})
+    for reader in (CloudReader, ReturnReader, AngleReader, OverlapReader):
+        with reader(path) as cloud:
+            (rows,) = cloud.read_pieces()
+            assert len(rows) == 4 and set(cloud.written) <= {"echo_time", "not_known"}
+    assert "echo_time" in read_cloud(path).dtype.names
+    with ColumnsReader(path, ["echo_time"]) as cloud:
+        (rows,) = cloud.read_pieces()
+        assert (rows["values"] == 2).all() and not rows["flags"].any()
+    for name in ("amplitude", "echo_flags", "not_known"):
+        with pytest.raises(ConfigError, match=f"has no column {name!r}"):
+            ColumnsReader(path, [name])
+
+
+def test_flags_of_the_account_that_are_no_unsigned_integers_are_no_flags(tmp_path):
+    names = {"amplitude": "f4", "echo_flags": "f4"}
+    path = write_renamed(tmp_path / "a.las", names, {name: name for name in names})
+    with CloudReader(path) as cloud:
+        (rows,) = cloud.read_pieces()
+    assert set(cloud.written) == {"amplitude"} and (rows["amplitude"] == 2).all() and not rows["flags"].any()
 
 
 def _damage(rng, whole, points_at):

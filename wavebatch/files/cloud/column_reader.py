@@ -111,7 +111,7 @@ class ColumnReader(CloudReader):
         extra = {one.name: one for one in self._format.extra_dimensions if one.num_elements == 1}
         ours = self._find_ours(list(extra.values()), COLUMNS, decibel=True)
         alike = [name for name in known if normalise(name) == normalise(column)]
-        if column in self.written and not stored:
+        if column in ours and column in self.written and not stored:
             column = ours[column].name
         elif column not in known:
             if column in ours:

@@ -28,7 +28,7 @@ from wavebatch.files.point_dtypes import list_dimensions
 
 if TYPE_CHECKING:  # laspy takes 50 ms to import, and a run hardly ever needs it
     import laspy
-    from laspy.point.dims import DimensionInfo
+    from laspy.point.dims import DimensionInfo, DimensionKind
 
 CLOUD_COLUMNS = ("echo_time", "amplitude", "echo_width", "amplitude_err", "echo_width_err", "range_err")
 """Columns that are read if the cloud has them."""
@@ -76,8 +76,11 @@ class CloudReader(Closing):
         self.has_gps_time = "gps_time" in names
         self.has_packets = "wavepacket_index" in names
         extra = list(self._format.extra_dimensions)
-        self.written = find_written(checked.header, [one.name for one in extra])
-        """The file's name of each wavebatch column, by the account of the run; empty without one."""
+        written = find_written(checked.header, [one.name for one in extra if one.num_elements == 1])
+        kinds = {one.name: one.kind for one in extra}
+        self.written = {column: name for column, name in written.items() if _may_hold(kinds[name], column)}
+        """The file's name of each wavebatch column, by the account of the run; empty without one. Columns that another
+        program has stored as several numbers, or flags as signed ones, are none."""
         self._sources = self._find_ours(extra, (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
         self.keep: Callable[[np.ndarray], np.ndarray] | None = None
@@ -216,9 +219,12 @@ def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str
 
 
 def _is_stored_as(dimension: DimensionInfo, column: str, scale: float | None) -> bool:
-    """Whether the dimension is one number, scaled if the style scales it, and flags are unsigned integers."""
-    from laspy.point.dims import DimensionKind
-
+    """Whether the dimension is one number, scaled if the style scales it, and may hold the column."""
     if dimension.num_elements != 1 or (dimension.scales is None) != (scale is None):
         return False
-    return column != "echo_flags" or dimension.kind is DimensionKind.UnsignedInteger
+    return _may_hold(dimension.kind, column)
+
+
+def _may_hold(kind: DimensionKind, column: str) -> bool:
+    """Whether numbers of a kind may be a column: flags are unsigned integers."""
+    return column != "echo_flags" or kind.name == "UnsignedInteger"
