@@ -3,13 +3,14 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from batch_tools import read_cloud
 from click.testing import CliRunner
 from helpers_scenes import make_scene
 
 from wavebatch.cli import main
-from wavebatch.surveying.system_file import load_survey
+from wavebatch.surveying.system_file import format_survey, load_survey
 from wavebatch.tools.simulate import find_pulse, simulate_strip
 
 
@@ -126,6 +127,24 @@ def test_system_and_flight_exclude_each_other(strips, flown, tmp_path):
     system = folder / "flight.system.toml"
     result = _run(strips["a"], "-o", tmp_path / "out", "--survey", "flight", "--system", system)
     assert result.exit_code == 2 and "exclude each other" in result.stderr and not (tmp_path / "out").exists()
+
+
+def test_a_gain_that_no_digitizer_has_does_not_stop_the_flight(strips, tmp_path):
+    data = bytearray(strips["a"].read_bytes())
+    place = data.index(b"LASF_Spec\0") + 52  # body of the first descriptor
+    assert data[place] == 8 and data.count(b"LASF_Spec\0") >= 1
+    data[place + 10 : place + 18] = np.float64(1e300).tobytes()
+    (tmp_path / "a.las").write_bytes(data)
+    result = _run(tmp_path / "a.las", "-o", tmp_path / "out", "--survey", "flight", "--profile", "fast")
+    assert result.exit_code == 0 and "descriptor 1 has gain 1e+300 V" in result.stderr
+    load_survey(tmp_path / "out" / "flight.system.toml")
+
+
+def test_a_survey_that_could_not_be_read_again_is_not_written(strips, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.batch.run.format_survey", lambda saved: format_survey(saved) + "\n[unknown]\n")
+    result = _run(strips["a"], "-o", tmp_path / "out", "--survey", "flight", "--profile", "fast")
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_no_strip_that_can_be_read(tmp_path):

@@ -221,6 +221,20 @@ def test_descriptor_oddities_are_told(tmp_path):
         assert [text.split(" ")[1] for text in reader.facts.warnings] == ["1", "2"]
 
 
+@pytest.mark.parametrize("value", [1e300, -1e300, np.inf, np.nan])
+@pytest.mark.parametrize("name", ["gain", "offset"])
+def test_volts_that_no_digitizer_has_are_told_and_count_as_not_given(tmp_path, name, value):
+    raw = make_raw()
+    raw.vlrs = [descriptor(1, **{"gain": 0.01, "offset": -0.5, name: value})]
+    path = raw.write(tmp_path / "a.las")
+    assert_read(path, raw)
+    with StripReader(path) as reader:
+        digitizer = reader.facts.digitizers[1]
+        assert {"gain": digitizer.gain, "offset": digitizer.offset} == {"gain": 0.01, "offset": -0.5, name: 0.0}
+        (warning,) = reader.facts.warnings
+        assert warning.startswith(f"descriptor 1 has {name} {value:g} V")
+
+
 def test_the_truncated_leica_file_gets_one_line():
     refused(data_file("no-packets/simple1_3.las"), "no packet can be used: 999 of 999 points")
 

@@ -30,7 +30,7 @@ from wavebatch.files.disk.publish import remove_stale, reporting
 from wavebatch.files.text_file import write_text
 from wavebatch.surveying import Survey
 from wavebatch.surveying.flight import read_samples, survey_flight, surveys_agree
-from wavebatch.surveying.system_file import SavedSurvey, format_survey, load_survey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +151,10 @@ def _survey_flight(
         return None
     path = flight_path(options.folder)
     flight = survey_flight(samples, spread=workers.map)
+    text = format_survey(flight.saved)
+    saved = parse_survey(text, str(path))  # as a later run reads it, so that its identity is the same
     try:
-        write_text(path, format_survey(flight.saved), overwrite=options.overwrite)
+        write_text(path, text, overwrite=options.overwrite)
     except InputError:
         # Another run into this folder was faster: its survey counts, so that all strips have the same one.
         found = load_flight(jobs, options)
@@ -161,8 +163,7 @@ def _survey_flight(
         return found
     if on_event is not None:
         on_event({"event": "flight", "strip": str(path), "strips": len(flight.strips) - len(flight.misfits)})
-    # As a later run reads it, so that its identity is the same.
-    return load_survey(path)
+    return saved
 
 
 class _Batch:

@@ -31,6 +31,9 @@ MAX_SAMPLES = 1 << 16
 """Longer waveforms are damage: digitizers record a few hundred samples."""
 BLOCK_BYTES = 1 << 25
 """Most bytes of samples in one block, for any number of waveforms."""
+MOST_VOLTS = 1e6
+"""Largest gain [V per count] and offset [V] of a descriptor; digitizers have a few volts, larger ones are damage."""
+
 DESCRIPTOR = struct.Struct("<BBIIdd")
 _FIRST_ID, _LAST_ID = 100, 354
 _SPARSE = 4
@@ -79,6 +82,11 @@ def read_descriptors(header: LasHeader) -> tuple[dict[int, Digitizer], dict[int,
             warnings.append(f"descriptor {index} has {len(vlr.payload)} bytes instead of 26 and is ignored")
             continue
         bits, kind, samples, spacing, gain, offset = DESCRIPTOR.unpack_from(vlr.payload)
+        for name, value in ("gain", gain), ("offset", offset):
+            if not abs(value) <= MOST_VOLTS:
+                reason = "which no digitizer has; it counts as not given, and counts are used as they are"
+                warnings.append(f"descriptor {index} has {name} {value:g} V, {reason}")
+        gain, offset = (value if abs(value) <= MOST_VOLTS else 0.0 for value in (gain, offset))
         digitizer = Digitizer(index, bits, samples, spacing / PS_PER_NS, gain, offset)
         if index not in digitizers:
             digitizers[index], compression[index] = digitizer, kind
