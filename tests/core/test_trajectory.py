@@ -184,6 +184,18 @@ def test_bytes_that_are_no_sbet(tmp_path):
         read_trajectory(path, crs="EPSG:32632")
 
 
+@pytest.mark.parametrize(("heading", "wander"), [(np.inf, np.inf), (1e308, -1e308), (np.nan, 0.0)])
+def test_a_damaged_record_of_an_sbet_is_left_out_without_a_warning(tmp_path, heading, wander):
+    pytest.importorskip("pyproj")
+    path = write_sbet(tmp_path / "s.sbet")
+    sound = read_trajectory(path, crs="EPSG:32633", lever_arm=(1.0, 0.0, 0.0))
+    records = np.fromfile(path, SBET_RECORD)
+    records["heading"][7], records["wander"][7], records["latitude"][9] = heading, wander, 1e308
+    records.tofile(path)
+    found = read_trajectory(path, crs="EPSG:32633", lever_arm=(1.0, 0.0, 0.0))
+    assert np.array_equal(found.time, np.delete(sound.time, [7, 9])) and np.isfinite(found.xyz).all()
+
+
 def test_sbet_is_projected(tmp_path):
     pytest.importorskip("pyproj")
     found = read_trajectory(write_sbet(tmp_path / "s.sbet"), crs="EPSG:32632")

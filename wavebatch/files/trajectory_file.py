@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.core.errors import InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.core.trajectory import Trajectory, apply_lever_arm
-from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
+from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads, widen
 
 SBET_RECORD = np.dtype([(name, "<f8") for name in (
     "time", "latitude", "longitude", "height", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch", "heading",
@@ -87,15 +87,17 @@ def read_trajectory(
 def _read_sbet(path: Path, size: int) -> dict[str, np.ndarray]:
     records = np.memmap(path, SBET_RECORD, "r")
     step = max(1, -(-len(records) // MOST_RECORDS))
-    some = np.array(records[::step])
-    columns = {name: some[name] for name in ("time", "latitude", "longitude", "height", *_ATTITUDE)}
-    columns["z"] = columns.pop("height")
-    inside = (np.abs(some["latitude"]) <= np.pi / 2) & (np.abs(some["longitude"]) <= 2 * np.pi)
-    if not (inside & np.isfinite(some["time"])).mean() > 0.99:
+    names = ("time", "latitude", "longitude", "height", *_ATTITUDE, "wander")
+    columns = {name: widen(records[name][::step]) for name in names}
+    columns["z"], wander = columns.pop("height"), columns.pop("wander")
+    inside = (np.abs(columns["latitude"]) <= np.pi / 2) & (np.abs(columns["longitude"]) <= 2 * np.pi)
+    if not (inside & np.isfinite(columns["time"])).mean() > 0.99:
         raise InputError(f"{path}: not an SBET: its latitudes and longitudes are not radians; give text with headers")
-    # An SBET counts the heading in the wander frame, which is turned from north by the wander angle.
-    columns["heading"] = some["heading"] - some["wander"]
-    columns["latitude"], columns["longitude"] = np.degrees(some["latitude"]), np.degrees(some["longitude"])
+    with np.errstate(over="ignore", invalid="ignore"):  # a few damaged records: not finite, and not used later
+        # An SBET counts the heading in the wander frame, which is turned from north by the wander angle.
+        columns["heading"] -= wander
+        for name in ("latitude", "longitude"):
+            columns[name] = np.degrees(columns[name])
     return columns
 
 
