@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 from click.testing import CliRunner
 
+import wavebatch
 from wavebatch.cli import main
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
@@ -72,6 +73,9 @@ ATTACKS = (
     "worker STOP INT",
     "worker STOP KILL",
 )
+
+
+_PACKAGE = os.path.dirname(wavebatch.__file__) + os.sep
 
 
 class Attack(NamedTuple):
@@ -131,7 +135,8 @@ class Attacker:
             is_ready, code, said = self._disturb(process, attack)
         finally:
             left = self._end(process)
-        self.ended[attack.kind, code if code in (0, 130) or is_ready else "before Python has begun"] += 1
+        begun = not has_not_begun(is_ready, code, said)
+        self.ended[attack.kind, code if begun else "before Python has begun"] += 1
         return (
             self._judge_end(attack, is_ready, code, said)
             or (f"processes stay: {left}" if left else "")
@@ -165,7 +170,7 @@ class Attacker:
     def _disturb(self, process: subprocess.Popen, attack: Attack) -> tuple[bool, int | str, str]:
         """Send the signals; whether the process had begun, and its exit code or "hangs", and stderr."""
         time.sleep(attack.share * self.seconds[attack.name])
-        is_ready = _handles_signals(process.pid)
+        is_ready = _has_signal(process.pid, "SigCgt", signal.SIGTERM)  # from then on no signal may be lost
         target, _, rest = attack.kind.partition(" ")
         with contextlib.suppress(ProcessLookupError):
             if target == "worker":
@@ -184,6 +189,8 @@ class Attacker:
 
     def _disturb_worker(self, parent: int, actions: list[str]) -> None:
         workers = [pid for pid in _children(parent) if b"spawn_main" in _command_line(pid)]
+        if actions == ["STOP", "KILL"]:  # one that is stopped while Python starts in it cannot be woken
+            workers = [pid for pid in workers if _has_signal(pid, "SigIgn", signal.SIGINT)]
         if not workers:
             return
         worker = random.choice(workers)
@@ -210,8 +217,8 @@ class Attacker:
         """The exit code and stderr."""
         if code == "hangs":
             return f"hangs for more than {LONGEST:.0f} s: {said}"
-        if not is_ready and isinstance(code, int) and code < 0:
-            return ""  # Python itself had not begun
+        if has_not_begun(is_ready, code, said):
+            return ""
         killed = "KILL" in attack.kind and not attack.kind.startswith("worker K")
         allowed = {0, -signal.SIGKILL} if killed else {0, 130}
         if "INT KILL" in attack.kind:
@@ -319,14 +326,21 @@ def _without_times(value: object) -> object:
     return [_without_times(one) for one in value] if isinstance(value, list) else value
 
 
-def _handles_signals(pid: int) -> bool:
-    """Whether the program has begun: from then on no signal may be lost."""
+def _has_signal(pid: int, name: str, number: int) -> bool:
+    """Whether a signal is among those that a process catches (name SigCgt) or ignores (SigIgn); True if it is gone."""
     try:
         with open(f"/proc/{pid}/status") as file:
-            caught = next((int(line.split()[1], 16) for line in file if line.startswith("SigCgt")), 0)
+            signals = next((int(line.split()[1], 16) for line in file if line.startswith(name)), 0)
     except OSError:
         return True
-    return bool(caught >> (signal.SIGTERM - 1) & 1)
+    return bool(signals >> (number - 1) & 1)
+
+
+def has_not_begun(is_ready: bool, code: int | str, said: str) -> bool:
+    """Whether a signal came while Python itself started: it dies of it, or says where in its own modules it was."""
+    if is_ready or not isinstance(code, int):
+        return False
+    return code < 0 or (code == 1 and "KeyboardInterrupt" in said and f'File "{_PACKAGE}' not in said)
 
 
 def _children(pid: int) -> list[int]:
@@ -379,16 +393,17 @@ def _session(number: int) -> list[int]:
 
 
 def attack_all(folder: Path, runs: int, seed: int, minutes: float = 1e9) -> Iterator[tuple[Attack, str]]:
-    """Run so many attacks, or so long; yield those that break a promise, then say how all ended."""
+    """Run so many attacks, or so long, or until Ctrl-C; yield those that break a promise, then say how all ended."""
     attacker, rng = Attacker(folder), random.Random(seed)
     end = time.monotonic() + 60 * minutes
-    for _ in range(runs):
-        if time.monotonic() > end:
-            break
-        attack = attacker.draw(rng)
-        why = attacker.attack(attack)
-        if why:
-            yield attack, why
+    with contextlib.suppress(KeyboardInterrupt):
+        for _ in range(runs):
+            if time.monotonic() > end:
+                break
+            attack = attacker.draw(rng)
+            why = attacker.attack(attack)
+            if why:
+                yield attack, why
     print(f"{sum(attacker.ended.values())} attacks with seed {seed}")
     for (kind, code), number in sorted(attacker.ended.items(), key=str):
         print(f"{kind:20} exit code {code!s:25} {number:6}")
@@ -400,6 +415,7 @@ def _start() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
         for attack, why in attack_all(Path(folder), options.runs, options.seed, options.minutes):

@@ -140,6 +140,7 @@ def _drop(words):
         (lambda words: [0 for _ in iter(int, 1)], "ran for more than"),
         (lambda words: click.echo("error: this is a bug", err=True), "says this is a bug"),
         (lambda words: click.echo("a \x07 name", err=True), "control characters"),
+        (lambda words: click.echo("a \r name", err=True), "control characters"),
     ],
 )
 def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, monkeypatch, what, why):

@@ -322,7 +322,8 @@ def _judge(done: dict[str, Any], out: Path, before: set[str], case: Case) -> str
     for word in ("this is a bug", "Traceback", "Warning", "not enough memory"):
         if word in said or word in done["out"]:
             return f"says {word}: {' '.join(said.split())[:300]}"
-    if any(c < " " and c != "\n" or c == "\x7f" for c in said):
+    plain = "\n\r" if _has_bar(case) else "\n"
+    if any(c < " " and c not in plain or c == "\x7f" for c in said):
         return f"control characters: {said[:200]!r}"
     if code and not said.strip() and not done["out"].strip():
         return "fails without a word"
@@ -342,6 +343,13 @@ def _judge(done: dict[str, Any], out: Path, before: set[str], case: Case) -> str
         if problem and not (case.kind == "options" and _is_other(out / name)):
             return f"{name} is not whole: {problem}"
     return ""
+
+
+def _has_bar(case: Case) -> bool:
+    """Whether a progress bar is asked for, which is drawn over itself."""
+    return "--progress bar" in case.command or any(
+        name.endswith("PROGRESS") and value == "bar" for name, value in case.variables.items()
+    )
 
 
 def _may_leave(case: Case, code: int) -> bool:
@@ -448,22 +456,23 @@ class Outcomes:
 def fuzz(
     folder: Path, seconds: float, seed: int, *, tell: Callable[[str], object] = print, most: int = 1 << 60
 ) -> Iterator[tuple[Case, str]]:
-    """Run random cases for so many seconds, or so many; yield the failing ones, made small, each reason once."""
+    """Run random cases for so long, or so many, or until Ctrl-C; yield the failing ones, small, each reason once."""
     fuzzer, rng, outcomes = Fuzzer(folder), random.Random(seed), Outcomes()
     end, seen = time.monotonic() + seconds, set()
-    while time.monotonic() < end and outcomes.count < most:
-        left = [fuzzer.draw(rng) for _ in range(GROUP)]
-        while left:
-            wrong = fuzzer.run_some(left, outcomes.add)
-            done, left = left[: len(wrong)], left[len(wrong) :]
-            case, why = done[-1], wrong[-1]
-            key = (case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60])
-            if why and key not in seen:
-                seen.add(key)
-                if fuzzer.run(case):
-                    yield fuzzer.shrink(case), why
-                else:
-                    yield case, f"only after {len(done) - 1} other cases: {why}"
+    with contextlib.suppress(KeyboardInterrupt):
+        while time.monotonic() < end and outcomes.count < most:
+            left = [fuzzer.draw(rng) for _ in range(GROUP)]
+            while left:
+                wrong = fuzzer.run_some(left, outcomes.add)
+                done, left = left[: len(wrong)], left[len(wrong) :]
+                case, why = done[-1], wrong[-1]
+                key = (case.kind, case.command.split()[0], re.sub(r"'.*?'|/\S*|[\d\W]+", " ", why)[:60])
+                if why and key not in seen:
+                    seen.add(key)
+                    if fuzzer.run(case):
+                        yield fuzzer.shrink(case), why
+                    else:
+                        yield case, f"only after {len(done) - 1} other cases: {why}"
     for line in outcomes.lines():
         tell(line)
     tell(f"{outcomes.count} cases with seed {seed}, {len(seen)} kinds of failure")
@@ -482,6 +491,7 @@ def _start() -> int:
     parser.add_argument("--cases", type=int, default=1 << 60, help="stop after so many")
     parser.add_argument("--no-keep", action="store_true", help="print failures only")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     failures = 0
     with tempfile.TemporaryDirectory() as folder:
         for case, why in fuzz(Path(folder), 60 * options.minutes, options.seed, most=options.cases):

@@ -10,6 +10,8 @@ import attacking
 import pytest
 from attacking import Attack, Attacker
 
+import wavebatch
+
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="looks at processes through /proc")
 
 
@@ -54,6 +56,29 @@ def test_the_attacker_sees_every_kind_of_failure(attacker, monkeypatch, code, wh
     monkeypatch.setattr(attacking, "STAY", 1.0)
     _plant(attacker, monkeypatch, code)
     assert re.search(why, attacker.attack(Attack("survey", "TERM", 0.3)))
+
+
+_OWN = 'Traceback (most recent call last):\n  File "<frozen abc>", line 48, in <module>\nKeyboardInterrupt\n'
+_OURS = _OWN.replace("<frozen abc>", os.path.join(os.path.dirname(wavebatch.__file__), "core", "memory.py"))
+
+
+@pytest.mark.parametrize(
+    ("is_ready", "code", "said", "expected"),
+    [
+        (False, -2, "", True),
+        (False, 1, _OWN, True),
+        (False, 1, _OURS, False),
+        (False, 1, "error: no", False),
+        (False, 0, "", False),
+        (False, "hangs", "", False),
+        (True, 1, _OWN, False),
+        (True, -2, "", False),
+    ],
+)
+def test_only_what_python_says_before_our_code_runs_is_no_failure(attacker, is_ready, code, said, expected):
+    assert attacking.has_not_begun(is_ready, code, said) is expected
+    if not expected and code not in (0, "hangs"):
+        assert attacker._judge_end(Attack("run, 1 job", "INT", 0.1), is_ready, code, said)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Runs that end in the middle: killed, interrupted, a worker shot. Nothing half-written is taken for a cloud."""
 
+import functools
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import time
 
 import pytest
 
+from wavebatch.batch import processes
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
@@ -123,6 +125,42 @@ def test_workers_die_with_their_parent(tmp_path, stopped):
     while any(_is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)
+
+
+def _ignores_ctrl_c(pid):
+    with open(f"/proc/{pid}/status") as file:
+        ignored = next(int(line.split()[1], 16) for line in file if line.startswith("SigIgn"))
+    return bool(ignored >> (signal.SIGINT - 1) & 1)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
+def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_parent(strips, tmp_path):
+    """The death signal comes first: one that ignores Ctrl-C has it."""
+    # Jobs that a shell has started in the background ignore Ctrl-C from the first.
+    listen = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"), preexec_fn=listen) as process:
+        worker = None
+        while worker is None:
+            assert process.poll() is None, "the run ended before it could be disturbed"
+            workers = [child for child in _children(process.pid) if not _is_tracker(child)]
+            worker = next(filter(_ignores_ctrl_c, workers), None)
+        os.kill(worker, signal.SIGSTOP)
+        process.send_signal(signal.SIGKILL)
+    deadline = time.monotonic() + 20
+    while _is_alive(worker):
+        assert time.monotonic() < deadline, "a worker outlived its parent"
+        time.sleep(0.01)
+
+
+def test_a_worker_asks_for_the_death_signal_before_all_else(monkeypatch):
+    done = []
+    monkeypatch.setattr(processes, "_wake_when_parent_dies", lambda: done.append("death signal"))
+    monkeypatch.setattr(processes.signal, "signal", lambda *_: done.append("ignores Ctrl-C"))
+    monkeypatch.setattr(processes, "keep_freed_memory", lambda: done.append("memory"))
+    monkeypatch.setattr(processes.multiprocessing, "parent_process", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        processes._work(None)
+    assert done == ["death signal", "ignores Ctrl-C", "memory"]
 
 
 _SHOT = """

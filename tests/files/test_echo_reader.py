@@ -116,7 +116,7 @@ ARRAYS = ("2f4", "3u2", "2f8")
 def test_no_reader_takes_several_numbers_for_a_column_that_the_account_names(tmp_path, kind):
     """Other programs store what they like under the names of the account; a KeyError or a broadcast would follow."""
     names = ("amplitude", "echo_width", "amplitude_err", "range_err", "incidence_angle", "reflectance", "echo_flags")
-    types = {name: kind for name in names} | {"echo_time": "f4"}
+    types = dict.fromkeys(names, kind) | {"echo_time": "f4"}
     path = write_renamed(tmp_path / "a.las", types, {name: name for name in types} | {"not_known": "echo_time"})
     for reader in (CloudReader, ReturnReader, AngleReader, OverlapReader):
         with reader(path) as cloud:

@@ -338,8 +338,8 @@ def _ctrl_c_held() -> Iterator[None]:
 
 def _work(pipe: Connection) -> None:
     """In a new process: make calls until the parent process says that there are no more."""
+    _wake_when_parent_dies()  # before all else: until then nothing wakes this process if it is stopped
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
-    _wake_when_parent_dies()
     keep_freed_memory()
     end = threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True)
     end.start()
