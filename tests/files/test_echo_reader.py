@@ -95,6 +95,16 @@ def test_extra_bytes_that_are_no_column_of_that_name_are_left_alone(tmp_path):
     assert np.array_equal(rows["range_err"], np.float32([np.nan, np.nan, 0.25]), equal_nan=True)
 
 
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_packet_vectors_that_are_no_numbers_are_none(tmp_path, value):
+    raw = make_raw(100, point_format=10)
+    raw.points["y_t"][::3] = value
+    with CloudReader(raw.write(tmp_path / "a.las")) as reader:
+        (rows,) = reader.read_pieces()
+    damaged = ~np.isfinite(raw.points["y_t"][raw.points["wavepacket_index"] != 0])
+    assert damaged.any() and not rows["ray"][damaged].any() and rows["ray"][~damaged].all()
+
+
 def write_renamed(path, types, columns):
     """A cloud with an account of the run that names `columns`, whose extra bytes are of `types`."""
     header = laspy.LasHeader(version="1.4", point_format=6)

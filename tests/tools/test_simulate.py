@@ -295,6 +295,8 @@ def test_origin_and_direction_lead_to_the_ground():
         {"noise_std": -1.0},
         {"rho": 0.3},
         {"rho": 1.0},
+        {"rho": 2.0},
+        {"rho": -1.0},
         {"saturation": 300},
         {"noise_gain": -0.1},
     ],

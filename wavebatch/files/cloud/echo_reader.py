@@ -137,6 +137,7 @@ class CloudReader(Closing):
             return rows
         for axis, name in enumerate(("x_t", "y_t", "z_t")):
             rows["ray"][:, axis] = widen(raw[name])
+        rows["ray"][~np.isfinite(rows["ray"]).all(axis=1)] = 0.0  # damaged: as if there were none
         return rows[raw["wavepacket_index"] != 0]
 
     def _place(self, raw: np.ndarray, dtype: np.dtype) -> np.ndarray:

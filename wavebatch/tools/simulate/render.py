@@ -62,7 +62,8 @@ class Recording:
             f"the pulse's sigma, {self.pulse.sigma:g} ns, must be no longer than the "
             f"waveform, {self.n_samples} samples {self.spacing:g} ns apart": self.pulse.sigma
             <= min(self.n_samples, MAX_SAMPLES) * self.spacing,
-            "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": abs(self.rho - self.color / (self.color + 1)) < 0.006,
+            "rho must be 0 or m/(m+1): .5, .667, .75, .8 ...": 0 <= self.rho < 0.95
+            and abs(self.rho - self.color / (self.color + 1)) < 0.006,
             "baseline must lie from 0 to below the largest count": 0 <= self.baseline < self.clip,
             "saturation must be a count that the bits can hold": 0 < self.clip < 1 << self.bits,
         }
@@ -73,7 +74,7 @@ class Recording:
     @property
     def color(self) -> int:
         """Order m of the binomial filter that gives the noise its correlation."""
-        return round(self.rho / (1 - self.rho)) if 0 <= self.rho < 0.95 else -2
+        return round(self.rho / (1 - self.rho))
 
     @property
     def clip(self) -> int:
