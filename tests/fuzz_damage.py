@@ -13,7 +13,7 @@ import random
 import re
 import struct
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 Edit = list
 """One of
@@ -103,6 +103,9 @@ def damage(sound: Mapping[str, bytes], kind: str, rng: random.Random) -> list[Ed
     data = sound[kind]
     if rng.random() < 0.01:
         return [["take", rng.choice(sorted(sound))]]
+    texts = list(find_texts(data)) if kind.endswith((".las", ".laz")) else []
+    if texts and rng.random() < 0.1:
+        return [_damage_record(data, *rng.choice(texts), rng) for _ in range(rng.choice([1, 1, 2, 5]))]
     if kind.endswith(".npz"):
         make = _damage_npz
     else:
@@ -177,6 +180,32 @@ def odd_value(now: bytes, form: str, rng: random.Random) -> bytes:
     values += [value + 1, value - 1, 2 * value, value // 2, value ^ (1 << rng.randrange(bits)), rng.getrandbits(bits)]
     values += [rng.randrange(300), 1 << rng.randrange(bits), value + 8, value - 8, value + 60]
     return (rng.choice(values) % (1 << bits)).to_bytes(size, "little")
+
+
+def find_texts(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield place and bytes of the records that hold text: the account of the run, and the CRS."""
+    for place, user, number, length in _list_records(data):
+        if user == b"wavebatch" or user == b"LASF_Projection" and number in (2112, 34737):
+            yield place, length
+
+
+def _damage_record(data: bytes, place: int, length: int, rng: random.Random) -> Edit:
+    """One token of a text is another one that is not longer, filled up with blanks."""
+    text = data[place : place + length]
+    tokens = [match.span() for match in _TOKEN.finditer(text)]
+    start, end = rng.choice(tokens)
+    others = [text[slice(*rng.choice(tokens))] for _ in range(20)]
+    fitting = [value for value in [*_NUMBERS, *_ODD, *others] if len(value) <= end - start]
+    return ["set", place + start, rng.choice(fitting).ljust(end - start).hex()]
+
+
+def _list_records(data: bytes) -> Iterator[tuple[int, bytes, int, int]]:
+    """Yield place of the content, user, number and bytes of each VLR."""
+    at, count = struct.unpack_from("<H", data, 94)[0], struct.unpack_from("<I", data, 100)[0]
+    for _ in range(count):
+        number, length = struct.unpack_from("<HH", data, at + 18)
+        yield at + 54, data[at + 2 : at + 18].rstrip(b"\0"), number, length
+        at += 54 + length
 
 
 def _damage_npz(data: bytes, fields: list, rng: random.Random) -> Edit:
@@ -274,10 +303,8 @@ def _las_fields(data: bytes) -> Iterator[tuple[int, str, int, int]]:
 
     header = [*_HEADER, *(_HEADER_14 if data[25] >= 4 else [])]
     yield from [(place, form, 0, 1) for place, form in header] * 2
-    at = read(94, "H")
-    for _ in range(read(100, "I")):
-        yield from _vlr_fields(data, at, read)
-        at += 54 + read(at + 20, "H")
+    for place, user, number, size in _list_records(data):
+        yield from _vlr_fields(place, user, number, size)
     points, length, point_format = read(96, "I"), read(105, "H"), data[104]
     count = read(247, "Q") if data[25] >= 4 else read(107, "I")
     if point_format & 0x80:
@@ -301,10 +328,9 @@ def _las_fields(data: bytes) -> Iterator[tuple[int, str, int, int]]:
         ]
 
 
-def _vlr_fields(data: bytes, at: int, read: Callable[[int, str], int]) -> Iterator[tuple[int, str, int, int]]:
-    user, number, length = data[at + 2 : at + 18].rstrip(b"\0"), read(at + 18, "H"), read(at + 20, "H")
-    yield from [(at + place, form, 0, 1) for place, form in ((0, "H"), (2, "16s"), (18, "H"), (20, "H"), (22, "32s"))]
-    body = at + 54
+def _vlr_fields(body: int, user: bytes, number: int, length: int) -> Iterator[tuple[int, str, int, int]]:
+    head = body - 54
+    yield from [(head + place, form, 0, 1) for place, form in ((0, "H"), (2, "16s"), (18, "H"), (20, "H"), (22, "32s"))]
     if user == b"LASF_Spec" and 100 <= number <= 354:
         yield from [(body + place, form, 0, 1) for place, form in _DESCRIPTOR] * 4
     elif user == b"LASF_Spec" and number == 4:
@@ -312,5 +338,9 @@ def _vlr_fields(data: bytes, at: int, read: Callable[[int, str], int]) -> Iterat
     elif user == b"laszip encoded":
         yield from [(body + place, form, 0, 1) for place, form in _LASZIP] * 2
         yield from [(body + 34 + place, "H", 6, max((length - 34) // 6, 1)) for place in (0, 2, 4)] * 2
+    elif user == b"LASF_Projection" and number == 34735:
+        yield from [(body, "H", 2, length // 2)] * 4
+    elif user == b"LASF_Projection" and number == 34736:
+        yield from [(body, "d", 8, length // 8)] * 2
     elif length:
         yield (body, "B", 1, length)

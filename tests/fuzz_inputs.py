@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
+from strips import vlr
 
 from wavebatch.cli import main
+from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.stages.chain_file import effective, load_profile
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.strip import StripOptions
@@ -73,6 +76,27 @@ plot histogram {input} --column echo_flags -o {out}/a.png
 plot map {input} --column echo_width -o {out}/a.png
 plot section {input} -o {out}/a.svg --width 5
 plot profile {input} -o {out}/a.svg
+"""
+
+_VENDOR = """
+run {input} -o {out} --pulse-energy Energy --calibration {base}/cal.toml --profile fast
+run {input} -o {out} --where Deviation>=3 --columns +range --profile fast -q
+run {input} -o {out} --points returns --where Energy<2 --no-data nan --profile fast -q
+run {input} -o {out} --trajectory {base}/degrees.txt --profile fast -q
+run {input} -o {out} --polygon {base}/polygons.geojson --las-version 1.4 --profile fast -q
+slice {input} -o {out}/a.geojson -q
+stats {input} --polygons {base}/polygons.geojson -o {out}/a.csv
+grid {input} --column Energy --column Deviation --size 5 -o {out}/a.tif
+plot histogram {input} --column Deviation -o {out}/a.png
+"""
+_CARRIED = """
+grid {input} --column Energy --column Deviation --statistic mean --size 5 -o {out}/a.tif
+stats {input} --polygons {base}/polygons.geojson --where "Energy > 1 or Deviation < 3"
+compare {input} {base}/carried.las
+compare {input} --angles
+info {input} -v --json
+synthesize {input} -o {out}/a.las -q
+plot map {input} --column Deviation -o {out}/a.png
 """
 
 _TEXTS = {
@@ -160,8 +184,10 @@ COMMANDS: dict[str, list[str]] = {
     "packed.laz": _split(_STRIP),
     "beside.las": [*_split(_STRIP)],
     "beside.wdp": [line.replace("{input}", "{folder}/beside.las") for line in _split(_STRIP)],
+    "vendor.las": [*_split(_VENDOR), *_split(_STRIP)],
     "cloud.laz": _split(_CLOUD),
     "cloud.las": _split(_CLOUD),
+    "carried.las": [*_split(_CARRIED), *_split(_CLOUD)],
     **{kind: _split(lines) for kind, lines in (_TEXTS | _ARRAYS).items()},
 }
 """Per kind of input. {input}: the damaged file, {base}: the folder of the sound ones, {folder}: that of the damaged
@@ -190,6 +216,7 @@ def build_inputs(base: Path) -> None:
         simulate_strip("urban", base / name, pulses=120, seed=1, truth=base / f"{name}.npz", options=chosen)
         (base / f"{name}.npz").rename(base / "truth.npz")
     simulate_strip("urban", base / "other.las", pulses=60, seed=2)
+    _write_vendor(base / "strip.las", base / "vendor.las")
     (base / "chain.toml").write_text(effective(load_profile("accurate")))
     _sound("survey", base / "strip.las", "-o", base / "system.toml")
     (base / "flight.system.toml").write_bytes((base / "system.toml").read_bytes())
@@ -200,11 +227,47 @@ def build_inputs(base: Path) -> None:
     for suffix in ("laz", "las"):
         _sound("run", base / "strip.las", "-o", base / f"rich-{suffix}", "--format", suffix, *rich)
         (base / f"cloud.{suffix}").write_bytes((base / f"rich-{suffix}" / f"strip.{suffix}").read_bytes())
+    _sound("run", base / "vendor.las", "-o", base / "carried", "--format", "las", *rich)
+    (base / "carried.las").write_bytes((base / "carried" / "vendor.las").read_bytes())
     _sound("voxelize", base / "strip.las", "-o", base / "voxels.npz", "--size", "2")
     _sound("slice", base / "strip.las", "--cube", base / "cube.npz", "--lines", "0:2")
     _write_places(base)
     target = ["--targets", base / "targets.csv", "-o", base / "calibrated.toml"]
     _sound("calibrate", base / "strip.las", *target)
+
+
+def _write_vendor(strip: Path, target: Path) -> None:
+    """A LAS 1.3 strip again, with GeoTIFF keys and with extra bytes: a scaled one, one with no data, arrays."""
+    records = [
+        ExtraRecord.build("Energy", "u2", "of the pulse [uJ]", scale=0.01),
+        ExtraRecord.build("Deviation", "i2", "of the pulse's shape", no_data=-1),
+        ExtraRecord.undocumented("Bytes", 3),
+    ]
+    pair = bytearray(ExtraRecord.build("Pair", "f4", "an array of two").data)
+    pair[2] += 10
+    records.append(ExtraRecord(bytes(pair)))
+    keys = [(1024, 0, 1, 1), (1026, 34737, 6, 0), (2057, 34736, 1, 0), (3072, 0, 1, 25832), (3076, 0, 1, 9001)]
+    new = [
+        vlr(b"LASF_Projection", 34735, np.array([(1, 1, 0, len(keys)), *keys], "<u2").tobytes()),
+        vlr(b"LASF_Projection", 34736, np.float64(6378137.0).tobytes()),
+        vlr(b"LASF_Projection", 34737, b"metre|"),
+        vlr(b"LASF_Spec", 4, b"".join(record.data for record in records)),
+    ]
+    data = bytearray(strip.read_bytes())
+    start, count, length, number, packets = (
+        struct.unpack_from(form, data, place)[0]
+        for form, place in (("<I", 96), ("<I", 100), ("<H", 105), ("<I", 107), ("<Q", 227))
+    )
+    old = np.frombuffer(data[start : start + number * length], f"V{length}")
+    points = np.zeros(number, build_dtype(data[104], records))
+    assert points.dtype.itemsize == length + 15
+    points.view(np.uint8).reshape(number, -1)[:, :length] = old.view(np.uint8).reshape(number, -1)
+    points["Energy"], points["Deviation"], points["Pair"] = 100 + np.arange(number) % 7, np.arange(number) % 5 - 1, 0.5
+    more, longer = sum(map(len, new)), number * 15
+    for form, place, value in (("<I", 96, start + more), ("<I", 100, count + len(new)), ("<H", 105, length + 15),
+                               ("<Q", 227, packets + more + longer)):  # fmt: skip
+        struct.pack_into(form, data, place, value)
+    target.write_bytes(b"".join([data[:start], *new, points.tobytes(), data[start + number * length :]]))
 
 
 def _sound(*command: object) -> None:
