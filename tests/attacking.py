@@ -227,7 +227,7 @@ class Attacker:
             allowed = {0}
         if code not in allowed:
             return f"exit code {code}: {said[-300:]}"
-        if "Traceback" in said or "this is a bug" in said:
+        if "this is a bug" in said or ("Traceback" in said and not _lost_its_parent(code, said)):
             return f"says {said[-300:]}"
         if code == 130 and "interrupted" not in "".join(said.splitlines()[-1:]):
             return f"the last line is not `interrupted`: {said[-300:]}"
@@ -334,6 +334,11 @@ def _has_signal(pid: int, name: str, number: int) -> bool:
     except OSError:
         return True
     return bool(signals >> (number - 1) & 1)
+
+
+def _lost_its_parent(code: int | str, said: str) -> bool:
+    """Whether Python, while it started in a worker, says that the program was killed."""
+    return code == -signal.SIGKILL and f'File "{_PACKAGE}' not in said
 
 
 def has_not_begun(is_ready: bool, code: int | str, said: str) -> bool:

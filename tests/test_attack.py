@@ -81,6 +81,11 @@ def test_only_what_python_says_before_our_code_runs_is_no_failure(attacker, is_r
         assert attacker._judge_end(Attack("run, 1 job", "INT", 0.1), is_ready, code, said)
 
 
+@pytest.mark.parametrize(("code", "said", "fails"), [(-9, _OWN, False), (-9, _OURS, True), (130, _OWN, True)])
+def test_python_may_say_that_the_parent_of_a_new_worker_was_killed(attacker, code, said, fails):
+    assert bool(attacker._judge_end(Attack("run, flight", "INT KILL", 0.1), True, code, said)) is fails
+
+
 @pytest.mark.slow
 def test_attacks_break_no_promise(tmp_path):
     seed = int(os.environ.get("FUZZ_SEED", "1"))

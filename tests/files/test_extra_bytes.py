@@ -44,12 +44,22 @@ def test_texts_longer_than_the_record_are_refused():
         ExtraRecord.build("n", "f4", "\N{MICRO SIGN}" * 17)
 
 
+@pytest.mark.parametrize("size", [*range(1, 80), 255, 256, 1000])
+def test_laspy_reads_records_of_undescribed_bytes(size):
+    """Their number stands where others have options: 8 to 31 would be a scale or an offset to laspy."""
+    records = read_records(b"", size)
+    assert sum(record.dtype.itemsize for record in records) == size
+    for record in records:
+        seen = as_laspy(record)
+        assert seen.num_elements() == record.dtype.itemsize and seen.scale is None and seen.offset is None
+
+
 def test_undescribed_bytes_get_records_of_their_own():
     known = ExtraRecord.build("a", "u2", "")
     assert [(r.name, r.dtype.itemsize) for r in read_records(known.data, 2)] == [("a", 2)]
     found = read_records(known.data, 302)
     assert [(r.name, r.code, r.dtype.itemsize) for r in found] == [
-        ("a", 3, 2), ("ExtraBytes", 0, 255), ("ExtraBytes 2", 0, 45),
+        ("a", 3, 2), ("ExtraBytes", 0, 231), ("ExtraBytes 2", 0, 69),
     ]  # fmt: skip
     assert read_records(known.data, 1)[0].dtype == np.dtype("u1")  # described, but not there
     unknown = ExtraRecord(bytes([0, 0, 31]) + bytes(189))

@@ -167,6 +167,14 @@ def test_wrong_use_is_one_line_and_writes_nothing(rasterio, rng, tmp_path, monke
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.las"]
 
 
+@pytest.mark.parametrize("degree", ["1e308", "0"])
+def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rasterio, rng, tmp_path, degree):
+    _cloud(tmp_path / "a.las", rng, 50, wkt=UTM.replace("0.0174532925199433", degree))
+    result = _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
+    assert "the CRS cannot be" in result.stderr and result.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
+
+
 def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, rng, tmp_path):
     _cloud(tmp_path / "a.las", rng, 50)
     _cloud(tmp_path / "b.las", rng, 50, wkt=None, epsg=25832)

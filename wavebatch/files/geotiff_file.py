@@ -80,12 +80,17 @@ def _read_crs(text: str, where: str) -> Any:
     with Env():
         try:
             found = CRS.from_user_input(text)
+            wkt = found.to_wkt()
         except Exception as error:  # of GDAL and PROJ, for whatever a file may hold
-            why = " ".join(str(error).split())
-            raise ConfigError(f"{where}: the CRS cannot be read ({why[:120]}); give it with --crs EPSG:n") from error
-        if found.to_wkt().upper().startswith("GEOCCS"):
+            raise _complain(where, "read", error) from error
+        if wkt.upper().startswith("GEOCCS"):
             raise ConfigError(f"{where}: coordinates are geocentric; a raster needs plane coordinates")
         return found
+
+
+def _complain(where: str, what: str, error: Exception) -> ConfigError:
+    why = " ".join(str(error).split())
+    return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); give it with --crs EPSG:n")
 
 
 class RasterWriter(Closing):
@@ -100,10 +105,10 @@ class RasterWriter(Closing):
         import rasterio
         from rasterio import Affine
 
+        crs = None if layout.crs is None else _read_crs(layout.crs, str(target))
         self._draft = Draft(target, overwrite=overwrite)
         self._target = target
         self._layout = layout
-        crs = None if layout.crs is None else _read_crs(layout.crs, str(target))
         try:
             self._file = rasterio.open(
                 self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
@@ -119,6 +124,8 @@ class RasterWriter(Closing):
             self._draft.discard()
             if isinstance(error, rasterio.errors.RasterioError | OSError):
                 raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
+            if crs is not None and type(error).__module__.startswith("rasterio"):  # GDAL has no keys for such numbers
+                raise _complain(str(target), "written", error) from error
             raise
 
     def write_tile(self, row: int, column: int, values: np.ndarray) -> None:

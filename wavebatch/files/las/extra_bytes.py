@@ -131,7 +131,8 @@ class ExtraRecord:
 def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
     """Return records for all `size` extra bytes of a point; bytes that `payload` does not describe get type 0.
 
-    A record of unknown type, or one that needs more bytes than there are, ends the description.
+    A record of unknown type, or one that needs more bytes than there are, ends the description. Records of type 0 have
+    their size where others have options; laspy fails on sizes that look like a scale or an offset, so none has such.
     """
     records: list[ExtraRecord] = []
     left = size
@@ -147,8 +148,9 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
         name = "ExtraBytes" if number == 1 else f"ExtraBytes {number}"
         number += 1
         if name not in taken:
-            records.append(ExtraRecord.undocumented(name, min(left, 255)))
-            left -= min(left, 255)
+            part = min(left, 255) & ~(_SCALE | _OFFSET) or min(left, 7)
+            records.append(ExtraRecord.undocumented(name, part))
+            left -= part
     return records
 
 

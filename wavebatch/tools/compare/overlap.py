@@ -129,6 +129,7 @@ def _take_off_angle(rows: np.ndarray, name: str, angles: str) -> np.ndarray:
     if name not in LIGHT_COLUMNS:
         return rows[name].astype(np.float64)
     angle = rows["angle" if angles == "normals" else "scan_angle"].astype(np.float64)
+    angle[~(np.abs(angle) < 90)] = np.nan  # no surface is seen from there
     return rows[name] / np.cos(np.radians(angle))
 
 
@@ -179,7 +180,7 @@ def _azimuth_error(ties: Ties, rows: list[np.ndarray]) -> float:
 
 
 def _typical_error(rows: np.ndarray, name: str) -> float:
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         relative = rows[f"{name}_err"] / rows[name]
     relative = relative[np.isfinite(relative)]
     return float(np.median(relative)) if len(relative) else math.nan
