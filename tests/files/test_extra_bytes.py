@@ -44,6 +44,19 @@ def test_texts_longer_than_the_record_are_refused():
         ExtraRecord.build("n", "f4", "\N{MICRO SIGN}" * 17)
 
 
+@pytest.mark.parametrize(
+    ("stored", "name"),
+    [(b"T\xb0", "T\N{DEGREE SIGN}"), (b"\xb0" * 32, "\N{DEGREE SIGN}" * 16), (b"a" * 31 + b"\xb0", "a" * 31)],
+)
+def test_latin_1_texts_become_utf_8(stored, name):
+    record = ExtraRecord(bytes([0, 0, 3, 0]) + stored.ljust(32, b"\0") + bytes(124) + stored.ljust(32, b"\0"))
+    with pytest.raises(UnicodeDecodeError):
+        as_laspy(record).format_name()
+    readable = record.with_readable_texts()
+    assert as_laspy(readable).format_name() == readable.name == readable.description == name
+    assert readable.with_readable_texts() == readable and len(readable.data) == 192
+
+
 @pytest.mark.parametrize("size", [*range(1, 80), 255, 256, 1000])
 def test_laspy_reads_records_of_undescribed_bytes(size):
     """Their number stands where others have options: 8 to 31 would be a scale or an offset to laspy."""

@@ -158,6 +158,15 @@ def write_several(path):
     return points
 
 
+def test_a_name_that_is_no_utf_8_is_carried_as_one(tmp_path):
+    write_source(tmp_path / "a.las", 9, (1, 4), n=6, records=[ExtraRecord.build("Ta", "u2", "")])
+    data = (tmp_path / "a.las").read_bytes()
+    assert data.count(b"Ta\0") == 1
+    (tmp_path / "a.las").write_bytes(data.replace(b"Ta\0", b"T\xb0\0"))
+    layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")
+    assert layout.extra_records[0].name == "T\N{DEGREE SIGN}"
+
+
 def test_returns_keep_all_extra_bytes_exactly(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")

@@ -35,6 +35,6 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
     for record in checked.records:
         empty = None if whole else choose_no_data(record)
         marked = record if empty is None else record.with_no_data(empty)
-        carried.append(Carried(marked, at, copied=not whole and empty is None))
+        carried.append(Carried(marked.with_readable_texts(), at, copied=not whole and empty is None))
         at += record.dtype.itemsize
     return tuple(carried)

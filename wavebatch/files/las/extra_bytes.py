@@ -18,7 +18,7 @@ RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
-_AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 40, 64, 88, 112, 160
+_AT_NAME, _AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 4, 40, 64, 88, 112, 160
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +115,21 @@ class ExtraRecord:
             packed = np.asarray(numbers).astype(self._container).tobytes()
             data[at : at + len(packed)] = packed
             data[3] |= option
+        return ExtraRecord(bytes(data))
+
+    def with_readable_texts(self) -> ExtraRecord:
+        """Return the record with name and description in UTF-8, without which laspy cannot open the file.
+
+        Bytes that are no UTF-8 count as Latin-1, which some vendors write.
+        """
+        data = bytearray(self.data)
+        for at in (_AT_NAME, _AT_DESCRIPTION):
+            text = self.data[at : at + 32].split(b"\0")[0]
+            try:
+                text.decode()
+            except UnicodeDecodeError:
+                whole = text.decode("latin-1").encode()[:32].decode(errors="ignore").encode()
+                data[at : at + 32] = whole.ljust(32, b"\0")
         return ExtraRecord(bytes(data))
 
     def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:
