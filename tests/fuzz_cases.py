@@ -159,6 +159,7 @@ def _drop(words):
         (lambda words: click.echo("error: this is a bug", err=True), "says this is a bug"),
         (lambda words: click.echo("a \x07 name", err=True), "control characters"),
         (lambda words: click.echo("a \r name", err=True), "control characters"),
+        (lambda words: len(words) > os.write(2, b"x"), "a library writes to stderr"),
     ],
 )
 def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, monkeypatch, what, why):

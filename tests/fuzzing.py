@@ -140,8 +140,16 @@ class Fuzzer:
         """In the forked process: run the cases and write what each did."""
         try:
             os.setsid()
+            libraries = tempfile.TemporaryFile()  # noqa: SIM115 - open until the process ends
             for case in cases:
-                found = self._run_here(case)
+                with _stderr_into(libraries):
+                    found = self._run_here(case)
+                libraries.seek(0)
+                written = libraries.read()
+                libraries.seek(0)
+                libraries.truncate()
+                if written and not found["why"]:
+                    found["why"] = f"a library writes to stderr: {written[:300]!r}"
                 os.write(target, json.dumps(found).encode() + b"\n")
                 if found["why"]:
                     break
@@ -218,6 +226,18 @@ class Fuzzer:
             if self.run(case._replace(variables=fewer_variables)):
                 case = case._replace(variables=fewer_variables)
         return case
+
+
+@contextlib.contextmanager
+def _stderr_into(file: Any) -> Iterator[None]:
+    """What libraries write past Python goes into a file."""
+    kept = os.dup(2)
+    os.dup2(file.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 class _Watch:

@@ -1,4 +1,10 @@
-"""LAZ files whose chunks were compressed apart: the bytes are those of a file that was compressed in one go."""
+"""LAZ files whose chunks were compressed apart: the bytes are those of a file that was compressed in one go.
+
+And what a decoder says past Python.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -6,6 +12,10 @@ from numpy.lib import recfunctions
 from writer_tools import BACKENDS, read_raw
 
 from wavebatch.core.errors import InputError
+from wavebatch.files.cloud.echo_reader import CloudReader
+from wavebatch.files.disk import raw_bytes
+from wavebatch.files.disk.raw_bytes import hiding_panics
+from wavebatch.files.las import laz_decode
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
 from wavebatch.files.las.header import LasHeader
 from wavebatch.files.las.laz_encode import CHUNK_POINTS
@@ -82,3 +92,49 @@ def test_rows_of_another_layout_are_refused(tmp_path):
         other = recfunctions.drop_fields(make_rows(6, 3), "X")
         with pytest.raises(InputError, match="another layout"):
             file.chunk_maker.make(other)
+
+
+def _panic(*_):
+    os.write(2, b"thread '<unnamed>' panicked at decoders.rs:171: index out of bounds\n")
+    raise type("PanicException", (BaseException,), {})("index out of bounds")
+
+
+def test_a_panic_of_the_decoder_is_one_line_and_says_nothing_itself(tmp_path, monkeypatch, capfd):
+    path = tmp_path / "a.laz"
+    with open_file(path, 1) as file:
+        file.write(make_rows(1, 10))
+        file.commit()
+    monkeypatch.setattr(laz_decode.LazPoints, "_decode", _panic)
+    with CloudReader(path) as reader, pytest.raises(InputError, match="cannot be decompressed .index out of bounds.;"):
+        list(reader.read_pieces())
+    assert capfd.readouterr().err == ""
+
+
+def test_what_others_write_to_stderr_while_points_are_decoded_is_not_lost(capfd):
+    files = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(KeyError), hiding_panics():
+        os.write(2, b"from another thread\n")
+        raise KeyError
+    with ThreadPoolExecutor() as pool:
+        pool.submit(_write_hidden).result()
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "from another thread\nin a thread\nafter\n"
+    assert len(os.listdir("/proc/self/fd")) == files
+
+
+def _write_hidden():
+    with hiding_panics():
+        os.write(2, b"in a thread\n")
+
+
+def test_an_interrupt_while_stderr_is_taken_gives_it_back(monkeypatch, capfd):
+    def interrupt(held):
+        raw_bytes_hold(held)
+        raise KeyboardInterrupt
+
+    raw_bytes_hold = raw_bytes._hold_stderr
+    monkeypatch.setattr(raw_bytes, "_hold_stderr", interrupt)
+    with pytest.raises(KeyboardInterrupt), hiding_panics():
+        pass
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -112,3 +113,46 @@ def guarded(path: Path, start: int, stop: int) -> Iterator[None]:
         interrupts.check()  # it may come from an interrupt inside the decoder
         what = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise damaged(path, f"points {start} to {stop} cannot be decompressed ({what})") from error
+
+
+@contextlib.contextmanager
+def hiding_panics() -> Iterator[None]:
+    """Keep what Rust writes to stderr, past Python, when lazrs panics: the error that follows says it in one line.
+
+    What else comes there meanwhile is written at the end. In the main thread only: two threads would mix up the
+    descriptors.
+    """
+    held: list[int] = []
+    panics = False
+    try:
+        if threading.current_thread() is threading.main_thread():
+            with interrupts.uninterrupted(), contextlib.suppress(OSError, AttributeError):
+                _hold_stderr(held)
+        yield
+    except BaseException as error:
+        panics = type(error).__name__ == "PanicException"
+        raise
+    finally:
+        if held:
+            with interrupts.uninterrupted():
+                _release_stderr(*held, drop=panics)
+
+
+def _hold_stderr(held: list[int]) -> None:
+    """Let stderr go into memory; `held` gets the descriptors of stderr and of the memory."""
+    memory = os.memfd_create("stderr")
+    try:
+        held += os.dup(2), memory
+    except OSError:
+        os.close(memory)
+        raise
+    os.dup2(memory, 2)
+
+
+def _release_stderr(kept: int, memory: int, *, drop: bool) -> None:
+    os.dup2(kept, 2)
+    os.close(kept)
+    if not drop and (size := os.lseek(memory, 0, os.SEEK_END)):
+        with contextlib.suppress(OSError):  # as for all messages: a full disk does not stop the work
+            os.write(2, os.pread(memory, size, 0))
+    os.close(memory)
