@@ -147,6 +147,24 @@ def test_a_survey_that_could_not_be_read_again_is_not_written(strips, tmp_path, 
     assert list((tmp_path / "out").iterdir()) == []
 
 
+def test_a_survey_of_which_no_cloud_comes_is_not_kept(strips, flown, tmp_path):
+    """The next run may be of other strips, and would take it."""
+    wrong = ("--survey", "flight", "--where", "nonsense > 3", "--profile", "fast")
+    result = _run(strips["a"], strips["b"], "-o", tmp_path / "out", *wrong)
+    assert result.exit_code == 2 and list((tmp_path / "out").iterdir()) == []
+    folder, before = flown[0], _files(flown[0])
+    assert _run(strips["c"], "-o", folder, *wrong).exit_code in (2, 4) and _files(folder) == before
+
+
+def test_a_survey_of_an_interrupted_run_is_kept_for_the_next(strips, tmp_path, monkeypatch):
+    def interrupt(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wavebatch.batch.run._Batch.run", interrupt)
+    assert _run(strips["a"], "-o", tmp_path, "--survey", "flight", "--profile", "fast").exit_code != 0
+    assert [path.name for path in tmp_path.iterdir()] == ["flight.system.toml"]
+
+
 def test_no_strip_that_can_be_read(tmp_path):
     (tmp_path / "bad.las").write_bytes(b"LASF")
     result = _run(tmp_path / "bad.las", "-o", tmp_path / "out", "--survey", "flight")

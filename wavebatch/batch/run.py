@@ -133,8 +133,17 @@ def run_batch(
             jobs = with_flight(jobs, saved or _survey_flight(jobs, options, workers, on_event))
         with contextlib.closing(_Batch(jobs, options, workers, on_event)) as batch:
             batch.run()
-        outcomes = tuple(batch.outcomes[job.path] for job in jobs)
-    return BatchResult(outcomes, time.perf_counter() - start)
+        result = BatchResult(tuple(batch.outcomes[job.path] for job in jobs), time.perf_counter() - start)
+        if saved is None and result.failed == len(jobs):
+            _drop_flight(options.folder)
+    return result
+
+
+def _drop_flight(folder: Path) -> None:
+    """Remove the survey of a flight of which no cloud came: the next run, perhaps of other strips, would use it."""
+    if not any(folder.glob("*.report.json")):
+        with contextlib.suppress(OSError):
+            flight_path(folder).unlink(missing_ok=True)
 
 
 def _survey_flight(
