@@ -4,6 +4,7 @@ import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.files.las.crs import read_crs_definition
@@ -173,6 +174,23 @@ def test_a_crs_that_gdal_reads_but_cannot_write_is_one_line(rasterio, rng, tmp_p
     result = _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif", code=2)
     assert "the CRS cannot be" in result.stderr and result.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
+
+
+def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):
+    """GDAL would put it into a file beside the raster: RIEGL strips have one."""
+    axes = 'AXIS["Easting",EAST],AXIS["Northing",NORTH],AXIS["Height",UP]'
+    _cloud(tmp_path / "a.las", rng, 50, wkt=UTM.replace('AUTHORITY["EPSG","32633"]', axes))
+    _run(tmp_path / "a.las", "--statistic", "count", "-o", tmp_path / "x.tif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.las", "x.tif"]
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.crs.is_projected and "Transverse_Mercator" in found.crs.to_wkt() and found.descriptions[0]
+
+
+def test_the_raster_of_a_real_strip_has_its_crs(rasterio, tmp_path):
+    _run(data_file("riegl-q680i/100429_152240_2535pt_UTM.las"), "--statistic", "density", "-o", tmp_path / "x.tif")
+    assert [path.name for path in tmp_path.iterdir()] == ["x.tif"]
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.crs.is_projected and "33" in found.crs.to_wkt()[:60]
 
 
 def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, rng, tmp_path):

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +50,13 @@ class RasterLayout:
     """Of the coordinates."""
 
 
+_ONE_FILE = {"GDAL_PAM_ENABLED": "NO"}
+"""Setting of GDAL: nothing goes into a file beside the raster."""
+
+_UPRIGHT = re.compile(r',AXIS\["[^"]*",up(?:,[A-Z]+\[(?:[^\[\]]|\[[^\[\]]*\])*\])*\]')
+"""An axis of heights in WKT 2."""
+
+
 def check_raster(target: Path, *, overwrite: bool) -> None:
     """Raise ConfigError if the suffix is not that of a GeoTIFF or rasterio is missing, InputError if it exists."""
     if target.suffix.lower() not in (".tif", ".tiff"):
@@ -88,6 +96,43 @@ def _read_crs(text: str, where: str) -> Any:
         return found
 
 
+def _make_writable(crs: Any, where: str) -> Any:
+    """The CRS as GeoTIFF keys hold it: without its heights if need be. ConfigError where they cannot hold it.
+
+    GDAL would put it into a file beside the raster, and the raster itself would have none.
+    """
+    error: Exception | None = None
+    for found in (crs, _without_heights(crs)):
+        try:
+            if found is not None and _is_kept(found):
+                return found
+        except Exception as caught:  # of GDAL, which has no keys for some numbers that it reads
+            error = caught
+    raise _complain(where, "written", error or ConfigError("GeoTIFF has no keys for it"))
+
+
+def _is_kept(crs: Any) -> bool:
+    """Whether a small raster in memory still has its CRS when it is read."""
+    import rasterio
+
+    with rasterio.Env(**_ONE_FILE), rasterio.MemoryFile() as memory:
+        place = rasterio.Affine(2.0, 0.0, 2.0, 0.0, -2.0, 2.0)
+        shape = {"width": 1, "height": 1, "count": 1, "dtype": "uint8"}
+        with memory.open(driver="GTiff", crs=crs, transform=place, **shape):
+            pass
+        with memory.open() as file:
+            return file.crs is not None
+
+
+def _without_heights(crs: Any) -> Any:
+    """A projected CRS of three axes with the first two only; None where it is another one."""
+    from rasterio.crs import CRS
+
+    text = crs.to_wkt(version="WKT2_2019")
+    plane = _UPRIGHT.sub("", text).replace("CS[Cartesian,3]", "CS[Cartesian,2]")
+    return CRS.from_wkt(plane) if text.startswith("PROJCRS[") and plane != text else None
+
+
 def _complain(where: str, what: str, error: Exception) -> ConfigError:
     why = " ".join(str(error).split())
     return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); give it with --crs EPSG:n")
@@ -105,17 +150,18 @@ class RasterWriter(Closing):
         import rasterio
         from rasterio import Affine
 
-        crs = None if layout.crs is None else _read_crs(layout.crs, str(target))
+        crs = None if layout.crs is None else _make_writable(_read_crs(layout.crs, str(target)), str(target))
         self._draft = Draft(target, overwrite=overwrite)
         self._target = target
         self._layout = layout
         try:
-            self._file = rasterio.open(
-                self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
-                dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
-                transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
-                compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
-            )  # fmt: skip
+            with rasterio.Env(**_ONE_FILE):
+                self._file = rasterio.open(
+                    self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
+                    dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
+                    transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
+                    compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
+                )  # fmt: skip
             self._file.update_tags(**tags)
             for number, band in enumerate(bands, 1):
                 self._file.set_band_description(number, band.description)
@@ -124,8 +170,6 @@ class RasterWriter(Closing):
             self._draft.discard()
             if isinstance(error, rasterio.errors.RasterioError | OSError):
                 raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
-            if crs is not None and type(error).__module__.startswith("rasterio"):  # GDAL has no keys for such numbers
-                raise _complain(str(target), "written", error) from error
             raise
 
     def write_tile(self, row: int, column: int, values: np.ndarray) -> None:
@@ -152,7 +196,8 @@ class RasterWriter(Closing):
         import rasterio
 
         try:
-            self._file.close()
+            with rasterio.Env(**_ONE_FILE):
+                self._file.close()
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
         self._draft.publish()
@@ -160,5 +205,8 @@ class RasterWriter(Closing):
     def close(self) -> None:
         """Remove what was not published; may be called twice."""
         if not self._file.closed:
-            self._file.close()
+            import rasterio
+
+            with rasterio.Env(**_ONE_FILE):
+                self._file.close()
         self._draft.discard()
