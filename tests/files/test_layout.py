@@ -167,6 +167,24 @@ def test_a_name_that_is_no_utf_8_is_carried_as_one(tmp_path):
     assert layout.extra_records[0].name == "T\N{DEGREE SIGN}"
 
 
+@pytest.mark.parametrize("name", [b"", b"same", b"intensity", b"x" * 32])
+def test_carried_names_are_told_apart(tmp_path, name):
+    """laspy opens no file in which a name is there twice, or is that of a field."""
+    records = [ExtraRecord.build(one, "u2", "") for one in ("Ta", "Tb", "Tc")]
+    write_source(tmp_path / "a.las", 9, (1, 4), n=6, records=records)
+    data = (tmp_path / "a.las").read_bytes()
+    for one in (b"Ta", b"Tb", b"Tc"):
+        assert data.count(one.ljust(32, b"\0")) == 1
+        data = data.replace(one.ljust(32, b"\0"), name.ljust(32, b"\0"))
+    (tmp_path / "a.las").write_bytes(data)
+    layout = plan_output(tmp_path / "a.las", ["amplitude"])
+    names = [record.name for record in layout.extra_records]
+    assert len(set(names)) == 4 and "" not in names and not set(names) & set(STANDARD_DTYPES[9].names)
+    assert names == list(layout.extra_fields)
+    begin = name[:30].decode()
+    assert names[0] == (name.decode() if name in (b"same", b"x" * 32) else f"{begin} 2") and names[1].startswith(begin)
+
+
 def test_returns_keep_all_extra_bytes_exactly(tmp_path):
     points = write_several(tmp_path / "a.las")
     layout = plan_output(tmp_path / "a.las", ["amplitude"], points="returns")

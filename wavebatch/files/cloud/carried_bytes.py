@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.extra_bytes import ExtraRecord, choose_no_data
+from wavebatch.files.las.extra_bytes import ExtraRecord, choose_no_data, tell_apart
 from wavebatch.files.las.header import STANDARD_DTYPES
 
 
@@ -32,9 +32,10 @@ def plan_carried(checked: CheckedHeader, whole: bool) -> tuple[Carried, ...]:
     """
     at = STANDARD_DTYPES[checked.header.point_format].itemsize
     carried = []
-    for record in checked.records:
+    readable = [record.with_readable_texts() for record in checked.records]
+    for record in tell_apart(readable, checked.header.point_format):
         empty = None if whole else choose_no_data(record)
         marked = record if empty is None else record.with_no_data(empty)
-        carried.append(Carried(marked.with_readable_texts(), at, copied=not whole and empty is None))
+        carried.append(Carried(marked, at, copied=not whole and empty is None))
         at += record.dtype.itemsize
     return tuple(carried)

@@ -132,6 +132,11 @@ class ExtraRecord:
                 data[at : at + 32] = whole.ljust(32, b"\0")
         return ExtraRecord(bytes(data))
 
+    def with_name(self, name: str) -> ExtraRecord:
+        """Return the record with another name, of which 32 bytes are kept."""
+        stored = name.encode()[:32].decode(errors="ignore").encode()
+        return ExtraRecord(self.data[:_AT_NAME] + stored.ljust(32, b"\0") + self.data[_AT_NAME + 32 :])
+
     def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:
         """Return the record with this stored no-data value per element."""
         return self._with(_AT_NO_DATA, _NO_DATA, numbers)
@@ -167,6 +172,24 @@ def read_records(payload: bytes, size: int) -> list[ExtraRecord]:
             records.append(ExtraRecord.undocumented(name, part))
             left -= part
     return records
+
+
+def tell_apart(records: Sequence[ExtraRecord], point_format: int) -> list[ExtraRecord]:
+    """Return the records with names that no other one and no field of the format has: laspy opens no other file.
+
+    A name that is taken, or empty, gets " 2", " 3" ... at its end, as in `build_dtype`.
+    """
+    taken = set(STANDARD_DTYPES[point_format].names)
+    apart = []
+    for record in records:
+        name, number = record.name, 1
+        while not name or name in taken:
+            number += 1
+            end = f" {number}"
+            name = record.name.encode()[: 32 - len(end)].decode(errors="ignore") + end
+        taken.add(name)
+        apart.append(record if name == record.name else record.with_name(name))
+    return apart
 
 
 def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
