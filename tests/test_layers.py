@@ -20,7 +20,7 @@ INSIDE = {
         {"strip_task", "processes", "dask_cluster"}, {"preflight"}, {"run"},
     ],
     "surveying": [
-        {"measure"}, {"learn_pulse", "flat_ground"}, {"survey", "sensor"},
+        {"flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"},
         {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"targets"},
     ],
