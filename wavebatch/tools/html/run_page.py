@@ -73,8 +73,9 @@ def _parts(
         yield markup.section("Failed strips", markup.bullets(failed, "warning"), mark="failed")
     if len(strips) > 1:
         yield _index(strips, marks, shown)
-        yield markup.section("All strips together", count_tables(counts), figures(figures_of(report["quality"])),
-                             flag_table(counts))  # fmt: skip
+        points = strips[0].outcome.job.options.points  # the same for all
+        yield markup.section("All strips together", count_tables(counts, points),
+                             figures(figures_of(report["quality"])), flag_table(counts))  # fmt: skip
     for strip in strips:
         if strip.number in shown and strip.report is not None:
             body = draw_strip(strip.outcome.job.path, strip.cloud, strip.report)
@@ -97,6 +98,8 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
         ("passed through", f"{passed:,}"),
         ("points out", f"{counts['points_out']:,}"),
     ]
+    left = sum(counts["left_out"].values())
+    cards[-1:-1] = [("left out", f"{left:,}")] if left else []
     body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
     lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
     if result.advice:
