@@ -35,7 +35,7 @@ _MODES = {
     "jobs_model": ("scenes", "pulses", "repeats", "seed"),
 }
 """Modes that measure something else, and the options that they use."""
-_ALWAYS = ("files", "output", "html_file", "as_json", "quiet", "log_file", "log_level", "debug")
+_ALWAYS = ("files", "output", "html_file", "as_json", "quiet", "log_path", "log_level", "debug")
 
 JOBS_PULSES = 600_000
 """Of the strip of --jobs-model: more than ten units."""
