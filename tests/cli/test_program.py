@@ -57,9 +57,8 @@ def test_groups_name_options_that_exist_and_each_once():
     named = [name for names in GROUPS.values() for name in names]
     assert len(named) == len(set(named))
     rivals = {name for group in EXCLUSIVE for name in group}
-    assert [name for name in {*rivals, *NEVER} if name not in {*known, "force"}] == []
-    assert len(set(named) - known) <= len({"where", "drop_flags", "bbox", "polygon", "classes", "las_version", "strict",
-                                           "recursive", "force", "points_"})  # fmt: skip
+    assert [name for name in {*rivals, *NEVER} if name not in known] == []
+    assert set(named) - known == set()
 
 
 def test_options_that_take_a_number_name_its_unit():

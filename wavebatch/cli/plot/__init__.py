@@ -57,7 +57,7 @@ def plot() -> None:
               callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
               help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
               "over the strip]")
-@click.option("--point", "points", multiple=True, type=int, metavar="N",
+@click.option("--point", "point_numbers", multiple=True, type=int, metavar="N",
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
@@ -89,15 +89,16 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.core.flag_names import read_flags
     from wavebatch.tools.plots.packets import Wanted
 
-    if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
+    if options["flags_with"] and (options["packets"] or options["point_numbers"] or options["times"]):
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["random"] and any(options[name] for name in ("packets", "points", "times", "flags_with")):
+    if options["random"] and any(options[name] for name in ("packets", "point_numbers", "times", "flags_with")):
         raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
     check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
-    wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
+    flags = read_flags(options["flags_with"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
         from wavebatch.tools.plots.echo_table import format_echoes
@@ -105,11 +106,10 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
+    echoes = sum(len(view.echoes) for view in views)
     if not options["quiet"]:
-        echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
     if options["as_json"]:
-        echoes = sum(len(view.echoes) for view in views)
         print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
