@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import sys
 import traceback
 from pathlib import Path
@@ -48,6 +47,8 @@ from wavebatch.cli.options import (
     where_option,
 )
 from wavebatch.cli.program.completion import complete_flags, complete_written
+from wavebatch.cli.program.log_file import typed_command
+from wavebatch.cli.program.settings import EXCLUSIVE
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
@@ -188,12 +189,10 @@ def _start_processes(options: dict[str, Any]) -> None:
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    pairs = [("chain_file", "profile"), ("chain_file", "tolerance"), ("profile", "tolerance")]
-    pairs += [("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"), ("scheduler", "memory")]
     given = {name for name, value in options.items() if value is not None and value is not False}
-    for first, second in pairs:
-        if {first, second} <= given:
-            names = [f"--{name.removesuffix('_file')}" for name in (first, second)]
+    for rivals in EXCLUSIVE:
+        names = [f"--{name.removesuffix('_file')}" for name in rivals if name in given]
+        if len(names) > 1:
             raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     report = options["report"]
     if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
@@ -298,7 +297,7 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     from wavebatch.tools.html.run_page import write_run_page
 
     try:
-        write_run_page(target, result, folder, " ".join(map(shlex.quote, sys.argv)))
+        write_run_page(target, result, folder, typed_command(click.get_current_context()))
     except Exception as error:  # the clouds are written, whatever becomes of the page
         if options["debug"]:
             traceback.print_exc()
