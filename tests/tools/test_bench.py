@@ -404,6 +404,13 @@ def test_options_that_a_mode_does_not_use_are_refused(words, message):
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
 
 
+def test_a_small_strip_that_fails_is_no_time(tmp_path):
+    broken = tmp_path / "broken.las"
+    broken.write_bytes(b"LASF")
+    with pytest.raises(InputError, match=r"0\.las"):
+        jobs.run_small(broken, tmp_path / "small")
+
+
 @pytest.mark.parametrize("mode", ["--real", "--jobs-model"])
 def test_every_mode_takes_a_log_file(mode, tmp_path):
     log = tmp_path / "night.log"

@@ -5,7 +5,6 @@ Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wavebatch.cli.messages import one_line, print_json, print_result, talk
+from wavebatch.cli.messages import format_json, one_line, print_json, print_result, talk
 from wavebatch.cli.options import (
     check_html,
     common_options,
@@ -195,12 +194,7 @@ def _bench_against(
             named = simulate_strips(scenes, options["pulses"], options["seed"], Path(folder))
         found = compare_runs(other, named, options["repeats"], say=say)
     text, document = format_paired(other, found), to_document(other, found)
-    if output:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "against.txt").write_text(text + "\n")
-        (output / "against.json").write_text(json.dumps(document, indent=2) + "\n")
-        talk(f"wrote {output / 'against.txt'} and {output / 'against.json'}")
-    print_result(options["as_json"], document, [text], "against")
+    _show(options["as_json"], output, text, document, "against")
 
 
 def _bench_jobs(
@@ -221,12 +215,16 @@ def _bench_jobs(
         small = simulate_strips([scene], SMALL_PULSES, options["seed"], folder / "small")[scene]
         found = measure_jobs(strip, small, folder / "out", options["repeats"], say)
     text, document = format_jobs(strip.name, *found), to_document(strip.name, *found)
-    if output:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "jobs.txt").write_text(text + "\n")
-        (output / "jobs.json").write_text(json.dumps(document, indent=2) + "\n")
-        talk(f"wrote {output / 'jobs.txt'} and {output / 'jobs.json'}")
-    print_result(options["as_json"], document, [text], "jobs")
+    _show(options["as_json"], output, text, document, "jobs")
+
+
+def _show(as_json: bool, output: Path | None, text: str, document: Mapping[str, Any], mode: str) -> None:
+    """Prints the figures of a mode, and writes them as MODE.txt and MODE.json into the folder of -o."""
+    from wavebatch.tools.bench.report import write_texts
+
+    if output is not None:
+        talk(write_texts(output, {f"{mode}.txt": text, f"{mode}.json": format_json(document)}))
+    print_result(as_json, document, [text], mode)
 
 
 def _bench_real(
