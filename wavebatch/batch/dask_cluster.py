@@ -63,7 +63,7 @@ class Cluster:
     folder : Path
         Of the outputs; temporary files that workers share lie in it.
     files : sequence of Path
-        That all workers must see: strips and trajectories.
+        That all workers must see: `StripJob.files`.
     tell : callable, optional
         Called with the events of `run_batch`: here, of a worker that joins and does not fit.
 

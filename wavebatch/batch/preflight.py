@@ -74,11 +74,9 @@ def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
 
 
 def find_inputs(jobs: Sequence[StripJob]) -> list[Path]:
-    """Return the files that the jobs read."""
-    files = {
-        path for job in jobs for path in (job.path, job.sensor.trajectory, job.selection.polygon) if path is not None
-    }
-    return sorted({Path(path) for path in files})
+    """Return the files that the jobs read, also those that are read already: no output may replace them."""
+    read = {Path(job.selection.polygon) for job in jobs if job.selection.polygon is not None}
+    return sorted(read.union(*(job.files for job in jobs)))
 
 
 def find_outputs(job: StripJob, folder: Path) -> list[Path]:

@@ -124,7 +124,8 @@ def run_batch(
     saved = load_flight(jobs, options)
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
-        workers = Cluster(options.scheduler, options.folder, find_inputs(jobs), on_event)
+        files = sorted({file for job in jobs for file in job.files})
+        workers = Cluster(options.scheduler, options.folder, files, on_event)
     with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)

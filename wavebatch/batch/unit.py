@@ -107,13 +107,22 @@ class StripJob:
         value, error = self.attenuation
         return replace(system, attenuation=value, attenuation_error=error)
 
+    @property
+    def energy_file(self) -> Path | None:
+        """The file of `pulse_energy`; None where that names an extra byte."""
+        file = None if self.pulse_energy is None else Path(self.pulse_energy)
+        return file if file is not None and file.is_file() else None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that the processes read, without those of packets."""
+        return tuple(path for path in (self.path, self.sensor.trajectory, self.energy_file) if path is not None)
+
     def absolute(self) -> StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
         file = self.sensor.trajectory
         sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        energy = self.pulse_energy
-        if energy is not None and Path(energy).is_file():
-            energy = str(Path(energy).absolute())
+        energy = self.pulse_energy if self.energy_file is None else str(self.energy_file.absolute())
         return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
 
     def open(self) -> StripReader:
