@@ -12,7 +12,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from wavebatch.batch.processes import WorkerDied, Workers
+from wavebatch.batch.workers.processes import WorkerDied, Workers
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 
@@ -102,7 +102,7 @@ _INTERRUPTED = """
 import os, signal, sys, threading, time
 sys.path.insert(0, {tests!r})
 from test_processes import square, stop_later
-from wavebatch.batch.processes import Workers
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.interrupts import guard
 
 def interrupt(join=None):

@@ -196,7 +196,7 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
     shutil.copyfile(tiny_strip, strip)
     task = StripTask(make_job(strip), BatchOptions(tmp_path), alone=False)
     assert task.start() is None
-    from wavebatch.batch.processes import Workers
+    from wavebatch.batch.workers.processes import Workers
 
     with Workers(1) as workers:
         while not task.is_complete:

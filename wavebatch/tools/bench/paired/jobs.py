@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.batch.processes import Workers
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.unit import prepare_strip
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.tools.api.run import plan_run
