@@ -82,7 +82,7 @@ def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse")
 
 def draw_waveform(view: WaveformView, note: str = "") -> str:
     """A small picture of a waveform: samples, fit, echoes (up) and returns of the input (below)."""
-    near = _signal_span(view)
+    near = view.span
     inside = (view.time >= near[0]) & (view.time <= near[1])
     shown = view.samples[inside]
     curve = np.full(len(view.fine), np.nan) if view.fit is None else view.fit
@@ -108,19 +108,6 @@ def draw_waveform(view: WaveformView, note: str = "") -> str:
     words = [f"{len(peaks)} {'echo' if len(peaks) == 1 else 'echoes'}", *([note] if note else [])]
     names = sorted({flag.name for flag in EchoFlag for value in view.echoes.flags if int(value) & flag})
     return figure(chart.render(), ", ".join([*words, *names]))
-
-
-def _signal_span(view: WaveformView) -> tuple[float, float]:
-    """The part that holds echoes, returns and samples above the noise, with some room [ns]."""
-    high = view.time[np.nan_to_num(view.samples, nan=-np.inf) > view.baseline + 5 * view.std]
-    places = np.concatenate([view.echoes.time, view.returns, high])
-    end = float(view.time[-1]) if len(view.time) > 1 else 1.0
-    places = places[np.isfinite(places) & (places >= 0) & (places <= end)]
-    if not len(places):
-        return 0.0, end
-    room = 12 * view.spacing
-    low, top = max(0.0, float(places.min()) - room), min(end, float(places.max()) + room)
-    return (low, top) if top > low else (0.0, end)
 
 
 def _describe_echo(view: WaveformView, row: int) -> str:
