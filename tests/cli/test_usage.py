@@ -34,6 +34,13 @@ def invoke(*arguments):
         (["slice", "a.las"], "give -o for the segments, --png or --overview for a picture, or --cube; see `wavebatch "
          "slice --help`"),
         (["run", "a.las", "-o", "d", "--overwrite", "--resume"], "--overwrite and --resume exclude each other"),
+        (["plot", "waveform", "a.las", "-o", "w.png", "--chain", "c", "--profile", "fast"],
+         "--chain and --profile exclude each other"),
+        (["calibrate", "a.las", "--targets", "t", "-o", "c", "--chain", "c", "--profile", "auto"],
+         "--chain and --profile exclude each other"),
+        (["voxelize", "a.las", "--size", "1", "-o", "v.npz", "--trajectory", "t", "--flight-height", "9"],
+         "--trajectory and --flight-height"),
+        (["run", "a.las", "-o", "d", "--attenuation", "0", "--visibility", "9"], "--attenuation and --visibility excl"),
     ],
 )
 def test_wrong_usage_is_one_line(arguments, line):

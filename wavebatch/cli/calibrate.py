@@ -13,7 +13,6 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
@@ -113,8 +112,6 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     from wavebatch.surveying.targets import CalibrationOptions
     from wavebatch.tools.api.run import find_request
 
-    if options["chain_file"] is not None and options["profile"] is not None:
-        raise ConfigError("--chain and --profile exclude each other; give one of them")
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     request = replace(request, force=options["force"])
     names = ("attenuation", "divergence", "reflectance_error", "direction")

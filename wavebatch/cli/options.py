@@ -20,6 +20,7 @@ import click
 from wavebatch.cli.messages import one_line, report_errors, talk
 from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles
 from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
+from wavebatch.cli.program.settings import EXCLUSIVE
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
@@ -163,7 +164,8 @@ sensor_options = together(
     click.option("--lever-arm", metavar="X,Y,Z", help="Offset from trajectory to scanner: forward, right, down [m]."),
     click.option("--crs", metavar="CRS", help="CRS of the strip, e.g. EPSG:32632; for a trajectory in degrees."),
     click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-                 help="Flight height above ground [m], used if neither trajectory nor vectors give the position."),
+                 help="Flight height above ground [m], used if the packet vectors do not give the position; not with "
+                 "--trajectory."),
 )  # fmt: skip
 
 _COMMON = {
@@ -202,6 +204,7 @@ def _protected(command: Callable) -> Callable:
         inputs: list[Any] = []
         outputs: dict[str, Any] = {}
         context = click.get_current_context()
+        _refuse_rivals(context)
         for parameter in context.command.params:
             value = context.params.get(parameter.name)
             if isinstance(parameter.type, OutputPath):
@@ -217,6 +220,19 @@ def _protected(command: Callable) -> Callable:
             return command(*args, **options)
 
     return call
+
+
+def _refuse_rivals(context: click.Context) -> None:
+    """Raises ConfigError for two options of which only one is possible."""
+    given = {
+        option.name: max(option.opts, key=len)
+        for option in context.command.params
+        if context.params.get(option.name) is not None and context.params[option.name] is not False
+    }
+    for rivals in EXCLUSIVE:
+        names = [given[name] for name in rivals if name in given]
+        if len(names) > 1:
+            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
 
 
 _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
@@ -326,12 +342,10 @@ def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
 
 
 def read_air(options: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError where they do not fit."""
+    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError for options without use."""
     from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 
     given, visibility = options["attenuation"], options["visibility"]
-    if given is not None and visibility is not None:
-        raise ConfigError("--attenuation and --visibility exclude each other; give one of them")
     if options["wavelength"] is not None and visibility is None:
         raise ConfigError("--wavelength is of no use without --visibility; give that too")
     if options["attenuation_error"] is not None and given is None and visibility is None:

@@ -48,7 +48,6 @@ from wavebatch.cli.options import (
 )
 from wavebatch.cli.program.completion import complete_flags, complete_written
 from wavebatch.cli.program.log_file import typed_command
-from wavebatch.cli.program.settings import EXCLUSIVE
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
@@ -189,11 +188,6 @@ def _start_processes(options: dict[str, Any]) -> None:
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    given = {name for name, value in options.items() if value is not None and value is not False}
-    for rivals in EXCLUSIVE:
-        names = [f"--{name.removesuffix('_file')}" for name in rivals if name in given]
-        if len(names) > 1:
-            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     report = options["report"]
     if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
         raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
