@@ -204,7 +204,7 @@ def _protected(command: Callable) -> Callable:
         inputs: list[Any] = []
         outputs: dict[str, Any] = {}
         context = click.get_current_context()
-        _refuse_rivals(context)
+        _check_together(context)
         for parameter in context.command.params:
             value = context.params.get(parameter.name)
             if isinstance(parameter.type, OutputPath):
@@ -222,8 +222,8 @@ def _protected(command: Callable) -> Callable:
     return call
 
 
-def _refuse_rivals(context: click.Context) -> None:
-    """Raises ConfigError for two options of which only one is possible."""
+def _check_together(context: click.Context) -> None:
+    """Raises ConfigError for two options of which only one is possible, and for one that another one needs."""
     given = {
         option.name: max(option.opts, key=len)
         for option in context.command.params
@@ -233,6 +233,8 @@ def _refuse_rivals(context: click.Context) -> None:
         names = [given[name] for name in rivals if name in given]
         if len(names) > 1:
             raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
+    if "force" in given and "system_file" not in given:
+        raise ConfigError("--force is of no use without --system; leave it out")
 
 
 _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")

@@ -96,6 +96,9 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
+    for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
+        if options[name]:
+            raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
     flags = read_flags(options["flags_with"])
     wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
