@@ -109,22 +109,8 @@ def bench(
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
-    if options["real"]:
-        if not strips or len(strips) < len(files):
-            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
-        _bench_real(strips, output, html_file, options, say)
-        return
-    if against is not None:
-        if html_file is not None:
-            raise click.UsageError("--against has no page: leave --html out; -o writes its table")
-        _bench_against(against, strips, files, output, options, say)
-        return
-    if options["jobs_model"]:
-        if html_file is not None or len(files) > 1 or len(strips) < len(files):
-            raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
-        if len(options["scenes"]) > 1:
-            raise click.UsageError(f"--jobs-model times one scene, not {len(options['scenes'])}; give --scene once")
-        _bench_jobs(strips, output, options, say)
+    if options["real"] or options["jobs_model"] or against is not None:
+        _bench_mode(files, strips, output, against, html_file, options, say)
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
@@ -148,6 +134,27 @@ def bench(
         write_bench_page(html_file, document, text)
         talk(f"{html_file}: written")
     print_result(options["as_json"], document, [text])
+
+
+def _bench_mode(
+    files: Sequence[Path], strips: Sequence[Path], output: Path | None, against: Path | None, html_file: Path | None,
+    options: Mapping[str, Any], say: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Measures what --real, --against or --jobs-model asks for."""
+    if options["real"]:
+        if not strips or len(strips) < len(files):
+            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
+        _bench_real(strips, output, html_file, options, say)
+    elif against is not None:
+        if html_file is not None:
+            raise click.UsageError("--against has no page: leave --html out; -o writes its table")
+        _bench_against(against, strips, files, output, options, say)
+    else:
+        if html_file is not None or len(files) > 1 or len(strips) < len(files):
+            raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
+        if len(options["scenes"]) > 1:
+            raise click.UsageError(f"--jobs-model times one scene, not {len(options['scenes'])}; give --scene once")
+        _bench_jobs(strips, output, options, say)
 
 
 def _list_given(context: click.Context) -> dict[str, str]:
