@@ -187,6 +187,17 @@ def test_the_first_line_of_a_log_is_the_command_as_it_was_typed(folder, monkeypa
     assert first.endswith(f": wavebatch {words} --log-file 'a b.log'")
 
 
+def test_outputs_replace_neither_the_log_nor_the_settings(folder, tmp_path):
+    settings = folder / "wavebatch.toml"
+    settings.write_text('[run]\nprofile = "fast"\n')
+    result = invoke("run", folder, "-o", tmp_path / "out", "--report", settings)
+    assert result.exit_code == 2 and "would replace this input" in result.stderr and "fast" in settings.read_text()
+    log = tmp_path / "night.log"
+    result = invoke("run", folder, "-o", tmp_path / "out", "--report", log, "--log-file", log)
+    assert result.exit_code == 2 and "two outputs have this name" in result.stderr
+    assert not (tmp_path / "out").exists() and "two outputs" in log.read_text()
+
+
 def test_a_log_never_grows_into_another_file(folder):
     before = (folder / "tiny.las").read_bytes()
     result = invoke("info", folder / "tiny.las", "--log-file", folder / "tiny.las")

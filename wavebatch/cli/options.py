@@ -19,8 +19,8 @@ import click
 
 from wavebatch.cli.messages import one_line, report_errors, talk
 from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles
-from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
-from wavebatch.cli.program.settings import EXCLUSIVE
+from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
+from wavebatch.cli.program.settings import EXCLUSIVE, READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
@@ -201,10 +201,12 @@ def _protected(command: Callable) -> Callable:
 
     @functools.wraps(command)
     def call(*args: Any, **options: Any) -> Any:
-        inputs: list[Any] = []
-        outputs: dict[str, Any] = {}
         context = click.get_current_context()
         _check_together(context)
+        inputs: list[Any] = list(context.meta.get(READ, ()))
+        outputs: dict[str, Any] = {}
+        if LOG in context.meta:
+            outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
         for parameter in context.command.params:
             value = context.params.get(parameter.name)
             if isinstance(parameter.type, OutputPath):

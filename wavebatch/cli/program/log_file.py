@@ -19,7 +19,8 @@ import click
 
 from wavebatch.core.errors import ConfigError
 
-_LEVEL = "wavebatch.log_level"
+_LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
+"""Keys of a context's `meta`: the level, and the file of the log."""
 
 LEVELS = ("error", "warning", "info")
 
@@ -105,4 +106,5 @@ def begin_log(context: click.Context, parameter: click.Parameter, path: Path | N
         open_log(path, context.meta.get(_LEVEL, "info"), typed_command(context))
     except ConfigError as error:
         raise click.UsageError(str(error), ctx=context) from error
+    context.meta[LOG] = path
     context.call_on_close(close_log)

@@ -20,6 +20,9 @@ from wavebatch.core.errors import ConfigError
 FILE = "wavebatch.toml"
 PREFIX = "WAVEBATCH_"
 
+READ = "wavebatch.settings_read"
+"""Key of a context's `meta`: names of the files from which settings are in force."""
+
 NEVER = ("overwrite", "force", "help", "debug")
 """Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
 
@@ -58,6 +61,7 @@ class Settings:
         from wavebatch.cli.messages import talk
 
         context.meta["wavebatch.settings"] = tuple(self.lines())
+        context.meta[READ] = [source for source in self.sources.values() if not source.startswith(PREFIX)]
         shown = [line for name, line in zip(self.values, self.lines(), strict=True)
                  if not context.params.get("quiet") or not self.sources[name].startswith(PREFIX)]  # fmt: skip
         if shown:
