@@ -204,7 +204,7 @@ def _learn(
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width, most)
+    sums = fit_gaussians(stack, width, most, goal)
     skewed = fit_skewed(stack, width)
     figures["misfit_goal"] = goal
     figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa
