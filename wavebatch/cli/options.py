@@ -297,6 +297,11 @@ def parse_floats(text: str, form: str) -> tuple[float, ...]:
     return numbers
 
 
+def floats_reader(form: str) -> Callable[[click.Context, click.Parameter, str | None], tuple[float, ...] | None]:
+    """The callback of an option that takes numbers of this form, as `parse_floats`."""
+    return lambda context, parameter, text: None if text is None else parse_floats(text, form)
+
+
 def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
     """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
     if len(paths) == 1:

@@ -35,9 +35,9 @@ from wavebatch.cli.options import (
     check_html,
     common_options,
     file_option,
+    floats_reader,
     html_option,
     output_option,
-    parse_floats,
     read_air,
     read_sensor,
     sensor_options,
@@ -77,10 +77,6 @@ def _read_classes(context: click.Context, parameter: click.Parameter, text: str 
         raise click.BadParameter(f"{text!r} is no list of numbers such as 2,6") from None
 
 
-def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else parse_floats(text, "WEST,SOUTH,EAST,NORTH")
-
-
 @click.command()
 @strips_argument
 @output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
@@ -103,7 +99,7 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
               help="Leave out points with one of these flags, e.g. RINGING_SUSPECT,WEAK; return numbers are counted "
               "without them.")
 @click.option("--classes", callback=_read_classes, metavar="LIST", help="Write only points of these classes, e.g. 2,6.")
-@click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
+@click.option("--bbox", callback=floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
               help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
 @file_option("--polygon", metavar="FILE.geojson",
              text="Write only points inside these polygons, in WGS 84, in the CRS that the file names, or in the "

@@ -38,10 +38,6 @@ def _read_times(context: click.Context, parameter: click.Parameter, text: str | 
     return "all" if text == "all" else _read_range(context, parameter, text)
 
 
-def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
-
-
 @click.group(cls=NearestGroup)
 def plot() -> None:
     """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
@@ -269,7 +265,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
-@click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
+@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
 @shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
