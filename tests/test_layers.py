@@ -15,8 +15,8 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "workers"}, {"selection"}, {"unit"}, {"explain", "neighbour_pass", "row_transfer"},
-        {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
+        {"counts", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
+        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "batch/workers": [{"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"}],
     "surveying": [

@@ -9,10 +9,11 @@ import pytest
 from batch_tools import make_job, read_cloud, run_one
 from writer_tools import read_provenance
 
+from wavebatch.batch.job import RunOptions, choose_columns
 from wavebatch.batch.preflight import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import RunOptions, choose_columns, prepare_strip
+from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
 
 

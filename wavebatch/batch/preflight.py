@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.selection import RowSelector
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight

@@ -17,7 +17,8 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import explain_absence
-from wavebatch.batch.unit import Prepared, StripJob
+from wavebatch.batch.job import StripJob
+from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.text_file import write_text

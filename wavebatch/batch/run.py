@@ -17,10 +17,10 @@ from typing import Any
 
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
+from wavebatch.batch.job import StripJob
 from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import StripJob
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import WorkerDied, Workers
 from wavebatch.core import interrupts

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
-from wavebatch.batch.unit import RunOptions
+from wavebatch.batch.job import RunOptions
 
 
 def describe_account(account: Mapping[str, Any]) -> dict[str, Any]:
