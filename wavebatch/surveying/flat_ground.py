@@ -24,7 +24,8 @@ from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
 from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample
+from wavebatch.surveying.lone_echoes import MIN_SNR
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, decompose_sample
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
