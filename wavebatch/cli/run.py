@@ -18,7 +18,6 @@ import click
 from wavebatch.cli.messages import (
     EXIT_USAGE,
     Interrupted,
-    Progress,
     count,
     format_json,
     one_line,
@@ -48,6 +47,7 @@ from wavebatch.cli.options import (
 )
 from wavebatch.cli.program.completion import complete_flags, complete_written
 from wavebatch.cli.program.log_file import typed_command
+from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
