@@ -107,3 +107,11 @@ def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
     simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
     add_record(tmp_path / "strip.las", build_wkt(FEET))
     _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast")
+
+
+@pytest.mark.parametrize("unit", ["ft", "deg"])
+def test_no_waveforms_are_modelled_with_distances_in_another_unit(clouds, tmp_path, unit):
+    """Echoes of a cloud in feet were 3.3 times too far apart in time."""
+    said = _print("synthesize", clouds[unit], "-o", tmp_path / "a.las", code=1).stderr
+    assert said.count("\n") == 1 and "project it to metres first" in said and not list(tmp_path.iterdir())
+    _print("synthesize", clouds["m"], "-o", tmp_path / "a.las", "-q")
