@@ -38,9 +38,11 @@ class CloudMap:
     values: np.ndarray
     """f8 (rows, columns), the first row is the southernmost; NaN without a value."""
     extent: tuple[float, float, float, float]
-    """West, east, south, north [m]."""
+    """West, east, south, north."""
     size: float
-    """Side of a cell [m]."""
+    """Side of a cell."""
+    length: str
+    """Unit of both."""
     shown: tuple[float, float]
     """Values at the ends of the colour scale."""
     note: str
@@ -154,18 +156,19 @@ def draw_counts(counts: Mapping[str, int] | Sequence[tuple[str, int]], *, title:
 
 
 def draw_map(found: CloudMap) -> str:
-    """A map of a column: cells coloured from the 2nd to the 98th percentile, north up, metres equal in both axes."""
+    """A map of a column: cells coloured from the 2nd to the 98th percentile, north up, equal scales."""
     rows, columns = found.values.shape
     west, east, south, north = found.extent
     wide = 420
     high = int(np.clip((wide - 80) * (north - south) / max(east - west, 1e-9), 120, 900)) + 78
     across = min(wide - 72, (high - 70) * (east - west) / max(north - south, 1e-9))
-    chart = Chart(Axis(0, east - west), Axis(0, north - south), title=found.title, labels=("m east", "m north"),
+    labels = f"{found.length} east", f"{found.length} north"
+    chart = Chart(Axis(0, east - west), Axis(0, north - south), title=found.title, labels=labels,
                   size=(int(across) + 72, high))  # fmt: skip
     chart.image(image_address(color_cells(found.values[::-1], *found.shown)))
     low, top = (tick_label(float(f"{value:.4g}")) for value in found.shown)
     words = (
-        f"dark {low} to bright {top} {found.unit}; {columns} x {rows} cells of {found.size:g} m; origin "
+        f"dark {low} to bright {top} {found.unit}; {columns} x {rows} cells of {found.size:g} {found.length}; origin "
         f"{west:.2f} E, {south:.2f} N{found.note}"
     )
     return figure(chart.render(), words)
