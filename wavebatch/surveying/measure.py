@@ -15,7 +15,7 @@ from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_mat
 from wavebatch.kernels.fit.next_echo import propose_echo
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.noise import estimate_noise, keep_longest, residual_noise
 from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.clean import clean_block
@@ -319,8 +319,8 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     used = np.isfinite(residual)
     used &= ~_cover(block, clear)
     ref = system.sigma_ref / block.spacing
-    seen, calm = _pulse_noise(residual, used, ref)
-    found = residual_noise(residual[calm], used[calm])
+    seen, calm, lost = _pulse_noise(residual, used, ref)
+    found = residual_noise(residual[calm], used[calm], lost)
     if found is None or not seen:
         return system
     std, correlation = found[0], tuple(found[1].tolist())
@@ -344,11 +344,16 @@ def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return np.cumsum(steps[:, :-1], axis=1) > 0
 
 
-def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[float, np.ndarray]:
+def _pulse_noise(
+    residual: np.ndarray, used: np.ndarray, width: float
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Noise of a pulse's amplitude, as that of a sample of white noise, and the calm half of the waveforms (k,).
 
     The median over the waveforms of the power that a matched filter finds in them: echoes too weak to be fitted raise
     it in some of them only. 0 where too few have enough samples.
+
+    Third: the covariance at lags 0, 1, ... that the noise of the calm half lacks. They have less power in the filter
+    than noise has, by chance too, and what lacks has the shape of the filter's own correlation.
     """
     taps = gaussian_taps(width)
     weight = used.T.astype(np.float32)
@@ -358,12 +363,15 @@ def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[
     number = whole.sum(axis=0)
     rows = np.flatnonzero(number >= LEAST_WINDOW)
     if len(rows) < FEW:
-        return 0.0, rows
+        return 0.0, rows, np.zeros(0)
     power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
     # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
     freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 4.0)
     typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
-    return float(np.sqrt(typical)), rows[power <= np.quantile(power, 0.6)]
+    calm = power <= np.quantile(power, 0.6)
+    shape = filter_autocorrelation(taps)
+    lack = max(typical - float(power[calm].mean()), 0.0) / (2 * np.sum(shape * shape) - 1)
+    return float(np.sqrt(typical)), rows[calm], lack * shape
 
 
 def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:

@@ -397,7 +397,9 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
     return number != np.argmax(sizes, axis=0) + 1
 
 
-def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> tuple[float, np.ndarray] | None:
+def residual_noise(
+    residual: np.ndarray, used: np.ndarray, lost: np.ndarray, lags: int = LAGS
+) -> tuple[float, np.ndarray] | None:
     """Standard deviation and correlation of what fits leave outside of their echoes.
 
     Parameters
@@ -406,6 +408,8 @@ def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> 
         Waveforms less baseline and echoes [count].
     used : bool (n, s)
         Samples that count.
+    lost : float (k,)
+        Covariance at lags 0, 1, ... that the choice of these waveforms has taken away [count^2]; 0 beyond.
     lags : int
         Largest lag [samples].
 
@@ -432,7 +436,10 @@ def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> 
         if pairs < LEAST_PAIRS:
             break
         found.append(np.einsum("ns,ns->", deviation[:, lag:], deviation[:, :-lag], dtype=np.float64) / pairs)
-    return float(np.sqrt(variance)), np.array(found) / max(variance, 1e-12)
+    covariance = np.array([variance, *found])
+    common = min(len(covariance), len(lost))
+    covariance[:common] += lost[:common]
+    return float(np.sqrt(covariance[0])), covariance[1:] / max(covariance[0], 1e-12)
 
 
 LEAST_FACTOR = 0.05
