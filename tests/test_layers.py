@@ -20,9 +20,9 @@ INSIDE = {
     ],
     "batch/workers": [{"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"}],
     "surveying": [
-        {"measure"}, {"learn_pulse", "flat_ground"}, {"survey", "sensor"},
+        {"lone_echoes"}, {"measure"}, {"learn_pulse", "flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"targets"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"},
     ],
 }
 """The same within packages whose modules do one thing after another."""
