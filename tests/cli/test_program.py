@@ -146,6 +146,9 @@ def test_settings_change_the_result_as_options_do(folder):
     [
         ("[run]\njbos = 3\n", "has no option 'jbos'; did you mean 'jobs'?"),
         ("[run]\noverwrite = true\n", "overwrite can be given on the command line only"),
+        ('[run]\nreport = "../notes.txt"\n', "report can be given on the command line or in a variable only"),
+        ('[run]\nscheduler = "tcp://there:8786"\n', "scheduler can be given on the command line or in a variable only"),
+        ("[run]\nresume = true\n", "resume can be given on the command line or in a variable only"),
         ("[run\n", "wavebatch.toml"), ("run = 3\n", "must be a table"),
         ('[run]\njobs = "many"\n', "invalid value for '--jobs'"),
     ],

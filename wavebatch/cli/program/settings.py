@@ -26,6 +26,10 @@ READ = "wavebatch.settings_read"
 NEVER = ("overwrite", "force", "help", "debug")
 """Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
 
+IN_NO_FILE = {"run": ("report", "resume", "scheduler")}
+"""Options by command that replace files without --overwrite, or trust other machines: wavebatch.toml may have come with
+the data."""
+
 EXCLUSIVE = (
     ("chain_file", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
     ("scheduler", "memory"), ("attenuation", "visibility"), ("trajectory", "flight_height"),
@@ -152,6 +156,9 @@ def _read_file(path: Path, command: click.Command, options: Mapping[str, click.O
             raise click.UsageError(f"{path}: [{_title(command)}] has no option {key!r}; {nearest(key, list(known))}")
         if known[key] in NEVER:
             raise click.UsageError(f"{path}: {key} can be given on the command line only; remove it from the file")
+        if known[key] in IN_NO_FILE.get(_title(command), ()):
+            where = "on the command line or in a variable only, since the file may have come with the data"
+            raise click.UsageError(f"{path}: {key} can be given {where}; remove it")
         found[known[key]] = _convert(value, options[known[key]], path)
     return found
 
