@@ -10,6 +10,7 @@ import os
 import re
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,7 @@ def run(**options: Any) -> None:
             _check_report(options["html_file"], jobs, batch_options, "--html")
             check_html(options["html_file"])
         if options["dry_run"]:
-            sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
+            sys.exit(_dry_run(jobs, batch_options, options))
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
@@ -258,10 +259,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
-    errors = [outcome.error for outcome in result.outcomes]
-    if errors and all(isinstance(error, ConfigError) for error in errors):
-        return EXIT_USAGE
-    return exit_code(result.failed, len(jobs)) or (0 if is_reported else EXIT_UNREPORTED)
+    return find_exit_code([outcome.error for outcome in result.outcomes]) or (0 if is_reported else EXIT_UNREPORTED)
 
 
 def _report(document: dict[str, Any], target: str | None) -> bool:
@@ -298,25 +296,31 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     return True
 
 
-def exit_code(failed: int, strips: int) -> int:
-    """0 if all strips are written, EXIT_NOTHING if none is, else EXIT_SOME_FAILED."""
-    if not failed:
-        return 0
-    return EXIT_NOTHING if failed == strips else EXIT_SOME_FAILED
+def find_exit_code(errors: Sequence[BaseException | None]) -> int:
+    """The exit code for the errors of the strips, None for those that are written; all wrong options are wrong usage.
+    """
+    failed = [error for error in errors if error is not None]
+    if not failed or len(failed) < len(errors):
+        return EXIT_SOME_FAILED if failed else 0
+    return EXIT_USAGE if all(isinstance(error, ConfigError) for error in failed) else EXIT_NOTHING
 
 
-def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
+def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.preflight import plan_strip
     from wavebatch.stages.chain_file import effective
 
-    failed, plans = 0, []
+    errors: list[BaseException | None] = []
+    plans, as_json = [], options["as_json"]
     for job in jobs:
         try:
             plan = plan_strip(job, batch_options)
         except Exception as error:
-            failed += 1
+            errors.append(error)
+            if options["debug"]:
+                traceback.print_exc()
             talk(f"error: {one_line(error)}")
             continue
+        errors.append(None)
         plans.append(plan)
         line = (
             f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
@@ -330,8 +334,8 @@ def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
     by = jobs[0].request.describe(jobs[0].chain)
     if as_json:
         print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
-        return exit_code(failed, len(jobs))
+        return find_exit_code(errors)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
     click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
-    return exit_code(failed, len(jobs))
+    return find_exit_code(errors)
