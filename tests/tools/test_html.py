@@ -155,6 +155,12 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_clouds(tiny_strip, tmp_
     assert "error: --html: ZeroDivisionError" in result.stderr and (tmp_path / "out" / "tiny.laz").exists()
 
 
+def test_a_page_that_cannot_be_written_does_not_hide_the_survey(tiny_strip, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.tools.html.survey_page.write_page", lambda *_: 1 / 0)
+    result = CliRunner().invoke(main, ["survey", str(tiny_strip), "--html", str(tmp_path / "s.html")])
+    assert result.exit_code == 1 and "ZeroDivisionError" in result.stderr and "decisions" in result.stdout
+
+
 def test_without_the_option_nothing_of_it_is_imported(tiny_strip, tmp_path):
     code = (
         "import sys; from wavebatch.cli import main\n"
