@@ -191,6 +191,15 @@ def _interrupt_at(number, function, *arguments):
     return count >= number
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit of processes")
+def test_a_process_that_the_system_refuses_is_one_line(tiny_strip, tmp_path):
+    """It said to check disk and permissions. Root has no limit of processes, so that of open files must do."""
+    words = f"ulimit -n 24; exec '{sys.executable}' -m wavebatch run '{tiny_strip}' -o '{tmp_path}/out' --jobs 40 -q"
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 4 and "of --jobs cannot be started (Too many open files); use fewer" in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+
+
 def die_elsewhere(parent, number):
     if os.getpid() != parent and number == 3:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -26,6 +26,7 @@ from typing import Any
 
 from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupted
 from wavebatch.batch.workers.serve import END, PATIENCE, serve_calls
+from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
 from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, use_scratch
@@ -158,10 +159,17 @@ def _kill_all() -> None:
 
 
 def start_early(jobs: int) -> None:
-    """Start processes that the next Workers will take: they import their modules while this process imports its own."""
+    """Start processes that the next Workers will take: they import their modules while this process imports its own.
+
+    Raises InputError where the system has no more processes.
+    """
     with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
         while len(_early) < jobs:
-            _early.append(_Process())
+            try:
+                _early.append(_Process())
+            except OSError as error:
+                why = error.strerror or error
+                raise InputError(f"process {len(_early) + 1} of --jobs cannot be started ({why}); use fewer") from error
 
 
 @atexit.register  # called before that of multiprocessing, which would wait for stopped processes
