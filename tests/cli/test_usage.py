@@ -33,6 +33,7 @@ def invoke(*arguments):
         (["slice", "a.las", "--lines", "3:1"], "invalid value for '--lines': '3:1' is empty; END is the number"),
         (["slice", "a.las"], "give -o for the segments, --png or --overview for a picture, or --cube; see `wavebatch "
          "slice --help`"),
+        (["slice", "a.las", "-o", "l.csv", "--geojson-crs", "keep"], "--geojson-crs keep is of no use without -o FILE"),
         (["run", "a.las", "-o", "d", "--overwrite", "--resume"], "--overwrite and --resume exclude each other"),
         (["plot", "waveform", "a.las", "-o", "w.png", "--chain", "c", "--profile", "fast"],
          "--chain and --profile exclude each other"),
