@@ -15,10 +15,10 @@ from strips import descriptor, make_raw, vlr
 from writer_tools import plan_output
 
 from wavebatch.batch import neighbour_pass
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.core.echoes import RAY
 from wavebatch.core.errors import ConfigError

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from wavebatch.cli.slice import slice_
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
 from wavebatch.tools.slices import lines
@@ -298,3 +298,10 @@ def test_the_level_is_that_without_signal_where_signal_fills_most_of_the_wavefor
     block = WaveformBlock.from_samples(samples, bits=8, spacing=1.0)
     values = lines._shape(block).values.reshape(3, 100)
     assert values[:, 0].tolist() == [0.0] * 3 and values[:, -1].tolist() == [48.0] * 3
+
+
+def test_the_scan_of_each_strip_is_closed(strip, tmp_path, monkeypatch):
+    """It holds temporary files, which stayed until the end of the command."""
+    closed, close = [], StripScan.close
+    monkeypatch.setattr(StripScan, "close", lambda scan: closed.append(scan) or close(scan))
+    assert run(strip, "-o", tmp_path / "s.csv", "--lines", "1", "-q").exit_code == 0 and len(closed) == 1

@@ -109,6 +109,8 @@ def slice_(
     extras = Extras(png, overview, cube)
     if output is None and not extras.targets:
         raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
+    if options["geojson_crs"] == "keep" and (output is None or output.suffix.lower() != ".geojson"):
+        raise click.UsageError("--geojson-crs keep is of no use without -o FILE.geojson: other files keep the CRS")
     for target in extras.targets:
         refuse_existing(target, options["overwrite"])
     for picture in filter(None, (png, overview)):
@@ -129,12 +131,11 @@ def _slice(
     strip: Path, output: Path | None, lines: tuple[int, int | None], extras: Extras, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Work on one strip; returns its counts and says them."""
-    with StripReader(strip, direction=options["direction"]) as reader:
+    with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
             known = find_crs(reader.facts.crs, reader.facts.header.vlrs)
             crs = plan_crs(strip, known, options["geojson_crs"])
-        scan = reader.scan()
         sigma = options["sigma"]
         if sigma is None:
             sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref

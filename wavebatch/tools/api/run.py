@@ -11,11 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns, name_columns
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.selection import build_selection
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, name_columns
 from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.inputs import find_strips
