@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, printable
+from wavebatch.cli.messages import count, print_json, print_text, printable
 from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -50,7 +50,7 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
             facts["pulse"] = _describe_pulse(path, **reading)
         if not as_json:
             lines = ["", *_list_lines(facts)][path == paths[0] :]
-            click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
+            print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
@@ -102,11 +102,11 @@ def check(
         if as_json:
             continue
         for line in found.problems:
-            click.echo(printable(f"{found.file}: {line}"))
+            print_text(printable(f"{found.file}: {line}"))
         for line in found.notes:
-            click.echo(printable(f"{found.file}: note: {line}"))
+            print_text(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
-            click.echo(printable(f"{found.file}: ok ({found.summary})"))
+            print_text(printable(f"{found.file}: ok ({found.summary})"))
     if as_json:
         print_json(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)

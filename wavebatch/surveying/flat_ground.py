@@ -102,6 +102,8 @@ def choose_radius(reader: StripReader, scan: StripScan) -> float:
     float
         Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS; at least 1.5, at most 12.
     """
+    if not reader.unit_count():
+        return RADII[0]
     unit = reader.read_unit(reader.unit_count() // 2, scan)
     return _choose_radius(locate(unit.points, reader.facts.header)) if len(unit.points) else RADII[0]
 

@@ -152,7 +152,8 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
         if keys.untimed:
-            tally.notes.append(f"{keys.untimed} points have no GPS time (0 or NaN): pulses by their return numbers there")
+            notes = f"{keys.untimed} points have no GPS time (0 or NaN): pulses by their return numbers there"
+            tally.notes.append(notes)
         tally.left_out = reader.left_out
     return tally
 
