@@ -118,7 +118,8 @@ def test_points_are_shown_where_the_packets_are_missing(place):
     content[6:8] = struct.pack("<H", 0b101)  # global encoding: packets in a .wdp
     (place / "lost.las").write_bytes(content)
     shown = CliRunner().invoke(main, ["info", "lost.las"])
-    assert shown.exit_code == 0 and "points         " in shown.stdout and "classes " in shown.stdout
+    assert shown.exit_code == 1 and "points         " in shown.stdout and "classes " in shown.stdout
+    assert shown.stderr == "error: lost.las: its packets are missing: put lost.wdp next to the strip\n"
     assert shown.stdout.splitlines()[-1].split(maxsplit=1) == [
         "problem", "its packets are missing: put lost.wdp next to the strip"
     ]  # fmt: skip

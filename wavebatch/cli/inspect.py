@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, print_text, printable
+from wavebatch.cli.messages import count, print_json, print_text, printable, talk
 from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -40,9 +40,9 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
     these per line. Reads all points and a few thousand waveforms. Of a cloud that wavebatch wrote it shows command,
     chain, version and counts. --json prints one object for one file, else a list of them.
 
-    Exit code: 0 done, 1 a file cannot be read (the others are shown), 2 wrong usage.
+    Exit code: 0 done, 1 a file or its packets cannot be read (the others, and its points, are shown), 2 wrong usage.
     """
-    paths = find_files(strips, recursive=recursive)
+    paths, lost = find_files(strips, recursive=recursive), 0
 
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, **reading)
@@ -51,12 +51,16 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
         if not as_json:
             lines = ["", *_list_lines(facts)][path == paths[0] :]
             print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
+        if "packets" not in facts and facts["problems"]:  # points are shown, packets cannot be
+            nonlocal lost
+            lost += 1
+            talk(f"error: {path}: {facts['problems'][0]}")
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
     if as_json:
         print_json(results[0] if len(paths) == 1 else results)
-    sys.exit(EXIT_UNREADABLE if failed else 0)
+    sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
 
 def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
