@@ -148,8 +148,8 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
     if report.count("echoes") and alone is not None and alone < FEW and "known_pulse_echoes" not in figures:
         yield (
             f"the survey found too few isolated echoes, {int(alone)} where {FEW} are needed: the system pulse is a "
-            f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of echoes "
-            "depend on it; give --system, a survey of a longer strip of this sensor"
+            f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of "
+            "echoes depend on it; give --system, a survey of a longer strip of this sensor"
         )
 
 
