@@ -183,7 +183,7 @@ class RasterWriter(Closing):
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
         if lost:
-            raise ConfigError(f"{self._target}: a GeoTIFF cannot hold the CRS of the clouds; give one with --crs EPSG:n")
+            raise ConfigError(f"{self._target}: a GeoTIFF cannot hold the CRS of the clouds; use --crs EPSG:n")
         self._draft.publish()
 
     def close(self) -> None:
