@@ -53,9 +53,9 @@ JERK, JERK_LEFT = 1.0, 0.025
 parabola leaves of it: a root mean square of JERK half^3 times this."""
 
 SCANNER = 1.3e-4
-"""Distance, as a share of the range, from where rays meet to the scanner's origin: a mirror whose facet moves, or a scan
-angle with a wrong scale, bends all rays alike, and no residual shows it. It is 7.2 cm of 559 m on the RIEGL strip whose
-PulseWaves file has the origin of each pulse."""
+"""Distance, as a share of the range, from where rays meet to the scanner's origin: a mirror whose facet moves, or a
+scan angle with a wrong scale, bends all rays alike, and no residual shows it. It is 7.2 cm of 559 m on the RIEGL strip
+whose PulseWaves file has the origin of each pulse."""
 
 LEAST_DOUBT = 2.0
 """Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
