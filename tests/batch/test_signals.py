@@ -181,6 +181,29 @@ def test_a_signal_while_a_worker_starts_leaves_no_process_that_complains(strip, 
     assert not out.exists() or list(out.iterdir()) == []  # processes start before anything else
 
 
+_CRASHES_AT_THE_END = """
+import atexit, os, signal, sys
+from wavebatch.core.interrupts import guard
+
+class Crash:
+    def __del__(self):
+        os.abort()  # as a compiled library does whose import was interrupted
+
+def command():
+    global crash
+    crash = Crash()
+    atexit.register(print, "cleaned up")
+    os.kill(os.getpid(), signal.SIGINT)
+
+guard(command)
+"""
+
+
+def test_what_crashes_when_python_ends_does_not_change_the_exit_code():
+    done = subprocess.run([sys.executable, "-c", _CRASHES_AT_THE_END], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned up\n", "interrupted\n")
+
+
 def test_hardly_anything_is_imported_before_signals_are_handled():
     code = "import sys; import wavebatch.core.interrupts; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True)

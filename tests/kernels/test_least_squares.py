@@ -14,6 +14,7 @@ from wavebatch.kernels.fit.least_squares import (
 )
 from wavebatch.kernels.fit.normal_equations import fit_errors, gram_matrix, parameter_errors
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.stages.decompose.solve import relative_energy_errors
 
 NOISE = 1.0
 LENGTH = 32
@@ -310,7 +311,9 @@ def test_the_error_of_an_energy_is_its_scatter_also_where_echoes_overlap(rng, ap
     truth[:, 1, 1] = truth[:, 1, 0] + 2.0 * apart
     windows = record(rng, truth)
     fit = fit_windows(windows, truth.copy(), box(800), GAUSSIAN, **TIGHT)
-    _, energy = fit_errors(fit.parameters, windows.std, fit.rows, fit.gram)
+    errors, shared = fit_errors(fit.parameters, windows.std, fit.rows, fit.gram)
+    rows = (values.transpose(0, 2, 1).reshape(1600, -1) for values in (fit.parameters, errors, shared))
+    energy = relative_energy_errors(*rows).reshape(800, 2)
     area = fit.parameters[:, 0] * fit.parameters[:, 2]
     off = area / (truth[:, 0] * truth[:, 2]) - 1.0
     inside = np.mean(np.abs(off) < energy, axis=0)

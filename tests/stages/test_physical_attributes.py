@@ -32,6 +32,11 @@ NAMES = ("range", "backscatter_coefficient", "cross_section", "level_reflectance
 COLUMNS = [name for stage in NAMES for name in STAGES[f"attribute.{stage}"].makes]
 
 
+def whole_pulse(shape, limits, main):
+    """Amplitude, time and sigma of the whole pulse (m, 3) from those of its main component."""
+    return describe_echoes(shape, limits, main, np.ones_like(main), np.zeros((len(main), 2)))[0]
+
+
 def run(block, echoes, system, *names, **parameters):
     noise = Noise(np.full(len(block), 12, np.float32), np.ones(len(block), np.float32))
     for name in names:
@@ -285,7 +290,7 @@ def test_a_learned_pulse_has_its_own_width():
     shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
     block, echoes, _ = make(np.full(50, 40.0), snr=1000.0)
     wide = np.hypot(1.2, spread_of_angle(np.radians(40.0), 640.0, 1.1e-3))
-    whole, _ = describe_echoes(shape, limits, np.tile([100.0, 20.0, wide], (50, 1)), np.ones((50, 3)))
+    whole = whole_pulse(shape, limits, np.tile([100.0, 20.0, wide], (50, 1)))
     echoes = replace(echoes, sigma=whole[:, 2].astype(np.float32), sigma_err=np.full(50, 0.01, np.float32))
     done = run(block, echoes, system, "incidence_angle").attributes
     assert done["incidence_angle"] == pytest.approx(40.0, abs=0.3)
@@ -415,8 +420,8 @@ def test_slopes_keep_the_energy_of_a_learned_pulse(degrees):
     shape, limits = pulse_shape(system, 1.0), shape_limits(system, 1.0)
     wide = np.hypot(limits.ref, spread_of_angle(np.radians(degrees), 640.0, 1.1e-3))
     assert wide < limits.high
-    whole, _ = describe_echoes(shape, limits, np.array([[100.0 / wide, 20.0, wide]]), np.ones((1, 3)))
-    facing, _ = describe_echoes(shape, limits, np.array([[100.0 / limits.ref, 20.0, limits.ref]]), np.ones((1, 3)))
+    whole = whole_pulse(shape, limits, np.array([[100.0 / wide, 20.0, wide]]))
+    facing = whole_pulse(shape, limits, np.array([[100.0 / limits.ref, 20.0, limits.ref]]))
     amplitude, time, sigma = whole.T
     echoes = EchoTable.build(np.zeros(1), time, amplitude, sigma)
     block = WaveformBlock.from_samples(np.zeros((1, 8), np.uint8))

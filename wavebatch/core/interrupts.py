@@ -9,6 +9,7 @@ Before you change it: send signals at every instant of a run (tests/batch/test_s
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -85,6 +86,7 @@ def uninterrupted() -> Iterator[None]:
 def guard(command: Callable[[], Any]) -> None:
     """Run the program; it ends with exit code 130 if a signal arrived at any time, whatever became of it."""
     error: BaseException | None = None
+    atexit.register(_end_interrupted)  # the first, so that it is called after all others
     try:
         try:
             sys.unraisablehook = _raise_again
@@ -102,6 +104,18 @@ def guard(command: Callable[[], Any]) -> None:
         raise SystemExit(EXIT_INTERRUPTED) from None
     if error is not None:
         raise error
+
+
+def _end_interrupted() -> None:
+    """End an interrupted program before Python takes itself apart.
+
+    Compiled libraries that were interrupted while they were imported crash there, and the exit code would be theirs.
+    """
+    if _State.arrived:
+        for stream in sys.stdout, sys.stderr:
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        os._exit(EXIT_INTERRUPTED)
 
 
 def _handle(number: int, frame: object) -> None:

@@ -178,7 +178,7 @@ FACTOR_WIDTHS = 12
 
 
 def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.ndarray:
-    """Errors of lone echoes over those that a fit in white noise gives to the main component of the pulse.
+    """Errors of echoes in the noise's colour over those that a fit in white noise of `noise_std` gives.
 
     Parameters
     ----------
@@ -192,18 +192,17 @@ def error_factors(system: SystemPulse, spacing: float, width: np.ndarray) -> np.
     Returns
     -------
     float64 array, shape (m, 4)
-        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 for a Gaussian in white
-        noise.
+        Of amplitude, time and sigma as `describe_echoes` gives them, and of the energy; 1 in white noise. They are
+        those of lone echoes.
 
     Notes
     -----
-    Two things make them differ from 1. `noise_std` is what coloured noise does to amplitudes; times and widths suffer
-    less from noise that changes slowly. And peak and delay of a learned pulse change with its width, whose error is
-    correlated with those of the main component's amplitude and time (docs/algorithms.md H11).
+    `noise_std` is what coloured noise does to amplitudes; times and widths suffer less from noise that changes slowly
+    (docs/algorithms.md H11).
     """
-    shape = pulse_shape(system, spacing)
-    if not system.correlation and not shape.components:
+    if not system.correlation:
         return np.ones((len(width), 4))
+    shape = pulse_shape(system, spacing)
     widths, factors = _factor_table(shape, shape_limits(system, spacing), system.correlation)
     return np.stack([np.interp(width, widths, column) for column in factors.T], axis=1)
 
@@ -219,24 +218,28 @@ def _factor_table(
 
 
 def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
-    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those of the main component."""
+    """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those in white noise."""
     joint = _pulse_rows(shape, width)
     main = np.linalg.solve(joint @ joint.T, joint)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
     main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
     if shape.components:
-        table = pulse_measures(shape, limits)
-        peak = np.interp(width, table.width, table.peak)
-        by_width = [np.interp(width, table.width, np.gradient(y, table.width)) for y in (table.peak, table.delay)]
-        whole[0] += by_width[0] / peak * main[2]
-        whole[1] += by_width[1] * main[2]
+        peak, by_peak, by_delay = _change_with_width(pulse_measures(shape, limits), np.float64(width))
+        whole[0] += by_peak / peak * width * main[2]
+        whole[1] += by_delay * main[2]
     variance = np.einsum("is,is->i", whole @ correlation_matrix(correlation, joint.shape[1]), whole)
-    return np.sqrt(np.maximum(variance / np.sum(main * main, axis=1), LEAST_FACTOR))
+    return np.sqrt(np.maximum(variance / np.sum(whole * whole, axis=1), LEAST_FACTOR))
+
+
+def _change_with_width(table: PulseMeasures, width: np.ndarray) -> list[np.ndarray]:
+    """Peak of a pulse of amplitude 1, and the slopes of peak and delay by the width, each of the shape of width."""
+    slopes = (np.gradient(values, table.width) for values in (table.peak, table.delay))
+    return [np.interp(width, table.width, values) for values in (table.peak, *slopes)]
 
 
 def describe_echoes(
-    shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray
+    shape: PulseShape, limits: ShapeLimits, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn fitted parameters of a learned pulse's main component into amplitude, time and sigma of the whole pulse.
 
@@ -251,6 +254,8 @@ def describe_echoes(
         Its widths.
     parameters, errors : float64 array, shape (m, 3)
         Amplitude [count], time [samples] and width [samples], and their standard deviations.
+    shared : float64 array, shape (m, 2)
+        Covariance of amplitude and width, and of time and width: peak and delay of the pulse change with its width.
 
     Returns
     -------
@@ -260,23 +265,29 @@ def describe_echoes(
     if not shape.components:
         return parameters, errors
     near = _near_table(shape, limits)
-    whole = _describe(near, parameters, errors)
+    whole = _describe(near, parameters, errors, shared)
     beyond = parameters[:, 2] > near.width[-1]
     if beyond.any():
-        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond])
+        wide = _describe(_wide_table(shape, limits), parameters[beyond], errors[beyond], shared[beyond])
         for values, others in zip(whole, wide, strict=True):
             values[beyond] = others
     return whole
 
 
-def _describe(table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _describe(
+    table: PulseMeasures, parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """As describe_echoes, with one table."""
     amplitude, time, width = parameters.T
-    peak = np.interp(width, table.width, table.peak)
+    peak, by_peak, by_delay = _change_with_width(table, width)
     sigma = table.half_width / FWHM_PER_SIGMA
     steep = np.interp(width, table.width, np.gradient(sigma, table.width))
     whole = [amplitude * peak, time + np.interp(width, table.width, table.delay), np.interp(width, table.width, sigma)]
-    return np.stack(whole, axis=1), errors * np.stack([peak, np.ones_like(peak), np.abs(steep)], axis=1)
+    by_width = np.stack([amplitude * by_peak, by_delay])
+    variance = (errors[:, :2].T * [peak, np.ones_like(peak)]) ** 2 + (by_width * errors[:, 2]) ** 2
+    variance += 2 * by_width * [peak, np.ones_like(peak)] * np.nan_to_num(shared.T)
+    whole_errors = np.stack([*np.sqrt(np.maximum(variance, 0)), errors[:, 2] * np.abs(steep)], axis=1)
+    return np.stack(whole, axis=1), whole_errors
 
 
 def model_parameters(shape: PulseShape, limits: ShapeLimits, echoes: np.ndarray) -> np.ndarray:

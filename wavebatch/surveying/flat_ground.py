@@ -25,7 +25,8 @@ from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, th
 from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, MIN_SNR, decompose_sample
+from wavebatch.surveying.lone_echoes import MIN_SNR
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, decompose_sample
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""

@@ -11,20 +11,11 @@ from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.learn_pulse import MOST_COMPONENTS, PulseFit, Stack, fit_gaussians, fit_skewed, stack_pulse
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
-from wavebatch.stages.decompose.fit import adaptive, closed_form
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import model_parameters, pulse_measures, pulse_shape, shape_limits
-from wavebatch.surveying.measure import (
-    ALONE,
-    ENOUGH_TO_LEARN,
-    FEW,
-    MIN_SNR,
-    find_edge,
-    find_strongest,
-    keep_lone,
-    subtract_echoes,
-)
+from wavebatch.surveying.lone_echoes import ALONE, MIN_SNR, fit_lone
+from wavebatch.surveying.measure import ENOUGH_TO_LEARN, FEW, find_edge, subtract_echoes
 
 MOST_STACKED = 3000
 """Isolated echoes that a stack takes; more do not make it better."""
@@ -168,16 +159,9 @@ def find_strong(echoes: EchoTable) -> EchoTable:
 
 def find_clear(block: WaveformBlock, system: SystemPulse) -> EchoTable:
     """Echoes of any width that are the strongest by ten to one of their waveform, not near an edge or clipped."""
-    n = len(block)
-    noise = pooled_noise(block, system)
-    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
-    strongest, second = find_strongest(echoes, n)
-    echoes = echoes.take(strongest)
+    echoes = fit_lone(block, pooled_noise(block, system), system, MIN_SNR, fraction=0.5)
     top = system.saturation or float(block.samples.max())
-    good = echoes.amplitude > MIN_SNR * system.noise_std
-    good &= (echoes.amplitude > 0.08 * top) & (echoes.amplitude < top)
-    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    return echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second)))
+    return echoes.take(np.flatnonzero((echoes.amplitude > 0.08 * top) & (echoes.amplitude < top)))
 
 
 def learn_pulse(block: WaveformBlock, system: SystemPulse, main: EchoTable, figures: dict[str, float]) -> SystemPulse:
@@ -204,7 +188,7 @@ def _learn(
     stack = stack_pulse(signal, amplitude, time, *_reach(block, system), QUANTISATION_STD, first)
     strongest = float(np.quantile(main.amplitude, 0.99))
     goal = max(REACHED * system.noise_std / strongest, GOAL * float(np.sqrt(np.mean(stack.error**2))))
-    sums = fit_gaussians(stack, width, most)
+    sums = fit_gaussians(stack, width, most, goal)
     skewed = fit_skewed(stack, width)
     figures["misfit_goal"] = goal
     figures["misfit_skewed"], figures["kappa"] = skewed.rms, skewed.kappa

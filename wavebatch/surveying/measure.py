@@ -15,14 +15,15 @@ from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_mat
 from wavebatch.kernels.fit.next_echo import propose_echo
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.kernels.signal.noise import estimate_noise, keep_longest, residual_noise
 from wavebatch.kernels.signal.signal import transpose_samples
 from wavebatch.stages.clean import clean_block
-from wavebatch.stages.decompose.fit import adaptive, closed_form
-from wavebatch.stages.detect.maximum import matched_filter, maximum
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, noise_factors, pulse_shape, shape_limits
+from wavebatch.surveying.lone_echoes import MIN_SNR, find_strongest, fit_lone
 
 MOST_ROUNDS = 12
 """Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
@@ -42,20 +43,11 @@ RESIDUAL_LOOK = 4096
 FEW = 20
 """Isolated echoes below which the width of the system pulse is a guess."""
 
-ALONE = 0.1
-"""Share of an echo up to which others of its waveform are no disturbance ..."""
-
-LEAST_ALONE, ALONE_BEFORE_RINGING = 0.15, 0.3
-"""... unless less than this share of the echoes are alone; then others may be as high as this."""
-
 ENOUGH_TO_LEARN = 50
 """Isolated echoes from which a pulse can be learned (R2)."""
 
 FIRST_WIDTH = 2.0
 """First guess of the system pulse's width [samples]."""
-
-MIN_SNR = 20.0
-"""Amplitude over noise of a clear echo."""
 
 REPEATED, LEAST_REPEATED = 0.04, 25
 """Share, and least number, of the clear echoes that must have nearly one width for it to be the pulse's."""
@@ -173,43 +165,14 @@ def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
     noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
     if system.baseline_spread > system.noise_std:
         noise = pooled_noise(block, system)
-    echoes = closed_form(block, noise, system, maximum(block, noise, system), steps=4)
-    strongest, second = find_strongest(echoes, n)
-    echoes = echoes.take(strongest)
-    good = echoes.amplitude > MIN_SNR * system.noise_std
-    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    good = keep_lone(good, echoes.amplitude, second)
-    free = (echoes.flags[good] & int(EchoFlag.AT_BOUND)) == 0
-    widths, errors = echoes.sigma[good] / block.spacing, echoes.sigma_err[good] / block.spacing
+    echoes = fit_lone(block, noise, system, MIN_SNR)
+    free = (echoes.flags & int(EchoFlag.AT_BOUND)) == 0
+    widths, errors = echoes.sigma / block.spacing, echoes.sigma_err / block.spacing
     if 2 * free.sum() > len(free):
         widths, errors = widths[free], errors[free]
     if len(widths) < FEW:
         return system.sigma_ref / block.spacing
     return float(np.clip(find_edge(widths, errors), 0.5, 50.0))
-
-
-def keep_lone(good: np.ndarray, amplitude: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """True (m,) for the good ones of the strongest echoes that the second strongest of their waveform leaves alone.
-
-    That is less than a tenth as high; but where hardly any echo is alone, after-pulses of every echo are what is seen,
-    and they may be higher: targets at chance distances would not be everywhere.
-    """
-    alone = good & (second < ALONE * amplitude)
-    if alone.sum() < LEAST_ALONE * good.sum():
-        alone = good & (second < ALONE_BEFORE_RINGING * amplitude)
-    return alone
-
-
-def find_strongest(echoes: EchoTable, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the strongest echo of each waveform that has any, and the amplitude of the second strongest there."""
-    order = np.lexsort((-echoes.amplitude, echoes.waveform))
-    waveform = echoes.waveform[order]
-    first = np.r_[True, waveform[1:] != waveform[:-1]] if len(order) else np.empty(0, bool)
-    second = np.zeros(n)
-    runner = np.flatnonzero(~first)
-    runner = runner[first[runner - 1]]
-    second[waveform[runner]] = echoes.amplitude[order[runner]]
-    return order[first], second[waveform[first]]
 
 
 def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
@@ -356,8 +319,8 @@ def _measure_outside(block: WaveformBlock, system: SystemPulse, echoes: EchoTabl
     used = np.isfinite(residual)
     used &= ~_cover(block, clear)
     ref = system.sigma_ref / block.spacing
-    seen, calm = _pulse_noise(residual, used, ref)
-    found = residual_noise(residual[calm], used[calm])
+    seen, calm, lost = _pulse_noise(residual, used, ref)
+    found = residual_noise(residual[calm], used[calm], lost)
     if found is None or not seen:
         return system
     std, correlation = found[0], tuple(found[1].tolist())
@@ -381,11 +344,16 @@ def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return np.cumsum(steps[:, :-1], axis=1) > 0
 
 
-def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[float, np.ndarray]:
+def _pulse_noise(
+    residual: np.ndarray, used: np.ndarray, width: float
+) -> tuple[float, np.ndarray, np.ndarray]:
     """Noise of a pulse's amplitude, as that of a sample of white noise, and the calm half of the waveforms (k,).
 
     The median over the waveforms of the power that a matched filter finds in them: echoes too weak to be fitted raise
     it in some of them only. 0 where too few have enough samples.
+
+    Third: the covariance at lags 0, 1, ... that the noise of the calm half lacks. They have less power in the filter
+    than noise has, by chance too, and what lacks has the shape of the filter's own correlation.
     """
     taps = gaussian_taps(width)
     weight = used.T.astype(np.float32)
@@ -395,12 +363,15 @@ def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[
     number = whole.sum(axis=0)
     rows = np.flatnonzero(number >= LEAST_WINDOW)
     if len(rows) < FEW:
-        return 0.0, rows
+        return 0.0, rows, np.zeros(0)
     power = np.where(whole, left * left / np.maximum(energy, 1e-6), 0).sum(axis=0)[rows] / number[rows]
     # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
     freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 4.0)
     typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
-    return float(np.sqrt(typical)), rows[power <= np.quantile(power, 0.6)]
+    calm = power <= np.quantile(power, 0.6)
+    shape = filter_autocorrelation(taps)
+    lack = max(typical - float(power[calm].mean()), 0.0) / (2 * np.sum(shape * shape) - 1)
+    return float(np.sqrt(typical)), rows[calm], lack * shape
 
 
 def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:

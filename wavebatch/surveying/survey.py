@@ -17,11 +17,11 @@ from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.learn_pulse import find_clear, find_isolated, find_strong, learn_pulse, refine_pulse
+from wavebatch.surveying.lone_echoes import MIN_SNR
 from wavebatch.surveying.measure import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
-    MIN_SNR,
     RESIDUAL_LOOK,
     SETTLED,
     decompose_sample,

@@ -281,13 +281,13 @@ def _leave_out(solution: Solution, target: np.ndarray, height: np.ndarray, rows:
 
 def _solution(cluster: np.ndarray, windows: Windows, fit: Fit, begin: np.ndarray) -> Solution:
     """What the fits of a batch found, in samples of the waveform."""
-    errors, energy = fit_errors(fit.parameters, windows.std, fit.rows, fit.gram)
+    errors, shared = fit_errors(fit.parameters, windows.std, fit.rows, fit.gram)
     parameters = fit.parameters.copy()
     parameters[:, 1] += begin[:, None]
     used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
     residual = fit.rows[:, -1]
     misfit = np.sqrt(np.einsum("ml,ml->m", residual, residual) / used) / windows.std
-    return Solution(cluster, parameters, errors, energy, misfit, fit.cost, fit.converged, fit.at_bound)
+    return Solution(cluster, parameters, errors, shared, misfit, fit.cost, fit.converged, fit.at_bound)
 
 
 def _limits(settings: Settings, first: np.ndarray, end: np.ndarray) -> Limits:

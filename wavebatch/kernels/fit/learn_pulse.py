@@ -104,10 +104,13 @@ class PulseFit(NamedTuple):
     """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
 
 
-def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> list[PulseFit]:
+def fit_gaussians(
+    stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0
+) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
 
-    One that gains less is kept where the next one after it makes up for both.
+    One that gains less is kept where the next one after it makes up for both. Where one Gaussian reaches the goal, a
+    misfit in amplitudes, no more are fitted.
     """
     weight = _weights(stack)
     parameters = np.array([1.0, 0.0, width])
@@ -118,6 +121,8 @@ def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS) -> li
         residual = stack.value - _sum(parameters, stack.lag)
         fits.append(_as_fit(parameters, float(np.sqrt(np.mean(residual**2)))))
         last = len(fits) - 1
+        if not last and fits[0].rms <= goal:
+            return fits
         if fits[last].rms <= (1 - GAIN) ** (last - worth) * fits[worth].rms:
             worth = last
         if len(fits) == most or last - worth == 2:

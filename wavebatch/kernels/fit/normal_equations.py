@@ -88,7 +88,7 @@ def parameter_errors(parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, 
 def fit_errors(
     parameters: np.ndarray, std: np.ndarray, rows: np.ndarray, gram: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One standard deviation of each parameter, and of each echo's energy, from the normal equations.
+    """One standard deviation of each parameter, and what the width has in common with the others, in each echo.
 
     Parameters
     ----------
@@ -99,24 +99,24 @@ def fit_errors(
     -------
     errors : float64 (m, 3, k)
         In the units of the parameters.
-    energy : float64 (m, k)
-        Of amplitude times width, relative. Both errors are correlated, and not by the same number for lone and for
-        overlapping echoes, so that this cannot be found from `errors` alone (docs/algorithms.md 5).
+    shared : float64 (m, 2, k)
+        Covariance of amplitude and width, and of time and width, in the units of the parameters. It is not the same
+        share of the errors for lone and for overlapping echoes, so that what depends on both, such as the energy,
+        cannot have its error from `errors` alone (docs/algorithms.md 5).
     """
     functions = gram[:, :-1, :-1]
-    variance, joint = invert_parts(add_ridge(functions.copy()))
+    variance, shared = invert_parts(add_ridge(functions.copy()))
     # Also of lone echoes: those at an edge of their window, of which a few samples are seen, had errors of 0.
     inflation = (variance * np.einsum("mpp->mp", functions)).max(axis=1)
     steep = np.flatnonzero(~((inflation < STEEP) & (variance.min(axis=1) > 0)))
     if len(steep):
         exact = rows[steep, :-1].astype(np.float64)
-        variance[steep], joint[steep] = invert_parts(add_ridge(exact @ exact.transpose(0, 2, 1)))
-    units = parameter_units(parameters, std)
-    variance = np.maximum(variance, 0).reshape(parameters.shape)
-    # A unit of both rows is the same relative change: 1 / amplitude.
-    energy = np.sqrt(np.maximum(variance[:, 0] + variance[:, 2] + 2 * joint, 0))
-    energy *= units[:, 2] / parameters[:, 2] * std[:, None]
-    return np.sqrt(variance) * units * std[:, None, None], energy
+        variance[steep], shared[steep] = invert_parts(add_ridge(exact @ exact.transpose(0, 2, 1)))
+    units = parameter_units(parameters, std) * std[:, None, None]
+    errors = np.sqrt(np.maximum(variance, 0).reshape(parameters.shape)) * units
+    shared *= units[:, :2]
+    shared *= units[:, 2:]
+    return errors, shared
 
 
 def solve_symmetric(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -194,16 +194,18 @@ def invert_parts(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     diagonal : float64 (m, 3 k)
-    joint : float64 (m, k)
-        The elements of amplitude and width of the same echo.
+    shared : float64 (m, 2, k)
+        The elements of amplitude and width, and of time and width, of the same echo.
     """
     k = matrix.shape[1] // 3
     if k != 1:
         inverse = np.linalg.inv(matrix)
         first = np.arange(k)
-        return np.diagonal(inverse, axis1=1, axis2=2).copy(), inverse[:, first, 2 * k + first]
-    (xx, _, xz, yy, _, zz), determinant = _cofactors(matrix)
-    return np.stack([xx, yy, zz], axis=1) / determinant[:, None], (xz / determinant)[:, None]
+        shared = np.stack([inverse[:, first, 2 * k + first], inverse[:, k + first, 2 * k + first]], axis=1)
+        return np.diagonal(inverse, axis1=1, axis2=2).copy(), shared
+    (xx, _, xz, yy, yz, zz), determinant = _cofactors(matrix)
+    inverse = np.stack([xx, yy, zz, xz, yz], axis=1) / determinant[:, None]
+    return inverse[:, :3], inverse[:, 3:, None]
 
 
 def _cofactors(matrix: np.ndarray) -> tuple[tuple[np.ndarray, ...], np.ndarray]:

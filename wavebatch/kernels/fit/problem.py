@@ -58,8 +58,8 @@ class Solution(NamedTuple):
     """Amplitude [count], time [samples of the waveform], width [samples], float64 (c, 3, k)."""
     errors: np.ndarray
     """One standard deviation of each parameter, float64 (c, 3, k)."""
-    energy_errors: np.ndarray
-    """One standard deviation of amplitude times width, relative, float64 (c, k)."""
+    shared: np.ndarray
+    """Covariance of amplitude and width, and of time and width, of each echo, float64 (c, 2, k)."""
     misfit: np.ndarray
     """Root mean square residual in noise standard deviations, float64 (c,)."""
     cost: np.ndarray

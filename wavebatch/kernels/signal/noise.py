@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import QUANTISATION_STD
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, STRONG, find_quiet, quiet_mean, smooth_121
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, STRONG, accumulate, find_quiet, quiet_mean, smooth_121
 
-ROUNDS = 4
-"""Times that level and quiet samples are found from each other."""
+ROUNDS, SETTLED = 4, 0.001
+"""Times, at most, that level and quiet samples are found from each other; change in noise that ends it."""
 
 
 DRIFT = 1.0
@@ -122,15 +122,20 @@ def _estimate_from(
     """The noise of quiet samples, found from each other from a first level, noise and spread of baselines on."""
     for _ in range(ROUNDS):
         width = limit * np.hypot(SMOOTH_GAIN * std, spread) + 0.25
-        quiet = find_quiet(signal - np.float32(level), width, reach, recovery)
+        deviation = signal - np.float32(level)
+        quiet = find_quiet(deviation, width, reach, recovery)
         if missing is not None:
             quiet &= ~missing
-        mean, number = quiet_mean(signal - np.float32(level), quiet)
+        mean, number = quiet_mean(deviation, quiet)
         if not number.any():
             return PooledNoise(level, std, std, 0.0, 0.0, recovery=recovery)
+        last = level, std, spread
         level += float(np.sum(mean * number, dtype=np.float64) / np.sum(number))
-        deviation = np.where(quiet, signal - np.float32(level), np.float32(0))
+        np.subtract(signal, np.float32(level), out=deviation)
+        deviation *= quiet
         std, spread = _split_variance(deviation, quiet, number, reach)
+        if max(abs(new - old) for new, old in zip((level, std, spread), last, strict=True)) < SETTLED * std:
+            break
     if spread > DRIFT * std:
         drifting = _estimate_drifting(signal, reach, limit, missing, recovery)
         return drifting or PooledNoise(level, std, std, spread, float(quiet.mean()), recovery=recovery)
@@ -186,7 +191,7 @@ def measure_recovery(
         above = signal - find_levels(signal, noise.std, reach, limit)[0]
     width = limit * np.hypot(SMOOTH_GAIN * noise.std, min(noise.spread, noise.std)) + 0.25
     quiet = find_quiet(above, width, reach)
-    early = np.logical_and.accumulate(quiet, axis=0)
+    early = accumulate(np.logical_and, quiet)
     if missing is not None:
         quiet &= ~missing
         early &= ~missing
@@ -198,8 +203,8 @@ def measure_recovery(
     peak = above[:, rows].max(axis=0)
     rows = rows[peak >= np.median(peak)]
     strong, quiet, above = strong[:, rows], quiet[:, rows], above[:, rows] - before[rows]
-    place = np.arange(s)[:, None]
-    last = np.maximum.accumulate(np.where(strong, place, -1), axis=0)
+    place = np.arange(s, dtype=np.int32)[:, None]
+    last = accumulate(np.maximum, (place + np.int32(1)) * strong) - np.int32(1)
     step = max(reach, 1)
     bins = (place - last) // step
     bins[(last < 0) | ~quiet] = -1
@@ -246,8 +251,8 @@ def correlate_quiet(signal: np.ndarray, quiet: np.ndarray, std: float, lags: int
     if not several.any():
         return np.empty(0)
     part, used = signal[:, several], quiet[:, several]
-    mean = np.where(used, part, 0).sum(axis=0, dtype=np.float64) / number[several]
-    deviation = np.where(used, part - mean.astype(np.float32), np.float32(0))
+    mean = (part * used).sum(axis=0, dtype=np.float64) / number[several]
+    deviation = (part - mean.astype(np.float32)) * used
     found = []
     for lag in range(min(lags, len(part) - 1) + 1):
         pairs = np.count_nonzero(used[lag:] & used[: len(used) - lag]) if lag else np.count_nonzero(used)
@@ -305,7 +310,7 @@ def _estimate_drifting(
         several = number >= 8
         if not several.any():
             return None
-        std = _within_waveforms(np.where(quiet, signal - levels, np.float32(0)), number)
+        std = _within_waveforms((signal - levels) * quiet, number)
     known = levels[several].astype(np.float64)
     scatter = np.mean((known - known.mean()) ** 2) - std**2 * np.mean(1 / number[several])
     spread = float(np.sqrt(max(scatter, 0.0)))
@@ -320,16 +325,19 @@ def _split_variance(deviation: np.ndarray, quiet: np.ndarray, number: np.ndarray
     coloured noise, and so do the means of few samples.
     """
     several = np.flatnonzero(number > 1)
-    part, used = deviation[:, several].astype(np.float64), quiet[:, several].astype(np.float64)
+    part, used = deviation, quiet
+    if len(several) < len(number):
+        part, used = np.take(deviation, several, axis=1), np.take(quiet, several, axis=1)
     gap = min(apart + 1, len(part))
-    earlier, partners = np.cumsum(part[: len(part) - gap], axis=0), np.cumsum(used[: len(used) - gap], axis=0)
+    used = used.astype(np.float32)
+    earlier, partners = (accumulate(np.add, values[: len(values) - gap]) for values in (part, used))
     products = np.einsum("sn,sn->n", part[gap:], earlier)
     pairs = np.einsum("sn,sn->n", used[gap:], partners)
     if np.count_nonzero(pairs) < LEAST_WAVEFORMS:
         return _within_waveforms(deviation, number), _between_waveforms(deviation, number)
     weight = 1 / number[several]
     between = max(float(products @ weight / (pairs @ weight)), 0.0)
-    total = float(np.sum(part * part) / np.sum(number[several]))
+    total = float(np.sum(part * part, dtype=np.float64) / np.sum(number[several]))
     return max(float(np.sqrt(max(total - between, 0.0))), QUANTISATION_STD), float(np.sqrt(between))
 
 
@@ -364,9 +372,9 @@ def _smoothed_std(signal: np.ndarray, quiet: np.ndarray, std: float) -> float:
     if not inside.any():
         return std
     mean, number = quiet_mean(smoothed, inside)
-    deviation = np.where(inside, smoothed - mean, 0).astype(np.float64)
+    deviation = (smoothed - mean) * inside
     freedom = np.maximum(number - 1, 0).sum()
-    return float(np.sqrt(np.sum(deviation * deviation) / freedom) / SMOOTH_GAIN) if freedom else std
+    return float(np.sqrt(np.sum(deviation * deviation, dtype=np.float64) / freedom) / SMOOTH_GAIN) if freedom else std
 
 
 def keep_longest(missing: np.ndarray) -> np.ndarray:
@@ -389,7 +397,9 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
     return number != np.argmax(sizes, axis=0) + 1
 
 
-def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> tuple[float, np.ndarray] | None:
+def residual_noise(
+    residual: np.ndarray, used: np.ndarray, lost: np.ndarray, lags: int = LAGS
+) -> tuple[float, np.ndarray] | None:
     """Standard deviation and correlation of what fits leave outside of their echoes.
 
     Parameters
@@ -398,6 +408,8 @@ def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> 
         Waveforms less baseline and echoes [count].
     used : bool (n, s)
         Samples that count.
+    lost : float (k,)
+        Covariance at lags 0, 1, ... that the choice of these waveforms has taken away [count^2]; 0 beyond.
     lags : int
         Largest lag [samples].
 
@@ -424,7 +436,10 @@ def residual_noise(residual: np.ndarray, used: np.ndarray, lags: int = LAGS) -> 
         if pairs < LEAST_PAIRS:
             break
         found.append(np.einsum("ns,ns->", deviation[:, lag:], deviation[:, :-lag], dtype=np.float64) / pairs)
-    return float(np.sqrt(variance)), np.array(found) / max(variance, 1e-12)
+    covariance = np.array([variance, *found])
+    common = min(len(covariance), len(lost))
+    covariance[:common] += lost[:common]
+    return float(np.sqrt(covariance[0])), covariance[1:] / max(covariance[0], 1e-12)
 
 
 LEAST_FACTOR = 0.05

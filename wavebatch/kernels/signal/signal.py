@@ -284,7 +284,7 @@ STRONG = 3.0
 def widen_after(mask: np.ndarray, reach: int) -> np.ndarray:
     """Mask, bool (s, n), in which each true sample also marks the `reach` samples after it."""
     if reach >= len(mask):
-        return np.logical_or.accumulate(mask, axis=0)
+        return accumulate(np.logical_or, mask)
     wide = mask.copy()
     done = 0
     while done < reach:
@@ -325,7 +325,7 @@ def quiet_mean(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.nd
     Parameters
     ----------
     signal : float32 (s, n), count
-        Waveforms.
+        Waveforms, all of them finite.
     quiet : bool (s, n)
         Samples that count.
 
@@ -337,8 +337,26 @@ def quiet_mean(signal: np.ndarray, quiet: np.ndarray) -> tuple[np.ndarray, np.nd
         Quiet samples.
     """
     number = quiet.sum(axis=0, dtype=np.int32)
-    total = sum_samples(np.where(quiet, signal, np.float32(0)))
+    total = sum_samples(signal * quiet)
     return total / np.maximum(number, 1).astype(np.float32), number
+
+
+NARROW = 128
+"""Waveforms below which NumPy accumulates faster along them than this module does sample by sample."""
+
+
+def accumulate(function: np.ufunc, values: np.ndarray) -> np.ndarray:
+    """As function.accumulate(values, axis=0) of values (s, n), in the same order and of the same dtype.
+
+    NumPy goes down every waveform, across the memory; all waveforms at once are up to 40 times as fast.
+    """
+    if values.shape[1] < NARROW or not len(values):
+        return function.accumulate(values, axis=0)
+    result = np.empty_like(values)
+    result[0] = values[0]
+    for at in range(1, len(values)):
+        function(result[at - 1], values[at], out=result[at])
+    return result
 
 
 def sum_samples(values: np.ndarray) -> np.ndarray:

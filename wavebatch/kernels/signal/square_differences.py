@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from wavebatch.kernels.signal.signal import accumulate
+
 COLUMNS_AT_A_TIME = 512
 """Waveforms per part, so that the arrays of a part stay in the cache together."""
 
@@ -74,7 +76,7 @@ def slide_taps(padded: np.ndarray, taps: np.ndarray) -> np.ndarray:
 def slide_energy(padded: np.ndarray, k: int) -> np.ndarray:
     """Sums of the squares of rows t .. t + k - 1 of padded (s, n), for every t: (s - k + 1, n)."""
     total = np.zeros((len(padded) + 1, padded.shape[1]), padded.dtype)
-    np.cumsum(padded * padded, axis=0, out=total[1:])
+    total[1:] = accumulate(np.add, padded * padded)
     return total[k:] - total[:-k]
 
 

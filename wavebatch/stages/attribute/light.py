@@ -118,7 +118,7 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
         return amplitude * sigma * area_factor(system, echoes) / np.exp(0.5 * system.kappa**2)
     whole = np.stack([amplitude, np.zeros(len(sigma)), sigma / block.spacing], axis=1)
     height, _, width = model_parameters(shape, limits, whole).T
-    facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)))
+    facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)), np.zeros((1, 2)))
     return height * width * (facing[0, 0] * facing[0, 2] / limits.ref) * block.spacing
 
 

@@ -256,14 +256,16 @@ def _solve_undamped(
     parameters[:, 2] = np.clip(parameters[:, 2], settings.width_low, settings.width_high)
     model = evaluate_model(windows, parameters, settings.shape)
     gram = gram_matrix(model)
-    errors, energy = fit_errors(parameters, windows.std, model, gram)
+    errors, shared = fit_errors(parameters, windows.std, model, gram)
     parameters[:, 1] += begin[:, None]
     cost = gram[:, -1, -1] / windows.std**2
     used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
-    return Solution(rows, parameters, errors, energy, np.sqrt(cost / used), cost, converged, bound)
+    return Solution(rows, parameters, errors, shared, np.sqrt(cost / used), cost, converged, bound)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:
     """Multiply the widths of a solution by the factor."""
     scale = np.array([1.0, 1.0, factor])[:, None]
-    return solution._replace(parameters=solution.parameters * scale, errors=solution.errors * scale)
+    return solution._replace(
+        parameters=solution.parameters * scale, errors=solution.errors * scale, shared=solution.shared * factor
+    )

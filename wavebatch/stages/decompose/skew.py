@@ -204,7 +204,7 @@ def _fit_each(
             parameters[:, 1] += begin[:, None]
             errors = fit.errors[:, :3]
             # The skew takes part in the area: its error is not that of amplitude and width alone.
-            unknown = np.full_like(errors[:, 0], np.nan)
+            unknown = np.full_like(errors[:, :2], np.nan)
             found = (fit.misfit, fit.cost, fit.converged, fit.at_bound)
             solutions.append(Solution(one.cluster, parameters, errors, unknown, *found))
             columns["skew"].append(fit.parameters[:, 3].reshape(-1).astype(np.float32))

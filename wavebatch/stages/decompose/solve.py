@@ -244,13 +244,13 @@ def describe_solutions(
     if not solutions:
         return EchoTable.empty().with_attributes(**given)
     flat = [_flatten(clusters, solution) for solution in solutions]
-    waveform, parameters, errors, energy_err, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
+    waveform, parameters, errors, shared, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
     factors = error_factors(fitted, block.spacing, parameters[:, 2])
+    energy_err = relative_energy_errors(parameters, errors, shared) * factors[:, 3]
+    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors, shared)
     errors *= factors[:, :3]
-    energy_err *= factors[:, 3]
-    parameters, errors = describe_echoes(settings.shape, limits, parameters, errors)
     amplitude, time, width = parameters.T
     energy = amplitude * amplitude * width * SQRT_PI
     last = block.samples.shape[1] - 1
@@ -273,8 +273,34 @@ def describe_solutions(
     return flag_echoes(block, noise, system, clear_lone(table))
 
 
+def relative_energy_errors(parameters: np.ndarray, errors: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Compute the relative errors of amplitude times width.
+
+    Parameters
+    ----------
+    parameters, errors : float64 array, shape (m, 3)
+        Amplitude, time and width, and their standard deviations.
+    shared : float64 array, shape (m, 2)
+        Covariance of amplitude and width, and of time and width.
+
+    Returns
+    -------
+    float64 array, shape (m,)
+        Standard deviations; NaN where the covariance is.
+
+    References
+    ----------
+    docs/algorithms.md 5.
+    """
+    amplitude, _, width = parameters.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = (errors[:, 0] / amplitude) ** 2 + (errors[:, 2] / width) ** 2
+        variance += 2 * shared[:, 0] / (amplitude * width)
+    return np.sqrt(np.maximum(variance, 0))
+
+
 def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
-    """One row per echo: waveform, parameters (m, 3), errors (m, 3), relative error of the energy, misfit, flags."""
+    """One row per echo: waveform, parameters (m, 3), errors (m, 3), shared (m, 2), misfit, flags."""
     k = solution.parameters.shape[2]
     flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
     flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
@@ -284,7 +310,7 @@ def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
         np.repeat(clusters.waveform[solution.cluster], k),
         solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
         solution.errors.transpose(0, 2, 1).reshape(-1, 3),
-        solution.energy_errors.reshape(-1),
+        solution.shared.transpose(0, 2, 1).reshape(-1, 2),
         np.repeat(solution.misfit, k),
         flags.reshape(-1),
     )

@@ -15,18 +15,18 @@ from typing import NamedTuple
 import numpy as np
 import scipy  # parts of it load when they are first asked for
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
+from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.text_file import read_text
 from wavebatch.files.toml_file import parse_toml
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
-from wavebatch.stages.decompose.fit import adaptive, closed_form
-from wavebatch.stages.detect.maximum import maximum
+from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.measure import find_strongest, keep_lone, measure_gaussian, subtract_echoes
+from wavebatch.surveying.lone_echoes import find_strongest, fit_lone
+from wavebatch.surveying.measure import measure_gaussian, subtract_echoes
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8
@@ -101,13 +101,7 @@ def _load(path: Path) -> KnownSystem:
 
 def find_lone(block: WaveformBlock, system: SystemPulse, most: int = MOST_ECHOES) -> EchoTable:
     """Return the strongest single echoes of a block by Gaussian fits: at most `most`, one per waveform, not clipped."""
-    noise = pooled_noise(block, system)
-    echoes = closed_form(block, noise, system, maximum(block, noise, system), fraction=0.5, steps=4)
-    rows, second = find_strongest(echoes, len(block))
-    echoes = echoes.take(rows)
-    good = echoes.amplitude > LEAST_SNR * system.noise_std
-    good &= (echoes.flags & int(EchoFlag.NEAR_EDGE | EchoFlag.SATURATED)) == 0
-    return take_strongest(echoes.take(np.flatnonzero(keep_lone(good, echoes.amplitude, second))), most)
+    return take_strongest(fit_lone(block, pooled_noise(block, system), system, LEAST_SNR, fraction=0.5), most)
 
 
 def take_strongest(echoes: EchoTable, most: int = MOST_ECHOES) -> EchoTable:
