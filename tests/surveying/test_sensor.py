@@ -283,3 +283,17 @@ def test_few_windows_assume_what_an_aircraft_does_in_turbulent_air():
     claimed, true = fly_roughly(np.random.default_rng(1), seconds=1.4, level=0.3, rounding=0.001)
     still, _ = fly_roughly(np.random.default_rng(1), seconds=1.4, rounding=0.001)
     assert still > 0.003 and claimed > 0.6 * true
+
+
+@pytest.mark.parametrize("time", [0.0, 123.0])
+def test_a_trajectory_is_of_no_use_to_points_without_times(tmp_path, tiny_strip, edit_points, time):
+    """The advice was to give --trajectory, which was given."""
+
+    def stop_clock(points):
+        points["gps_time"] = time
+        return points
+
+    strip = edit_points(tiny_strip, tmp_path / "still.las", stop_clock)
+    with pytest.raises(InputError, match="no GPS times, or all the same; give --flight-height instead"):
+        find(strip, trajectory=write_trajectory(tmp_path / "t.csv"))
+    assert find(strip, height=800.0).kind == "flight height"

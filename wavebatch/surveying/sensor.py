@@ -170,7 +170,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
-        return _from_file(reader, vectors, request)
+        return _from_file(reader, vectors, request, scan.packets > 1)
     for kind, rays in (("direction vectors", vectors), ("pairs of returns", pairs)):
         found = estimate_path(rays, kind)
         if found is not None:
@@ -229,9 +229,15 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     return ()
 
 
-def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
+def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several: bool) -> SensorSource:
     crs = request.crs or find_crs(reader.facts.crs, reader.facts.header.vlrs)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
+    times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
+    if several and (not len(times) or times.min() == times.max()):
+        raise InputError(
+            f"{request.trajectory}: cannot be used, because the points of the strip have no GPS times, or all the same; "
+            "give --flight-height instead"
+        )
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))
     start, stop = float(rays.time[0]), float(rays.time[-1])
