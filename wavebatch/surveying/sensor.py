@@ -235,7 +235,7 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several:
     times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
     if several and (not len(times) or times.min() == times.max()):
         raise InputError(
-            f"{request.trajectory}: cannot be used, because the points of the strip have no GPS times, or all the same; "
+            f"{request.trajectory}: cannot be used, because its points have no GPS times, or all the same; "
             "give --flight-height instead"
         )
     if not len(rays.time):
