@@ -235,8 +235,8 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several:
     times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
     if several and (not len(times) or times.min() == times.max()):
         raise InputError(
-            f"{request.trajectory}: cannot be used, because its points have no GPS times, or all the same; "
-            "give --flight-height instead"
+            f"{request.trajectory}: cannot be used, because the points of this strip have no GPS times, or all the "
+            "same; give --flight-height instead"
         )
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))
