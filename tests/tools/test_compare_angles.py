@@ -22,8 +22,8 @@ NAMES = ("incidence_angle", "incidence_angle_normals")
 CHAIN = "".join(
     f'[[chain]]\nstage = "{name}"\n'
     for name in ("noise.pooled", "detect.maximum", "decompose.adaptive", "attribute.position",
-                 "attribute.incidence_angle_normals", "attribute.incidence_angle")
-) + "divergence = 1.1\n"  # fmt: skip
+                 "attribute.incidence_angle", "attribute.incidence_angle_normals")
+).replace('incidence_angle"\n', 'incidence_angle"\ndivergence = 1.1\n') + "radius = 2.5\n"  # fmt: skip
 
 
 @pytest.fixture(scope="module")

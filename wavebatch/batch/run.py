@@ -297,5 +297,6 @@ class _Batch:
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             more["serious"] = list(strip.serious)
             if strip.prepared is not None:
-                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": list(strip.prepared.doubts)}
+                lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
+                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
             self._tell({**event, **more})

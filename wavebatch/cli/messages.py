@@ -157,7 +157,19 @@ def print_json(value: Any, mode: str = "") -> None:
         context = context.parent
     schema = {"schema": f"wavebatch.{'-'.join(path)}/1"}
     named = [{**schema, **one} for one in value] if isinstance(value, list) else {**schema, **value}
-    click.echo(format_json(named))
+    print_text(format_json(named))
+
+
+def print_text(text: str) -> None:
+    """Prints the text on stdout; a stdout that cannot be written, such as a full disk, is named as such."""
+    try:
+        click.echo(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _drop_output(sys.stdout)
+        raise Unprinted(error) from error
 
 
 def format_json(value: Any) -> str:
@@ -188,7 +200,7 @@ def print_result(as_json: bool, document: Any, lines: Iterable[str], mode: str =
     if as_json:
         print_json(document, mode)
     else:
-        click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
+        print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
 
 
 def print_summary(options: Mapping[str, Any], summary: Any, lines: Iterable[str]) -> None:

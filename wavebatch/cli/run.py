@@ -24,6 +24,7 @@ from wavebatch.cli.messages import (
     one_line,
     print_json,
     print_safely,
+    print_text,
     printable,
     talk,
 )
@@ -328,9 +329,9 @@ def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> in
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
         if not as_json:
-            click.echo(printable(line))
+            print_text(printable(line))
     for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
-        click.echo(f"# setting: {line}")
+        print_text(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
     if as_json:
         print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,34 @@ def _read_crs(text: str, where: str) -> Any:
         return found
 
 
+def _flatten(crs: Any) -> Any:
+    """The CRS without its third axis: keys of a GeoTIFF have no place for one, and GDAL then writes no CRS at all.
+
+    RiPROCESS gives its UTM zones an axis of height.
+    """
+    from rasterio.crs import CRS
+
+    text = crs.to_wkt(version="WKT2_2019")
+    third = text.find("ORDER[3]")
+    if not text.startswith("PROJCRS[") or third < 0:
+        return crs
+    start = text.rindex(",AXIS[", 0, third)
+    depth, end = 0, start
+    for token in re.finditer(r'"[^"]*"|[][]', text[start:]):
+        depth += {"[": 1, "]": -1}.get(token[0], 0)
+        if not depth and token[0] == "]":
+            end = start + token.end()
+            break
+    return CRS.from_wkt((text[:start] + text[end:]).replace("CS[Cartesian,3]", "CS[Cartesian,2]"))
+
+
+def _writing() -> Any:
+    """Settings of GDAL: what a GeoTIFF cannot hold goes to no .aux.xml, which would have the temporary file's name."""
+    from rasterio.env import Env
+
+    return Env(GDAL_PAM_ENABLED="NO")
+
+
 class RasterWriter(Closing):
     """Writes the tiles of a GeoTIFF; it appears at `publish`, whole, or not at all. A context manager.
 
@@ -103,18 +132,19 @@ class RasterWriter(Closing):
         self._draft = Draft(target, overwrite=overwrite)
         self._target = target
         self._layout = layout
-        crs = None if layout.crs is None else _read_crs(layout.crs, str(target))
         try:
-            self._file = rasterio.open(
-                self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
-                dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
-                transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
-                compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
-            )  # fmt: skip
-            self._file.update_tags(**tags)
-            for number, band in enumerate(bands, 1):
-                self._file.set_band_description(number, band.description)
-                self._file.set_band_unit(number, band.unit)
+            with _writing():
+                crs = None if layout.crs is None else _flatten(_read_crs(layout.crs, str(target)))
+                self._file = rasterio.open(
+                    self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
+                    dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
+                    transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
+                    compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
+                )  # fmt: skip
+                self._file.update_tags(**tags)
+                for number, band in enumerate(bands, 1):
+                    self._file.set_band_description(number, band.description)
+                    self._file.set_band_unit(number, band.unit)
         except BaseException as error:
             self._draft.discard()
             if isinstance(error, rasterio.errors.RasterioError | OSError):
@@ -136,7 +166,8 @@ class RasterWriter(Closing):
             )
         stored = np.where(np.isnan(cut), self._layout.no_data, cut).astype(self._layout.dtype)
         try:
-            self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
+            with _writing():
+                self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
 
@@ -145,13 +176,19 @@ class RasterWriter(Closing):
         import rasterio
 
         try:
-            self._file.close()
+            with _writing():
+                self._file.close()
+                with rasterio.open(self._draft.path) as written:
+                    lost = self._layout.crs is not None and written.crs is None
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+        if lost:
+            raise ConfigError(f"{self._target}: a GeoTIFF cannot hold the CRS of the clouds; use --crs EPSG:n")
         self._draft.publish()
 
     def close(self) -> None:
         """Remove what was not published; may be called twice."""
         if not self._file.closed:
-            self._file.close()
+            with _writing():
+                self._file.close()
         self._draft.discard()

@@ -7,6 +7,7 @@ else has succeeded: matplotlib takes long to import and may be missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,8 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
         run, fill = choice.chain, None
         if ranges:
-            run, fill = add_ranges(choice.chain, reader, scan)
+            run, fill, error = add_ranges(choice.chain, reader, scan)
+            system = replace(system, sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
         return views, describe_chain(choice.chain)
 

@@ -37,15 +37,14 @@ _MOST_SOURCES = 20
 def describe_file(path: Path, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
     """Return everything that `wavebatch info` shows of a file, as plain values.
 
-    direction, headerless: as for `describe_strip`, for files with waveforms. Raises InputError where the file cannot be
-    read.
+    direction, headerless: as for `describe_strip`, for files with waveforms. What cannot be read of the packets or the
+    points goes to `problems`. Raises InputError where the header cannot be read.
     """
     checked = read_checked_header(path, waveforms=False)
     header = checked.header
+    facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
     if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
-        facts = describe_strip(path, direction=direction, headerless=headerless)
-    else:
-        facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
+        facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
     accounts = read_accounts(header)
     facts["provenance"] = [describe_account(account) for account in accounts]
@@ -54,6 +53,14 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     except InputError as error:
         facts["problems"] = [*facts["problems"], " ".join(str(error).split()).removeprefix(f"{path}: ")]
     return without_nan(facts)
+
+
+def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
+    """What a strip holds besides points; the reason where its packets cannot be found, because points still can."""
+    try:
+        return describe_strip(path, direction=direction, headerless=headerless)
+    except InputError as error:
+        return {"problems": [" ".join(str(error).split()).removeprefix(f"{path}: ")]}
 
 
 def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
