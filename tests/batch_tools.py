@@ -5,9 +5,9 @@ from pathlib import Path
 import laspy
 import numpy as np
 
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.stages.chain_file import load_profile
 
 

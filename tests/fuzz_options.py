@@ -14,6 +14,7 @@ from fuzz_damage import _damage_text, apply_edits
 
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
+from wavebatch.cli.program.settings import EXCLUSIVE
 
 SOUND = {
     "run": "run {base}/strip.las -o {out} --profile fast", "info": "info {base}/strip.las",
@@ -101,6 +102,7 @@ class Options:
             place = rng.randrange(len(name.split()), len(words))
             words[place] = rng.choice([*_PLACES, *_READ])
         for option in rng.sample(options, min(rng.choice([1, 1, 2, 3, 5]), len(options))):
+            words = self._drop_rivals(words, name, option)
             value = (draw_value(option, rng) or "").replace("\0", "") if not option.is_flag else None
             if value is not None and rng.random() < 0.12:
                 words_of = max(option.opts, key=len).removeprefix("--").upper().replace("-", "_")
@@ -110,6 +112,15 @@ class Options:
                 words.append(rng.choice([*option.opts, *option.secondary_opts]))
                 words += [] if value is None else [value]
         return shlex.join(words), variables
+
+
+    def _drop_rivals(self, words: list[str], name: str, option: click.Option) -> list[str]:
+        """The words without options that this one excludes: else it would always be refused."""
+        for one in self._commands[name].params:
+            if one is not option and any({one.name, option.name} <= set(rivals) for rivals in EXCLUSIVE):
+                for place in reversed([place for place, word in enumerate(words) if word in one.opts]):
+                    words = words[:place] + words[place + (1 if one.is_flag else 2) :]
+        return words
 
 
 def draw_value(option: click.Option, rng: random.Random) -> str | None:

@@ -5,6 +5,7 @@ import re
 import signal
 import sys
 import textwrap
+import time
 
 import attacking
 import pytest
@@ -29,9 +30,18 @@ def _plant(attacker, monkeypatch, code):
         {code}
     """
     words = [sys.executable, "-c", textwrap.dedent(program), "spawn_main", str(attacker._folder / "out")]
-    monkeypatch.setattr(attacking.subprocess, "Popen", lambda _, **how: _POPEN(words, **how))
+    monkeypatch.setattr(attacking.subprocess, "Popen", lambda _, **how: _begin(words, **how))
     monkeypatch.setattr(attacker, "sound", {"survey": {"a.toml": b"whole"}})
-    monkeypatch.setattr(attacker, "seconds", {"survey": 1.0})
+    monkeypatch.setattr(attacker, "seconds", {"survey": 0.0})
+
+
+def _begin(words, **how):
+    """The process, once it does not die of the signal: on a busy machine that takes a while."""
+    process, deadline = _POPEN(words, **how), time.monotonic() + 60
+    while process.poll() is None and not attacking._handles_signals(process.pid):
+        assert time.monotonic() < deadline, "the program does not begin"
+        time.sleep(0.01)
+    return process
 
 
 _POPEN = attacking.subprocess.Popen

@@ -15,14 +15,15 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "worker_check"}, {"selection"}, {"unit"},
-        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"},
-        {"strip_task", "processes", "dask_cluster"}, {"preflight"}, {"run"},
+        {"counts", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
+        {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
+    "surveying/measuring": [{"lone_echoes"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],
+    "batch/workers": [{"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"}],
     "surveying": [
-        {"measure"}, {"learn_pulse", "flat_ground"}, {"survey", "sensor"},
+        {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"targets"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"},
     ],
 }
 """The same within packages whose modules do one thing after another."""
@@ -77,12 +78,17 @@ def test_imports_go_down_only(path):
 
 @pytest.mark.parametrize("package", INSIDE)
 def test_imports_go_down_inside_packages_too(package):
-    rank = {f"wavebatch.{package}.{name}": rank for rank, names in enumerate(INSIDE[package]) for name in names}
-    files = {f"wavebatch.{package}.{path.stem}": path for path in (ROOT / package).glob("*.py")}
-    assert rank.keys() == files.keys() - {f"wavebatch.{package}.__init__"}
+    """A name in INSIDE is that of a module, or of a folder with all of its modules."""
+    rank = {name: rank for rank, names in enumerate(INSIDE[package]) for name in names}
+    modules = {path.stem for path in (ROOT / package).glob("*.py")} - {"__init__"}
+    assert {name for name in rank if not (ROOT / package / name).is_dir()} == modules
+    start = f"wavebatch.{package.replace('/', '.')}."
     for name, own in rank.items():
-        for used in _imports(files[name]) & rank.keys():
-            assert rank[used] <= own, f"{name} must not import {used}"
+        folder = ROOT / package / name
+        for path in folder.rglob("*.py") if folder.is_dir() else [folder.with_suffix(".py")]:
+            used = {one.removeprefix(start).split(".")[0] for one in _imports(path) if one.startswith(start)}
+            for other in used & rank.keys():
+                assert rank[other] <= own, f"{path} must not import {other}"
 
 
 def test_no_circle_of_imports():
@@ -151,7 +157,7 @@ def test_no_other_dependency_at_run_time():
         peers |= {"matplotlib", "mpl_toolkits"} if _part(path) == "tools" or path.name == "figure_file.py" else set()
         projecting = ("trajectory_file.py", "geotiff_wkt.py", "geojson_crs.py", "area_crs.py")
         peers |= {"pyproj"} if path.name in projecting else set()
-        peers |= {"dask", "distributed"} if path.name in ("dask_cluster.py", "worker_check.py") else set()
+        peers |= {"dask", "distributed"} if path.parent.name == "workers" else set()
         peers |= {"rasterio"} if path.name == "geotiff_file.py" else set()
         assert _outside(path) <= allowed | peers | sys.stdlib_module_names, path
 

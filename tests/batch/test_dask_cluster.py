@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import re
 import shutil
 import signal
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from wavebatch.batch.workers import dask_cluster
 from wavebatch.cli import main
 from wavebatch.tools.simulate import simulate_strip
 
@@ -161,7 +163,7 @@ def _spool_as_ever():
     "address", ["tcp://127.0.0.1:9", "nonsense", "foo://127.0.0.1:9", "tcp://none.invalid:8786", "tcp://", "a:b"]
 )
 def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatch, address):
-    monkeypatch.setattr("wavebatch.batch.dask_cluster._CONNECT", 0.5)
+    monkeypatch.setattr("wavebatch.batch.workers.dask_client._CONNECT", 0.5)
     done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", address])
     assert done.exit_code == 2
     assert done.stderr.startswith(f"error: --scheduler {address}: cannot be reached") and done.stderr.count("\n") == 1
@@ -169,7 +171,7 @@ def test_a_cluster_that_is_not_there_is_wrong_usage(strips, tmp_path, monkeypatc
 
 
 def test_without_distributed_the_line_says_what_to_install(strips, tmp_path, monkeypatch):
-    monkeypatch.setattr("wavebatch.batch.dask_cluster.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("wavebatch.batch.workers.dask_cluster.importlib.util.find_spec", lambda name: None)
     done = CliRunner().invoke(main, ["run", str(strips), "-o", str(tmp_path / "out"), "--scheduler", "tcp://a:1"])
     assert done.exit_code == 2 and re.search(r"pip install .*'distributed>=", done.stderr)
     assert not (tmp_path / "out").exists()
@@ -288,7 +290,7 @@ def test_strips_that_a_worker_does_not_see_are_named_before_anything_starts(dask
 
 def _blind(part):
     """Let a worker not see what has this in its path; None: let it see everything."""
-    from wavebatch.batch import worker_check
+    from wavebatch.batch.workers import worker_check
 
     worker_check._size = lambda file: -1 if part and part in file else worker_check.os.path.getsize(file)
 
@@ -307,7 +309,7 @@ def test_a_worker_on_another_kind_of_processor_is_refused_by_name(tmp_path, stri
 
 
 def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path, strips):
-    from wavebatch.batch.dask_cluster import Cluster
+    from wavebatch.batch.workers.dask_cluster import Cluster
 
     events, dask = [], Dask(tmp_path)
     try:
@@ -355,3 +357,27 @@ def test_a_cluster_with_tls_writes_the_same_bytes(tmp_path, strips):
         cluster.stop()
     subprocess.run([*command, "-o", str(tmp_path / "near")], check=True)
     assert (tmp_path / "far" / "a.laz").read_bytes() == (tmp_path / "near" / "a.laz").read_bytes()
+
+
+@pytest.mark.parametrize(("cancelled", "sent"), [(False, 2), (True, 1)])
+def test_a_call_that_nobody_waits_for_is_not_sent_again_from_a_worker_that_does_not_fit(cancelled, sent):
+    remotes = []
+
+    class Remote:
+        def __init__(self):
+            remotes.append(self)
+
+        def add_done_callback(self, function):
+            self.done = function
+
+        def result(self):
+            return pickle.dumps((("worker", {}), "misfit"))
+
+        def release(self):
+            pass
+
+    promise = dask_cluster._Promise(Remote, lambda error: error, lambda worker, kind: None)
+    if cancelled:
+        assert promise.cancel()
+    remotes[0].done(remotes[0])
+    assert len(remotes) == sent

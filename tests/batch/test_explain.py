@@ -5,7 +5,10 @@ import json
 import numpy as np
 import pytest
 from batch_tools import run_one
+from click.testing import CliRunner
+from strips import cut_strip
 
+from wavebatch.cli import main
 from wavebatch.files.las.header import read_header
 
 
@@ -41,6 +44,44 @@ def test_inverted_and_empty_waveforms_are_told(tiny_strip, tmp_path):
     inverted = change_packets(tiny_strip, tmp_path / "down.las", lambda samples: 255 - samples)
     (line,) = remarks(inverted, tmp_path)
     assert "the signal goes down, its counts are mirrored" in line
+
+
+def warn_quietly(strip, folder, *options):
+    """Lines of `run --quiet` on stderr; the strip is written."""
+    done = CliRunner().invoke(main, ["run", str(strip), "-o", str(folder), "--quiet", *options])
+    assert done.exit_code == 0, done.stderr
+    lines = done.stderr.splitlines()
+    report = json.loads((folder / f"{strip.stem}.report.json").read_text())
+    for line in lines:
+        assert line.startswith(f"{strip}: warning: ") and line.split(": warning: ")[1] in report["warnings"]
+    return [line.split(": warning: ")[1] for line in lines]
+
+
+def test_a_strip_without_any_echo_or_waveform_warns_in_cron_too(tiny_strip, tmp_path, edit_points):
     constant = change_packets(tiny_strip, tmp_path / "flat.las", lambda samples: 0 * samples + 12)
-    (line,) = remarks(constant, tmp_path)
+    (line,) = warn_quietly(constant, tmp_path / "flat")
     assert "holds an echo: nothing rises" in line
+
+    def remove(points):
+        points["wavepacket_index"] = 0
+        return points
+
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "bare.las", remove), tmp_path / "bare")
+    assert "none of " in line and "points has a waveform" in line
+
+
+def test_points_whose_packets_are_lost_warn_in_cron_too(tiny_strip, tmp_path, edit_points):
+    def break_some(points):
+        points["wavepacket_offset"][::3] = 1 << 40
+        return points
+
+    (line,) = warn_quietly(edit_points(tiny_strip, tmp_path / "cut.las", break_some), tmp_path)
+    assert "have a packet outside the waveform data" in line
+
+
+def test_a_pulse_that_is_a_guess_warns_in_cron_too(tiny_strip, tmp_path):
+    short = cut_strip(tiny_strip, tmp_path / "short.las", 5)
+    (line,) = warn_quietly(short, tmp_path)
+    assert "the system pulse is a guess" in line and "--system" in line
+    assert CliRunner().invoke(main, ["survey", str(tiny_strip), "-o", str(tmp_path / "long.toml")]).exit_code == 0
+    assert warn_quietly(short, tmp_path / "again", "--system", str(tmp_path / "long.toml")) == []

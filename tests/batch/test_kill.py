@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from wavebatch.batch import processes
+from wavebatch.batch.workers import serve
 from wavebatch.tools.simulate import simulate_strip
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
@@ -51,11 +51,32 @@ def _contents(folder):
 
 
 def _wait_for(folder, pattern, process):
-    """Until a file like that is in the folder."""
+    """Until a file like that is in the folder; False where the run ended before it was seen."""
     deadline = time.monotonic() + 120
     while not list(folder.glob(pattern)):
-        assert time.monotonic() < deadline and process.poll() is None, "the run ended before it could be disturbed"
+        assert time.monotonic() < deadline, "the run does not begin"
+        if process.poll() is not None:
+            return False
         time.sleep(0.002)
+    return True
+
+
+def _disturb(strips, folder, pattern, number, *more):
+    """The output folder, exit code and stderr of a run that got a signal once a file like that was there.
+
+    On a busy machine a run may end before this process sees the file: then another one is started.
+    """
+    deadline, attempt = time.monotonic() + 120, 0
+    while True:
+        assert time.monotonic() < deadline, "no run could be disturbed"
+        out, attempt = folder / str(attempt), attempt + 1
+        out.mkdir()
+        with subprocess.Popen(_command(strips, out, *more), stderr=subprocess.PIPE, text=True) as process:
+            if _wait_for(out, pattern, process):
+                process.send_signal(number)
+            _, said = process.communicate(timeout=120)
+        if process.returncode:
+            return out, process.returncode, said
 
 
 def _children(pid):
@@ -82,25 +103,19 @@ def _is_tracker(pid):
 
 @pytest.mark.parametrize(("jobs", "pattern"), [("1", "a.report.json"), ("2", DRAFT)])
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, jobs, pattern):
-    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", jobs))
-    _wait_for(tmp_path, pattern, process)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert _contents(tmp_path).keys() != undisturbed.keys()
-    subprocess.run(_command(strips, tmp_path, "--resume"), check=True)
-    assert _contents(tmp_path) == undisturbed
+    out, code, _ = _disturb(strips, tmp_path, pattern, signal.SIGKILL, "--jobs", jobs)
+    assert code == -signal.SIGKILL and _contents(out).keys() != undisturbed.keys()
+    subprocess.run(_command(strips, out, "--resume"), check=True)
+    assert _contents(out) == undisturbed
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
-    process = subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"), stderr=subprocess.PIPE, text=True)
-    _wait_for(tmp_path, DRAFT, process)
-    process.send_signal(number)
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 130
+    out, code, said = _disturb(strips, tmp_path, DRAFT, number, "--jobs", "2")
+    assert code == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
-    assert set(_contents(tmp_path)) <= set(undisturbed)
-    for path in tmp_path.glob("*.report.json"):
+    assert set(_contents(out)) <= set(undisturbed)
+    for path in out.glob("*.report.json"):
         assert path.with_name(path.name.replace(".report.json", ".laz")).exists()
 
 
@@ -112,7 +127,7 @@ def test_workers_die_with_their_parent(tmp_path, stopped):
     strips.mkdir()
     simulate_strip("flat", strips / "a.las", pulses=400_000, seed=1)  # long enough to be disturbed below
     with subprocess.Popen(_command(strips, out, "--jobs", "2")) as process:
-        _wait_for(out, DRAFT, process)
+        assert _wait_for(out, DRAFT, process), "the run ended before it could be disturbed"
         children = _children(process.pid)
         assert children
         time.sleep(0.1)  # workers have begun
@@ -154,12 +169,12 @@ def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_p
 
 def test_a_worker_asks_for_the_death_signal_before_all_else(monkeypatch):
     done = []
-    monkeypatch.setattr(processes, "_wake_when_parent_dies", lambda: done.append("death signal"))
-    monkeypatch.setattr(processes.signal, "signal", lambda *_: done.append("ignores Ctrl-C"))
-    monkeypatch.setattr(processes, "keep_freed_memory", lambda: done.append("memory"))
-    monkeypatch.setattr(processes.multiprocessing, "parent_process", lambda: 1 / 0)
+    monkeypatch.setattr(serve, "_wake_when_parent_dies", lambda: done.append("death signal"))
+    monkeypatch.setattr(serve.signal, "signal", lambda *_: done.append("ignores Ctrl-C"))
+    monkeypatch.setattr(serve, "keep_freed_memory", lambda: done.append("memory"))
+    monkeypatch.setattr(serve.multiprocessing, "parent_process", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        processes._work(None)
+        serve.serve_calls(None)
     assert done == ["death signal", "ignores Ctrl-C", "memory"]
 
 

@@ -69,7 +69,7 @@ def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
     assert ((angle == -9999) | ((angle >= 0) & (angle <= 80))).all()
     told = report(plain)
     assert told["strip"]["sensor"]["source"] == "direction vectors"
-    assert told["strip"]["sensor"]["range_error_m"] < 0.01
+    assert told["strip"]["sensor"]["range_error_m"] < 0.15
     assert told["request"]["calibration"]["constant"] == 2.6e-8
 
 

@@ -12,7 +12,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from wavebatch.batch.processes import WorkerDied, Workers
+from wavebatch.batch.workers.processes import WorkerDied, Workers
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 
@@ -51,6 +51,22 @@ def stop_later():
         os._exit(0)
 
 
+def wait_until_stopped(workers):
+    """Until one of the processes is stopped."""
+    deadline = time.monotonic() + 60
+    while not any(_is_stopped(worker.process.pid) for worker in workers._workers):
+        assert time.monotonic() < deadline, "no process stops"
+        time.sleep(0.01)
+
+
+def _is_stopped(pid):
+    if os.path.exists(f"/proc/{pid}/stat"):
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] == "T"
+    shown = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return shown.stdout.startswith("T")
+
+
 def test_results_and_errors_come_back():
     with Workers(2) as workers:
         futures = [workers.submit(square, number) for number in range(20)] + [workers.submit(raise_error, 7)]
@@ -79,12 +95,12 @@ def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(keep
 
 @pytest.mark.parametrize("function", [stop, stop_later])
 def test_a_stopped_process_does_not_keep_this_one_from_ending(function):
-    start = time.monotonic()
     with Workers(2) as workers:
         workers.submit(function)
         other = workers.submit(square, 5)
         workers.wait([other])
-        time.sleep(1)
+        wait_until_stopped(workers)
+        start = time.monotonic()
     assert time.monotonic() - start < 15
 
 
@@ -101,8 +117,8 @@ def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
 _INTERRUPTED = """
 import os, signal, sys, threading, time
 sys.path.insert(0, {tests!r})
-from test_processes import square, stop_later
-from wavebatch.batch.processes import Workers
+from test_processes import square, stop_later, wait_until_stopped
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.interrupts import guard
 
 def interrupt(join=None):
@@ -112,7 +128,7 @@ def command():
     with Workers(2) as workers:
         workers.wait([workers.submit(stop_later)])
         workers.wait([workers.submit(square, 5)])
-        time.sleep(1)
+        wait_until_stopped(workers)
         if {early}:
             workers._end = interrupt
         else:
@@ -173,6 +189,15 @@ def _interrupt_at(number, function, *arguments):
     finally:
         sys.settrace(None)
     return count >= number
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit of processes")
+def test_a_process_that_the_system_refuses_is_one_line(tiny_strip, tmp_path):
+    """It said to check disk and permissions. Root has no limit of processes, so that of open files must do."""
+    words = f"ulimit -n 24; exec '{sys.executable}' -m wavebatch run '{tiny_strip}' -o '{tmp_path}/out' --jobs 40 -q"
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 4 and "of --jobs cannot be started (Too many open files); use fewer" in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
 
 
 def die_elsewhere(parent, number):

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wavebatch.batch.processes import settle
 from wavebatch.batch.row_transfer import RowStream
+from wavebatch.batch.workers.processes import settle
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk import shared_rows, temp_folders
 from wavebatch.files.disk.shared_rows import SharedRows, join_rows, read_rows, share_rows
@@ -161,7 +161,7 @@ from pathlib import Path
 from wavebatch.files.disk import temp_folders
 temp_folders.MEMORY_PLACE = Path({place!r})
 if __name__ == "__main__":
-    from wavebatch.batch.processes import Workers
+    from wavebatch.batch.workers.processes import Workers
     with Workers(2) as workers:
         workers.wait([workers.submit(os.getpid)])
         for number in range(20_000):
@@ -219,14 +219,14 @@ def test_no_place_in_memory_is_no_error(tmp_path, monkeypatch):
 
 EARLY = """
 import os, sys, time
-from wavebatch.batch.processes import start_early
+from wavebatch.batch.workers.processes import start_early
 if __name__ == "__main__":
     start_early(2)
     with open(f"/proc/{os.getpid()}/task/{os.getpid()}/children") as file:
         print(file.read(), flush=True)
     if sys.argv[1] == "stopped":
         import signal
-        from wavebatch.batch.processes import _early
+        from wavebatch.batch.workers.processes import _early
         for one in _early:
             os.kill(one.process.pid, signal.SIGSTOP)
 """

@@ -9,10 +9,11 @@ import pytest
 from batch_tools import make_job, read_cloud, run_one
 from writer_tools import read_provenance
 
+from wavebatch.batch.job import RunOptions, choose_columns
 from wavebatch.batch.preflight import LEAST_MEMORY, check_outputs, plan_memory, plan_strip
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import RunOptions, choose_columns, prepare_strip
+from wavebatch.batch.unit import prepare_strip
 from wavebatch.core.errors import ConfigError, InputError
 
 
@@ -196,7 +197,7 @@ def test_a_strip_that_changes_while_it_is_read_is_not_written(tiny_strip, tmp_pa
     shutil.copyfile(tiny_strip, strip)
     task = StripTask(make_job(strip), BatchOptions(tmp_path), alone=False)
     assert task.start() is None
-    from wavebatch.batch.processes import Workers
+    from wavebatch.batch.workers.processes import Workers
 
     with Workers(1) as workers:
         while not task.is_complete:

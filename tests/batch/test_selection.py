@@ -260,3 +260,21 @@ def test_conditions_of_a_cloud_read_as_those_of_its_run(full, riegl, tmp_path):
 def test_api_refuses_a_wrong_condition(riegl, tmp_path):
     with pytest.raises(ConfigError, match="--where: character"):
         wb.run(riegl, tmp_path, where="z >")
+
+
+def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path, monkeypatch):
+    """They are read before anything starts, and may lie on this machine alone; files of the work must be there."""
+
+    def refuse(address, folder, files, tell):
+        seen.extend(files)
+        raise ConfigError("stop")
+
+    seen = []
+    monkeypatch.setattr("wavebatch.batch.run.Cluster", refuse)
+    path, energy = tmp_path / "path.txt", tmp_path / "energy.txt"
+    path.write_text("time x y z\n0 0 0 900\n1 9 9 900\n")
+    energy.write_text("time energy\n0 1\n1 1\n")
+    with pytest.raises(ConfigError, match="stop"):
+        wb.run(tiny_strip, tmp_path, polygon=_area(tmp_path / "a.json", (0, 0, 1, 1)), pulse_energy=energy,
+               sensor=wb.SensorRequest(trajectory=path), scheduler="tcp://there:8786")  # fmt: skip
+    assert sorted(seen) == sorted([tiny_strip, path, energy])

@@ -57,9 +57,8 @@ def test_groups_name_options_that_exist_and_each_once():
     named = [name for names in GROUPS.values() for name in names]
     assert len(named) == len(set(named))
     rivals = {name for group in EXCLUSIVE for name in group}
-    assert [name for name in {*rivals, *NEVER} if name not in {*known, "force"}] == []
-    assert len(set(named) - known) <= len({"where", "drop_flags", "bbox", "polygon", "classes", "las_version", "strict",
-                                           "recursive", "force", "points_"})  # fmt: skip
+    assert [name for name in {*rivals, *NEVER} if name not in known] == []
+    assert set(named) - known == set()
 
 
 def test_options_that_take_a_number_name_its_unit():
@@ -115,6 +114,24 @@ def test_the_order_is_command_line_variable_file(folder):
     assert shown.exit_code == 0 and shown.stderr == ""  # what excludes others takes their place
 
 
+@pytest.mark.parametrize(("weak", "strong"), [('profile = "fast"', "tolerance"), ('chain = "c.toml"', "profile")])
+def test_a_variable_takes_the_place_of_what_it_excludes_in_the_file(folder, weak, strong):
+    (folder / "wavebatch.toml").write_text(f"[run]\n{weak}\n")
+    value = {"tolerance": "5m", "profile": "balanced"}[strong]
+    shown = _dry(folder, **{f"WAVEBATCH_{strong.upper()}": value})
+    assert shown.exit_code == 0 and shown.stderr == f"settings: --{strong} {value} (WAVEBATCH_{strong.upper()})\n"
+
+
+@pytest.mark.parametrize(
+    ("setting", "arguments"),
+    [("attenuation = 0.3", ("--visibility", "23")), ("flight-height = 800", ("--trajectory", "t.txt"))],
+)  # fmt: skip
+def test_an_option_takes_the_place_of_what_it_excludes(folder, setting, arguments):
+    (folder / "wavebatch.toml").write_text(f"[run]\n{setting}\n")
+    shown = _dry(folder, *arguments, "--columns", "+range")
+    assert "exclude each other" not in shown.stderr and "settings" not in shown.stderr
+
+
 def test_settings_change_the_result_as_options_do(folder):
     (folder / "wavebatch.toml").write_text('[run]\nprofile = "fast"\nformat = "las"\noutput = "there"\n')
     result = invoke("run", folder, "--quiet")
@@ -129,6 +146,9 @@ def test_settings_change_the_result_as_options_do(folder):
     [
         ("[run]\njbos = 3\n", "has no option 'jbos'; did you mean 'jobs'?"),
         ("[run]\noverwrite = true\n", "overwrite can be given on the command line only"),
+        ('[run]\nreport = "../notes.txt"\n', "report can be given on the command line or in a variable only"),
+        ('[run]\nscheduler = "tcp://there:8786"\n', "scheduler can be given on the command line or in a variable only"),
+        ("[run]\nresume = true\n", "resume can be given on the command line or in a variable only"),
         ("[run\n", "wavebatch.toml"), ("run = 3\n", "must be a table"),
         ('[run]\njobs = "many"\n', "invalid value for '--jobs'"),
     ],
@@ -159,6 +179,26 @@ def test_a_log_has_what_quiet_hides_and_is_appended(folder, tmp_path):
     assert any("ERROR" in line and "broken.las" in line for line in lines)
     assert invoke(*arguments, "--resume", "--log-level", "error").exit_code == 3
     assert log.read_text().count("broken.las") == 2 and log_file._log is None
+
+
+@pytest.mark.parametrize("words", ["run in -o out", "plot map in --column z -o m.png"])
+def test_the_first_line_of_a_log_is_the_command_as_it_was_typed(folder, monkeypatch, words):
+    monkeypatch.chdir(folder.parent)
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/wavebatch", *words.split(), "--log-file", "a b.log"])
+    assert invoke(*sys.argv[1:]).exit_code == 0
+    first = (folder.parent / "a b.log").read_text().splitlines()[0]
+    assert first.endswith(f": wavebatch {words} --log-file 'a b.log'")
+
+
+def test_outputs_replace_neither_the_log_nor_the_settings(folder, tmp_path):
+    settings = folder / "wavebatch.toml"
+    settings.write_text('[run]\nprofile = "fast"\n')
+    result = invoke("run", folder, "-o", tmp_path / "out", "--report", settings)
+    assert result.exit_code == 2 and "would replace this input" in result.stderr and "fast" in settings.read_text()
+    log = tmp_path / "night.log"
+    result = invoke("run", folder, "-o", tmp_path / "out", "--report", log, "--log-file", log)
+    assert result.exit_code == 2 and "two outputs have this name" in result.stderr
+    assert not (tmp_path / "out").exists() and "two outputs" in log.read_text()
 
 
 def test_a_log_never_grows_into_another_file(folder):

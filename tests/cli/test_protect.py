@@ -1,5 +1,6 @@
 """No output of any command replaces a file that the command reads, with or without --overwrite, also through links."""
 
+import json
 import os
 
 import pytest
@@ -22,6 +23,10 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "list.txt").write_text("s.las\n")
     (tmp_path / "targets.csv").write_text("reflectance,x,y,radius\n0.5,0,0,5\n")
     (tmp_path / "areas.json").write_text('{"type": "FeatureCollection", "features": []}')
+    (tmp_path / "energy.txt").write_text("time energy\n0 1\n1e9 1\n")
+    (tmp_path / "path.txt").write_text("time x y z\n0 0 0 900\n1e9 9 9 900\n")
+    corners = [[0, 0], [9e6, 0], [9e6, 9e6], [0, 9e6], [0, 0]]
+    (tmp_path / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
     (tmp_path / "empty").mkdir()
     os.symlink("s.las", "link.las")
     os.link("s.las", "hard.las")
@@ -38,6 +43,9 @@ _CASES = [
     "run s.las -o out -c chain.toml --report chain.toml",
     "run s.las -o out --system sys.toml --report sys.toml",
     "run @list.txt -o out --report list.txt",
+    "run s.las -o out --trajectory path.txt --pulse-energy energy.txt --report energy.txt",
+    "run s.las -o out --trajectory path.txt --pulse-energy energy.txt --report path.txt",
+    "run s.las -o out --polygon area.json --report area.json",
     "run @list.txt -o out --report s.las",
     "run s.las -o empty --report empty/s.laz",
     "run s.las -o empty --report empty/s.report.json",

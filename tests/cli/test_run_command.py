@@ -89,9 +89,18 @@ def test_existing_outputs(tiny_strip, done):
     assert _run(tiny_strip, "-o", done, "--profile", "fast", "--overwrite").exit_code == 0
 
 
-def test_debug_shows_the_traceback(tmp_path):
-    result = _run(tmp_path / "none.las", "-o", tmp_path / "out", "--debug")
+@pytest.mark.parametrize("more", [[], ["--dry-run"]])
+def test_debug_shows_the_traceback(tmp_path, more):
+    result = _run(tmp_path / "none.las", "-o", tmp_path / "out", "--debug", *more)
     assert result.exit_code == 4 and "Traceback" in result.stderr and "none.las" in result.stderr
+
+
+@pytest.mark.parametrize("dry", [False, True])
+@pytest.mark.parametrize(("names", "code"), [(["tiny"], 2), (["tiny", "none"], 4), (["none"], 4)])
+def test_wrong_columns_give_a_dry_run_the_exit_code_of_a_run(tiny_strip, tmp_path, names, code, dry):
+    strips = [tiny_strip.with_name(f"{name}.las") for name in names]
+    result = _run(*strips, "-o", tmp_path / "out", "--where", "amplitud > 3", *["--dry-run"] * dry)
+    assert result.exit_code == code and ("there is no column 'amplitud'" in result.stderr) == ("tiny" in names)
 
 
 def test_dry_run_says_what_would_be_done_and_touches_nothing(tiny_strip, tmp_path):

@@ -33,7 +33,21 @@ def invoke(*arguments):
         (["slice", "a.las", "--lines", "3:1"], "invalid value for '--lines': '3:1' is empty; END is the number"),
         (["slice", "a.las"], "give -o for the segments, --png or --overview for a picture, or --cube; see `wavebatch "
          "slice --help`"),
+        (["slice", "a.las", "-o", "l.csv", "--geojson-crs", "keep"], "--geojson-crs keep is of no use without -o FILE"),
         (["run", "a.las", "-o", "d", "--overwrite", "--resume"], "--overwrite and --resume exclude each other"),
+        (["plot", "waveform", "a.las", "-o", "w.png", "--chain", "c", "--profile", "fast"],
+         "--chain and --profile exclude each other"),
+        *((["plot", "waveform", "a.las", "-o", "w.csv", *words], f"{words[0]} is for pictures")
+          for words in (["--sheet"], ["--show", "detector"], ["--times", "all"])),
+        *(([*words, "--force"], "--force is of no use without --system") for words in (
+            ["run", "a.las", "-o", "d"], ["plot", "waveform", "a.las", "-o", "w.png"],
+            ["voxelize", "a.las", "--size", "1", "-o", "v.npz"], ["compare", "fast", "--strip", "a.las"],
+        )),
+        (["calibrate", "a.las", "--targets", "t", "-o", "c", "--chain", "c", "--profile", "auto"],
+         "--chain and --profile exclude each other"),
+        (["voxelize", "a.las", "--size", "1", "-o", "v.npz", "--trajectory", "t", "--flight-height", "9"],
+         "--trajectory and --flight-height"),
+        (["run", "a.las", "-o", "d", "--attenuation", "0", "--visibility", "9"], "--attenuation and --visibility excl"),
     ],
 )
 def test_wrong_usage_is_one_line(arguments, line):

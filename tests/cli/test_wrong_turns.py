@@ -1,10 +1,14 @@
 """Plausible mistakes of a first hour: the line says what to do next, not only what is wrong."""
 
+import os
 import shutil
 import struct
+import subprocess
+import sys
 
 import pytest
 from click.testing import CliRunner
+from strips import cut_strip
 
 from wavebatch.cli import main
 from wavebatch.files.inputs import find_files
@@ -88,3 +92,53 @@ def test_clouds_without_an_echo_in_common_are_doubted(place):
     assert result.exit_code == 0 and "warning: A and B have no echo in common" in result.stderr
     result = CliRunner().invoke(main, ["compare", "strip.las", "strip.las"])
     assert "no echo in common" not in result.stderr
+
+
+def test_a_file_of_another_kind_names_its_option(place):
+    words = ["survey", "strip.las", "-o", "system.toml", "--chain", "chain.toml"]
+    assert CliRunner().invoke(main, words).exit_code == 0
+    (place / "cal.toml").write_text('schema = "wavebatch.calibration/1"\nconstant = 1e-8\nrelative_error = 0.1\n')
+    kinds = {"chain": "a chain file", "system": "a survey", "calibration": "a calibration"}
+    files = {"chain": "chain.toml", "system": "system.toml", "calibration": "cal.toml"}
+    for option, wanted in kinds.items():
+        for kind, path in files.items():
+            if kind != option:
+                line = _say("run", "strip.las", "-o", "o", f"--{option}", path, code=2)
+                assert f"{path}: this is {kinds[kind]}, not {wanted}: give it as --{kind}" in line
+
+
+def test_a_trajectory_that_is_missing_is_one_line_for_all_strips(place):
+    shutil.copy("strip.las", "other.las")
+    line = _say("run", "strip.las", "other.las", "-o", "o", "--trajectory", "none.txt", code=2)
+    assert "none.txt: trajectory cannot be read: No such file" in line
+
+
+def test_points_are_shown_where_the_packets_are_missing(place):
+    content = bytearray((place / "strip.las").read_bytes())
+    content[6:8] = struct.pack("<H", 0b101)  # global encoding: packets in a .wdp
+    (place / "lost.las").write_bytes(content)
+    shown = CliRunner().invoke(main, ["info", "lost.las"])
+    assert shown.exit_code == 1 and "points         " in shown.stdout and "classes " in shown.stdout
+    assert shown.stderr == "error: lost.las: its packets are missing: put lost.wdp next to the strip\n"
+    assert shown.stdout.splitlines()[-1].split(maxsplit=1) == [
+        "problem", "its packets are missing: put lost.wdp next to the strip"
+    ]  # fmt: skip
+
+
+def test_strips_without_points_pass_through_every_stage(place):
+    empty = cut_strip(place / "strip.las", place / "empty.las", 0)
+    columns = "+range,+incidence_angle_normals,+amplitude_normalized"
+    done = CliRunner().invoke(main, ["run", str(empty), "-o", "o", "--columns", columns])
+    assert done.exit_code == 0, done.stderr
+    assert CliRunner().invoke(main, ["check", str(empty)]).stdout.endswith("ok (0 points, 0 packets)\n")
+    shown = CliRunner().invoke(main, ["compare", "o/empty.laz", str(empty)]).stdout
+    assert "nan" not in shown and "completeness         no-data   correctness no-data" in shown
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is full")
+@pytest.mark.parametrize("words", ["info strip.las", "check strip.las --json", "stats strip.las", "stages"])
+def test_a_full_stdout_is_named(place, words):
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run([sys.executable, "-m", "wavebatch", *words.split()], stdout=full, stderr=subprocess.PIPE,
+                              text=True, check=False)  # fmt: skip
+    assert (done.returncode, done.stderr) == (1, "error: stdout: cannot be written: No space left on device\n")

@@ -29,8 +29,11 @@ def measures(shape, width):
     return values.max(), fine[values.argmax()], (above[-1] - above[0]) / FWHM_PER_SIGMA
 
 
-def draw(shape, width, n, seed, apart=0.0, rho=0.0):
-    """Waveforms of an echo each, half of them with a second one `apart` FWHM later, and their truth (n, 2)."""
+def draw(shape, width, n, seed, apart=0.0, rho=0.0, unit=1.0):
+    """Waveforms of an echo each, half of them with a second one `apart` FWHM later, and their truth (n, 2).
+
+    unit: noise is NOISE, and a count one of these.
+    """
     rng = np.random.default_rng(seed)
     peak, delay, sigma = measures(shape, width)
     x = np.arange(int(max(80, 36 * width)))
@@ -41,7 +44,7 @@ def draw(shape, width, n, seed, apart=0.0, rho=0.0):
     y = BASELINE + NOISE * (white[:, 1:] + rho * white[:, :-1]) / np.sqrt(1 + rho * rho)
     for echo in range(2):
         y += amplitude[:, echo, None] / peak * pulse(shape, x - time[:, echo, None], width)
-    block = WaveformBlock.from_samples(np.clip(np.rint(y), 0, 65535).astype(np.uint16))
+    block = WaveformBlock.from_samples(np.clip(np.rint(y / unit), 0, 65535).astype(np.uint16))
     return block, amplitude, time + delay, sigma
 
 
@@ -87,3 +90,14 @@ def test_the_survey_finds_the_colour_of_the_noise(shape, width, rho):
     assert correlation[1:] == pytest.approx(np.zeros(len(correlation) - 1), abs=0.012)
     assert system.noise_by_kind["outside"] == pytest.approx(NOISE, rel=0.015)
     assert scatter(block, system, *truth, 1) == pytest.approx(np.ones(3), abs=0.12)
+
+
+@pytest.mark.parametrize("unit", [5.0, 5.2, 5.4, 5.5])
+def test_whole_counts_are_no_correlation_no_tail_and_no_less_noise(unit):
+    """Where a count is more than the noise, medians are up to half a count off, and quantiles half of the spread."""
+    block, *_ = draw("gaussian", 2.0, 4000, 6, unit=unit)
+    system = survey_block(block).system
+    assert not system.components
+    assert system.noise_std == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)
+    assert system.correlation == pytest.approx(np.zeros(len(system.correlation)), abs=0.02)
+    assert system.noise_by_kind["outside"] == pytest.approx(np.hypot(NOISE / unit, 0.2887), rel=0.02)

@@ -77,6 +77,11 @@ def test_fits_stop_growing_only_where_next_to_nothing_overlaps(survey, grows):
     assert decision.needed is grows and decision.reason
 
 
+def test_a_share_of_a_small_sample_is_at_most_all():
+    reasons = [decision.reason for decision in decide(_survey(overlapped_share=0.8, empty_share=0.0, waveforms=5))]
+    assert any("at most 100.00 % by this sample" in reason for reason in reasons)
+
+
 def test_no_widths_of_an_undersampled_pulse():
     decisions = (*DECISIONS[:3], Decision("echo width", False, "the system pulse is 0.64 samples wide (0.85)"))
     survey = _survey(decisions)

@@ -14,7 +14,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.surveying.measure import decompose_sample
+from wavebatch.surveying.measuring.residuals import decompose_sample
 from wavebatch.surveying.system_file import load_survey
 from wavebatch.surveying.systems import known_systems as module
 from wavebatch.surveying.systems.known_systems import compare_pulses, find_likeness, find_source, known_systems

@@ -1,7 +1,9 @@
 """Where a strip's sensor was: real and simulated strips, trajectory files right and wrong, what nobody can know."""
 
+import struct
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from wavebatch.core.waveforms import ReturnTable, WaveformBlock
 from wavebatch.files.las.crs import CrsUnits
 from wavebatch.files.strip.ray_sample import MOST_SLICES, RAYS_PER_SLICE, Rays, sample_rays
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor
+from wavebatch.surveying.sensor import SCANNER, UNKNOWN, SensorRequest, SensorSource, estimate_path, find_sensor
 from wavebatch.tools.simulate.geometry import START_TIME, Flight, trace_rays
 
 
@@ -38,7 +40,7 @@ def test_a_simulated_flight(found):
     told = found.describe()
     assert told["speed_m_s"] == pytest.approx(60.0, abs=0.1)
     assert told["heading_deg"] == pytest.approx(90.0, abs=1.0)
-    assert told["range_error_m"] < 0.01
+    assert told["range_error_m"] == pytest.approx(SCANNER * told["distance_m"], rel=0.05)
 
 
 def test_riegl(riegl):
@@ -57,6 +59,27 @@ def test_leica(leica):
     assert told["height_m"] == pytest.approx(726.8, abs=0.5)
     assert told["speed_m_s"] == pytest.approx(60.4, abs=1.0)
     assert told["range_error_m"] < 0.1
+
+
+def test_the_error_covers_the_origins_of_the_pulses_in_the_pulsewaves_file(riegl):
+    """Independent of the LAS file's vectors: .pls has where the clock of each pulse starts."""
+    source, content = find(riegl), riegl.with_suffix(".pls").read_bytes()
+    start, number = struct.unpack_from("<qq", content, 176)
+    scale, offset = struct.unpack_from("<dd", content, 224)
+    places = np.frombuffer(content, "<f8", 6, 256)
+    record = np.dtype([("time", "<i8"), ("wave", "<i8"), ("anchor", "<i4", 3), ("rest", "V20")])
+    pulses = np.frombuffer(content, record, number, start)
+    anchor = pulses["anchor"] * places[:3] + places[3:]
+    cloud = laspy.read(riegl)
+    order = np.argsort(pulses["time"])
+    time = pulses["time"][order] * scale + offset
+    at = np.clip(np.searchsorted(time, cloud.gps_time - 1e-6), 0, number - 1)
+    assert np.abs(time[at] - cloud.gps_time).max() < 1e-6
+    point = np.asarray(cloud.xyz)
+    by_vectors = np.linalg.norm(point - source.trajectory.at(np.asarray(cloud.gps_time)), axis=1)
+    off = by_vectors - np.linalg.norm(point - anchor[order][at], axis=1)
+    assert abs(off.mean()) < 1.2 * source.error and off.std() < 0.01
+    assert abs(off.mean()) > 0.5 * source.error  # and it is not simply large
 
 
 @pytest.mark.parametrize("name", ["riegl", "leica"])
@@ -228,7 +251,8 @@ def fly_roughly(rng, *, seconds=5.0, level=0.0, mounting=0.0, attitude=0.0, view
     rays = Rays(time, np.round(ground / rounding) * rounding, vectors, np.ones(len(time)))
     found = estimate_path(rays, "direction vectors")
     far = np.linalg.norm(ground - found.trajectory.at(time), axis=1) - np.linalg.norm(ground - sensor, axis=1)
-    return found.error, float(np.sqrt(np.nanmean(far**2)))
+    seen = found.error**2 - (SCANNER * found.distance) ** 2  # this scanner has no mirror that moves
+    return float(np.sqrt(seen)), float(np.sqrt(np.nanmean(far**2)))
 
 
 @pytest.mark.parametrize(
@@ -259,3 +283,17 @@ def test_few_windows_assume_what_an_aircraft_does_in_turbulent_air():
     claimed, true = fly_roughly(np.random.default_rng(1), seconds=1.4, level=0.3, rounding=0.001)
     still, _ = fly_roughly(np.random.default_rng(1), seconds=1.4, rounding=0.001)
     assert still > 0.003 and claimed > 0.6 * true
+
+
+@pytest.mark.parametrize("time", [0.0, 123.0])
+def test_a_trajectory_is_of_no_use_to_points_without_times(tmp_path, tiny_strip, edit_points, time):
+    """The advice was to give --trajectory, which was given."""
+
+    def stop_clock(points):
+        points["gps_time"] = time
+        return points
+
+    strip = edit_points(tiny_strip, tmp_path / "still.las", stop_clock)
+    with pytest.raises(InputError, match="no GPS times, or all the same; give --flight-height instead"):
+        find(strip, trajectory=write_trajectory(tmp_path / "t.csv"))
+    assert find(strip, height=800.0).kind == "flight height"

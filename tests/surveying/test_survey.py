@@ -11,7 +11,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.surveying import join_digitizers, survey_block, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.surveying.choose_chain import read_sample
-from wavebatch.surveying.measure import FIRST_LOOK
+from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 

@@ -404,6 +404,20 @@ def test_options_that_a_mode_does_not_use_are_refused(words, message):
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
 
 
+def test_a_small_strip_that_fails_is_no_time(tmp_path):
+    broken = tmp_path / "broken.las"
+    broken.write_bytes(b"LASF")
+    with pytest.raises(InputError, match=r"0\.las"):
+        jobs.run_small(broken, tmp_path / "small")
+
+
+@pytest.mark.parametrize("mode", ["--real", "--jobs-model"])
+def test_every_mode_takes_a_log_file(mode, tmp_path):
+    log = tmp_path / "night.log"
+    result = CliRunner().invoke(main, ["bench", mode, str(tmp_path / "no.las"), "--log-file", str(log)])
+    assert "no.las" in result.stderr and "has no meaning" not in result.stderr and "no.las" in log.read_text()
+
+
 def test_the_slowest_part_bounds_many_jobs():
     """A strip that is prepared alone; one process that writes; many strips hide the preparation."""
     parts = Parts(1_000_000, start=0.25, start_worker=0.5, prepare=1.0, single=10e-6, work=10e-6, write=0.5e-6,

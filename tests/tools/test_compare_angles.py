@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk import buckets
@@ -22,8 +22,8 @@ NAMES = ("incidence_angle", "incidence_angle_normals")
 CHAIN = "".join(
     f'[[chain]]\nstage = "{name}"\n'
     for name in ("noise.pooled", "detect.maximum", "decompose.adaptive", "attribute.position",
-                 "attribute.incidence_angle_normals", "attribute.incidence_angle")
-) + "divergence = 1.1\n"  # fmt: skip
+                 "attribute.incidence_angle", "attribute.incidence_angle_normals")
+).replace('incidence_angle"\n', 'incidence_angle"\ndivergence = 1.1\n') + "radius = 2.5\n"  # fmt: skip
 
 
 @pytest.fixture(scope="module")

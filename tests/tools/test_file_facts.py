@@ -1,6 +1,9 @@
 """What `wavebatch info` shows of any file, against laspy, and how a cloud was made."""
 
 import json
+import shlex
+import shutil
+from pathlib import Path
 
 import laspy
 import numpy as np
@@ -11,6 +14,7 @@ from writer_tools import data_file, write_source
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
+from wavebatch.tools.inspect.account import describe_account
 from wavebatch.tools.inspect.file_facts import describe_file
 
 
@@ -54,6 +58,43 @@ def test_a_cloud_shows_how_it_was_made(tiny_strip, tmp_path):
         assert line in shown
     document = json.loads(CliRunner().invoke(main, ["info", "--json", str(tmp_path / "tiny.laz")]).stdout)
     assert document == {"schema": "wavebatch.info/1", **facts}
+
+
+def test_the_command_that_is_shown_makes_the_cloud_again(tiny_strip, tmp_path, monkeypatch):
+    """It named neither what was written of the strip, nor the air, nor the energies of the pulses."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(tiny_strip, "a strip.las")
+    with laspy.open(tiny_strip) as strip:
+        (west, south, _), (east, north, _) = strip.header.mins, strip.header.maxs
+    Path("energy.txt").write_text("time energy\n" + "".join(f"{300_000_000 + k / 1e4:.4f} 1\n" for k in range(400)))
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    Path("area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    box = f"{west},{south},{east},{north}"
+    words = ["run", "a strip.las", "--columns", "+amplitude_normalized", "--where", "amplitude > 20 and not 'z' == 3",
+             "--drop-flags", "WEAK,AT_BOUND", "--classes", "0,1,2", "--bbox", box, "--polygon", "area.json",
+             "--points", "returns", "--attenuation", "0.3", "--attenuation-error", "0.1",
+             "--pulse-energy", "energy.txt"]  # fmt: skip
+    first = _make(words, "one")
+    again = shlex.split(describe_file(Path("one/a strip.laz"))["provenance"][0]["command"])
+    assert again[:2] == ["wavebatch", "run"] and again[3:5] == ["-o", "DIR"]
+    again = ["energy.txt" if word == "FILE" else word for word in again]  # an account has no names of such files
+    second = _make(["run", again[2], *again[5:], "--columns", "+amplitude_normalized"], "two")
+    assert first["counts"]["left_out"]["where"] and second["output"]["size"] == first["output"]["size"]
+    for key in ("options", "request", "counts"):
+        assert second[key] == first[key]
+
+
+def test_the_command_names_where_the_sensor_was():
+    sensor = {"trajectory": {"size": 9}, "lever_arm": [0.1, -0.2, 0.3], "crs": "EPSG:32633", "height": None}
+    command = describe_account({"request": {"chain": "auto", "sensor": sensor}})["command"]
+    assert command.endswith("--trajectory FILE --lever-arm 0.1,-0.2,0.3 --crs EPSG:32633")
+
+
+def _make(words, folder):
+    """The report of a run."""
+    done = CliRunner().invoke(main, [*words, "-o", folder])
+    assert done.exit_code == 0, done.stderr
+    return json.loads(Path(folder, "a strip.report.json").read_text())
 
 
 def test_headers_that_are_wrong_show():

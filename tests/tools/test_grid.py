@@ -202,3 +202,37 @@ def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, r
     assert "have no CRS" in _run(tmp_path / "c.las", "--statistic", "count", "-q", "-o", tmp_path / "x.tif").stderr
 
 
+
+
+RIPROCESS = (
+    'PROJCS["UTM_North zone 33",GEOGCS["UTM_North zone 33",DATUM["WGS84",SPHEROID["WGS84",6378137.000,298.257223563]],'
+    'PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]],PROJECTION["Transverse_Mercator"],'
+    'PARAMETER["latitude_of_origin",0],PARAMETER["central_meridian",15],PARAMETER["scale_factor",0.9996],'
+    'PARAMETER["false_easting",500000],PARAMETER["false_northing",0],UNIT["Meter",1],AXIS["Easting",EAST],'
+    'AXIS["Northing",NORTH],AXIS["Height [up]",UP]]'
+)
+"""As RIEGL writes it: a projected CRS with three axes."""
+
+
+def test_a_crs_with_an_axis_of_height_is_in_the_file_itself(rasterio, rng, tmp_path):
+    # GDAL wrote it to an .aux.xml of the temporary file's name, so the raster had no CRS and the folder a stray file.
+    _cloud(tmp_path / "a.las", rng, 100, wkt=RIPROCESS)
+    _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.las", "x.tif"}
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.crs.to_epsg() == 32633
+
+
+def test_a_crs_that_no_geotiff_can_hold_is_refused(rasterio, rng, tmp_path, monkeypatch):
+    _cloud(tmp_path / "a.las", rng, 100, wkt=RIPROCESS)
+    monkeypatch.setattr("wavebatch.files.geotiff_file._flatten", lambda crs: crs)
+    result = _run(tmp_path / "a.las", "--column", "height", "-o", tmp_path / "x.tif", code=2)
+    assert "cannot hold the CRS" in result.stderr and "--crs EPSG:n" in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["a.las"]
+
+
+def test_the_raster_of_a_real_strip_has_its_crs(rasterio, riegl, tmp_path):
+    assert CliRunner().invoke(main, ["run", str(riegl), "-o", str(tmp_path), "-q"]).exit_code == 0
+    _run(tmp_path / f"{riegl.stem}.laz", "--column", "echo_width", "--size", 2, "-o", tmp_path / "x.tif")
+    with rasterio.open(tmp_path / "x.tif") as found:
+        assert found.crs.to_epsg() == 32633

@@ -24,7 +24,7 @@ from wavebatch.tools.html.drawing.charts import draw_histogram, draw_values
 from wavebatch.tools.html.drawing.png import color_cells, encode_png
 from wavebatch.tools.html.drawing.svg import Axis, Chart, log_ticks, round_ticks
 from wavebatch.tools.html.outliers import FIGURES, find_outliers
-from wavebatch.tools.html.strip_part import list_sums
+from wavebatch.tools.html.strip_part import draw_sums
 
 
 def _run(*arguments, code=0):
@@ -53,7 +53,7 @@ def test_the_page_of_a_run_has_every_part_and_its_counts_are_those_of_the_report
     assert [name for name in wanted if name not in shown.headings] == []
     for name in ("points_in", "waveforms", "echoes", "matched_returns", "added_echoes", "points_out"):
         assert shown.row(name)[1] == f"{report['counts'][name]:,}"
-    assert "does not add up" not in shown.text and shown.text.count("adds up") == 4 * 3
+    assert "does not add up" not in shown.text and shown.text.count("adds up") == 7 * 3
     assert shown.text.count("broken.las") >= 2
     assert 'a <b>&"1\'.las' in shown.text  # shown as it is, never as markup
     assert "<b>&" not in shown.source
@@ -119,8 +119,21 @@ def test_the_page_of_a_calibration(tmp_path):
 
 def test_counts_that_do_not_add_up_are_marked(flight):
     counts = json.loads((flight / "run.json").read_text())["counts"]
-    assert "does not add up" not in list_sums(counts)
-    assert list_sums({**counts, "echoes": counts["echoes"] + 1}).count("does not add up") == 2
+    assert "does not add up" not in draw_sums(counts, "echoes")
+    assert draw_sums({**counts, "echoes": counts["echoes"] + 1}, "echoes").count("does not add up") == 2
+
+
+@pytest.mark.parametrize("points", ["echoes", "returns"])
+def test_the_sums_of_a_page_hold_with_points_left_out(points, tiny_strip, tmp_path):
+    for name in ("a.las", "b.las"):
+        shutil.copy(tiny_strip, tmp_path / name)
+    _run("run", tmp_path, "-o", tmp_path / "out", "--points", points, "--where", "amplitude > 60",
+         "--html", tmp_path / "r.html", "--report", tmp_path / "r.json")  # fmt: skip
+    shown, counts = Page(tmp_path / "r.html").check(), json.loads((tmp_path / "r.json").read_text())["counts"]
+    left = counts["left_out"]["where"]
+    assert left and "does not add up" not in shown.text
+    assert shown.row("left out: where")[1] == f"{left:,}"
+    assert f"- {left:,} left out: where" in shown.text
 
 
 @pytest.mark.parametrize(
@@ -140,6 +153,12 @@ def test_a_page_that_cannot_be_written_does_not_hide_the_clouds(tiny_strip, tmp_
     monkeypatch.setattr("wavebatch.tools.html.run_page.write_page", lambda *_: 1 / 0)
     result = _run("run", tiny_strip, "-o", tmp_path / "out", "--html", tmp_path / "r.html", code=1)
     assert "error: --html: ZeroDivisionError" in result.stderr and (tmp_path / "out" / "tiny.laz").exists()
+
+
+def test_a_page_that_cannot_be_written_does_not_hide_the_survey(tiny_strip, tmp_path, monkeypatch):
+    monkeypatch.setattr("wavebatch.tools.html.survey_page.write_page", lambda *_: 1 / 0)
+    result = CliRunner().invoke(main, ["survey", str(tiny_strip), "--html", str(tmp_path / "s.html")])
+    assert result.exit_code == 1 and "ZeroDivisionError" in result.stderr and "decisions" in result.stdout
 
 
 def test_without_the_option_nothing_of_it_is_imported(tiny_strip, tmp_path):

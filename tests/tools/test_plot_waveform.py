@@ -27,7 +27,7 @@ from wavebatch.tools.plots.draw_waveform import ECHO, _draw_panels
 from wavebatch.tools.plots.echo_table import list_echoes
 from wavebatch.tools.plots.labels import place_labels
 from wavebatch.tools.plots.packets import MOST, Wanted, find_places
-from wavebatch.tools.plots.waveform import build_views, read_views
+from wavebatch.tools.plots.waveform import add_ranges, build_views, read_views
 
 KAPPA = 0.15
 
@@ -383,3 +383,13 @@ def test_a_sheet_shows_waveforms_without_echo_and_saturated_ones(tmp_path):
     draw_sheet(views, tmp_path / "s.svg", strip="a.las", chain="test")
     text = (tmp_path / "s.svg").read_text("utf-8")
     assert "SATURATED" in text and "no echo" in text and "3 waveforms" in text
+
+
+def test_a_listed_range_has_the_error_of_the_sensor_too(tiny_strip):
+    with StripReader(tiny_strip) as reader, reader.scan() as scan:
+        places = find_places(reader, scan, Wanted(packets=((0, 5),)), None)
+        chain, fill, error = add_ranges(load_profile("balanced"), reader, scan)
+        assert error > 0.05  # the error of a fit is millimetres
+        views = read_views(reader, scan, places, chain, replace(PULSE, sensor_error=error), None, fill)
+    places = [line.split("\N{PLUS-MINUS SIGN}")[-1].split()[0] for line in list_echoes(views).splitlines()[1:]]
+    assert places and all(float(place) == pytest.approx(error, rel=0.1) for place in places)

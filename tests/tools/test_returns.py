@@ -85,6 +85,20 @@ def test_times_that_are_all_alike_are_not_used(tmp_path):
     assert (found.pulses, found.pulses_by) == (240, "return_number")
 
 
+@pytest.mark.parametrize("missing", [np.nan, 0.0])
+def test_points_without_a_time_are_not_one_pulse(tmp_path, missing, monkeypatch):
+    # Ten times the small cloud at times of their own; the pulse of three returns has lost its time in each.
+    parts = {name: np.tile(values, 10) for name, values in SMALL.items()}
+    parts["time"] = parts["time"] + 10.0 * np.repeat(np.arange(10), 7)
+    parts["time"][np.tile(np.arange(7) < 3, 10)] = missing
+    (found,), _ = count_returns([write_cloud(tmp_path / "a.las", **parts)])
+    assert (found.pulses, found.pulses_by) == (40, "gps_time") and found.by_count[3] == pytest.approx(0.25)
+    assert found.warnings[0].startswith("30 points have no GPS time (0 or NaN)")
+    monkeypatch.setattr(buckets, "BUCKET_ROWS", 5)
+    (again,), _ = count_returns([tmp_path / "a.las"])
+    assert again.by_count == found.by_count
+
+
 def test_buckets_and_pieces_change_nothing(tmp_path, monkeypatch):
     receiver = DiscreteReceiver(most=3)
     simulate_returns("canopy.orion-22", tmp_path / "c.laz", pulses=3000, receiver=receiver)

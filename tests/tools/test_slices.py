@@ -2,15 +2,19 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from strips import cut_strip
 
+from wavebatch.cli import main
 from wavebatch.cli.slice import slice_
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import WaveformBlock
-from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.las.header import read_header
+from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.tools.simulate import simulate_strip
 from wavebatch.tools.simulate.geometry import EAST, GROUND, NORTH, Flight
 from wavebatch.tools.slices import lines
@@ -298,3 +302,32 @@ def test_the_level_is_that_without_signal_where_signal_fills_most_of_the_wavefor
     block = WaveformBlock.from_samples(samples, bits=8, spacing=1.0)
     values = lines._shape(block).values.reshape(3, 100)
     assert values[:, 0].tolist() == [0.0] * 3 and values[:, -1].tolist() == [48.0] * 3
+
+
+def test_the_scan_of_each_strip_is_closed(strip, tmp_path, monkeypatch):
+    """It holds temporary files, which stayed until the end of the command."""
+    closed, close = [], StripScan.close
+    monkeypatch.setattr(StripScan, "close", lambda scan: closed.append(scan) or close(scan))
+    assert run(strip, "-o", tmp_path / "s.csv", "--lines", "1", "-q").exit_code == 0 and len(closed) == 1
+
+
+def test_noise_holds_no_surface(tmp_path, rng):
+    # Water and sky: every waveform is noise. Two standard deviations of such a slice are two of the noise.
+    strip = tmp_path / "noise.las"
+    simulate_strip("flat", strip, pulses=1500, seed=2)
+    content = np.frombuffer(strip.read_bytes(), np.uint8).copy()
+    start = read_header(strip).waveform_start + 60
+    content[start:] = np.rint(rng.normal(20, 1, len(content) - start))
+    strip.write_bytes(content.tobytes())
+    for more in ([], ["--sigma", "2"], ["--geometry", "time"]):
+        done = CliRunner().invoke(main, ["slice", str(strip), "-o", str(tmp_path / "x.csv"), "--overwrite", *more])
+        assert done.exit_code == 0 and f"{strip}: 0 segments in " in done.stderr, done.stderr
+
+
+def test_strips_too_short_for_a_scan_line_say_so(tiny_strip, tmp_path):
+    short = cut_strip(tiny_strip, tmp_path / "short.las", 5)
+    done = CliRunner().invoke(main, ["slice", str(short), "-o", str(tmp_path / "x.csv")])
+    assert done.exit_code == 1 and re.search(r"has \d pulses, a scan line to find surfaces in needs 8", done.stderr)
+    none = cut_strip(tiny_strip, tmp_path / "none.las", 0)
+    done = CliRunner().invoke(main, ["slice", str(none), "-o", str(tmp_path / "y.csv")])
+    assert done.exit_code == 0 and "none.las: has no waveform, so no scan line\n" in done.stderr

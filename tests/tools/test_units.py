@@ -1,6 +1,7 @@
 """Distances are metres whatever the unit of the coordinates is: state planes are in feet."""
 
 import json
+import re
 import shutil
 import struct
 
@@ -12,6 +13,7 @@ from wavebatch.cli import main
 from wavebatch.files.las.crs import metres_per_unit, parse_wkt
 from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import build_wkt
+from wavebatch.tools.html.cloud_pictures import picture_cloud
 from wavebatch.tools.simulate import simulate_strip
 
 FOOT = 1200 / 3937
@@ -107,3 +109,18 @@ def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
     simulate_strip("forest", tmp_path / "strip.las", pulses=1500, seed=1)
     add_record(tmp_path / "strip.las", build_wkt(FEET))
     _print("run", tmp_path / "strip.las", "-o", tmp_path / "o", "--profile", "fast")
+
+
+@pytest.mark.parametrize(("unit", "name"), [("m", "m"), ("ft", "us-ft"), ("deg", "deg")])
+def test_maps_of_report_pages_name_the_unit(clouds, unit, name):
+    maps = picture_cloud(clouds[unit], ["amplitude"])[1]
+    assert len(maps) == 2 and all(f"{name} east" in one and re.search(rf"cells of \S+ {name};", one) for one in maps)
+    assert f"1/{name}2;" in maps[0]
+
+
+@pytest.mark.parametrize("unit", ["ft", "deg"])
+def test_no_waveforms_are_modelled_with_distances_in_another_unit(clouds, tmp_path, unit):
+    """Echoes of a cloud in feet were 3.3 times too far apart in time."""
+    said = _print("synthesize", clouds[unit], "-o", tmp_path / "a.las", code=1).stderr
+    assert said.count("\n") == 1 and "project it to metres first" in said and not list(tmp_path.iterdir())
+    _print("synthesize", clouds["m"], "-o", tmp_path / "a.las", "-q")

@@ -2,8 +2,9 @@
 
 How one strip flows through the modules:
 
-1. `files.inputs` lists the strips. `preflight` checks memory and the names of the outputs, before anything is read.
-2. `run` keeps the workers busy: `processes` on this machine, or a `dask_cluster`. It opens a `strip_task` per strip,
+1. `files.inputs` lists the strips; a `job` says what is asked of one. `preflight` checks memory and the names of the
+   outputs, before anything is read.
+2. `run` keeps the `workers` busy: processes of this machine, or a dask cluster. It opens a `strip_task` per strip,
    writes results in order, and keeps a strip that fails from stopping the others.
 3. `strip_task` sends the preparation, then unit after unit, to the workers, writes their rows and publishes
    the cloud.

@@ -150,24 +150,14 @@ class RunReport:
         StageError
             Where a sum differs.
         """
-        get, passed = self.count, self.passed_through
-        sums = {
-            "points_in": get("points_with_waveform") + get("points_without_waveform") + get("points_broken"),
-            "points_with_waveform": get("matched_returns") + get("unmatched_returns") + get("no_echo_returns"),
-            "points_without_waveform": passed.get("NO_WAVEFORM", 0),
-            "points_broken": passed.get("BROKEN_PACKET", 0),
-            "no_echo_returns": passed.get("NO_ECHO", 0) - get("unmatched_returns"),
-            "echoes": get("matched_returns") + get("added_echoes"),
-            "points_out": get("echoes" if points == "echoes" else "matched_returns")
-            + sum(passed.values())
-            - sum(self.left_out.values()),
-            "waveforms": int(self.echoes_per_waveform.sum()),
-        }
-        by_reason = [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
-        for name, total in [*sums.items(), *by_reason]:
-            if get(name) != total:
+        counts = self.to_json()["counts"]
+        totals = [(name, sum(parts.values())) for name, parts in list_sums(counts, points).items()]
+        totals.append(("waveforms", int(self.echoes_per_waveform.sum())))
+        totals += [("echoes", sum(reasons.values())) for reasons in self.no_data.values()]
+        for name, total in totals:
+            if counts[name] != total:
                 raise StageError(
-                    f"{where}: {name} is {get(name)} but its parts add up to {total}; nothing was written for this "
+                    f"{where}: {name} is {counts[name]} but its parts add up to {total}; nothing was written for this "
                     "strip, please report it as a bug"
                 )
 
@@ -213,6 +203,41 @@ class RunReport:
 
 
 _PASSED = (EchoFlag.NO_WAVEFORM.name, EchoFlag.BROKEN_PACKET.name, EchoFlag.NO_ECHO.name)
+
+
+def list_sums(counts: Mapping[str, Any], points: str) -> dict[str, dict[str, int]]:
+    """List the counts that are sums of others.
+
+    Parameters
+    ----------
+    counts : mapping
+        The `counts` of `RunReport.to_json`.
+    points : str
+        What was written: "echoes" or "returns".
+
+    Returns
+    -------
+    dict of str to dict of str to int
+        By name of the count, its parts with their numbers; what is taken away is negative.
+    """
+    passed = {f"passed through: {name}": number for name, number in counts["passed_through"].items()}
+    left = {f"left out: {name}": -number for name, number in counts["left_out"].items()}
+
+    def take(*names: str) -> dict[str, int]:
+        return {name: counts[name] for name in names}
+
+    def take_passed(flag: EchoFlag) -> dict[str, int]:
+        return {name: number for name, number in passed.items() if name.endswith(f" {flag.name}")}
+
+    return {
+        "points_in": take("points_with_waveform", "points_without_waveform", "points_broken"),
+        "points_with_waveform": take("matched_returns", "unmatched_returns", "no_echo_returns"),
+        "points_without_waveform": take_passed(EchoFlag.NO_WAVEFORM),
+        "points_broken": take_passed(EchoFlag.BROKEN_PACKET),
+        "no_echo_returns": {**take_passed(EchoFlag.NO_ECHO), "unmatched_returns": -counts["unmatched_returns"]},
+        "echoes": take("matched_returns", "added_echoes"),
+        "points_out": {**take("echoes" if points == "echoes" else "matched_returns"), **passed, **left},
+    }
 
 
 def count_flags(flags: np.ndarray) -> dict[str, int]:

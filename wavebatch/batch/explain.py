@@ -12,8 +12,10 @@ from wavebatch.batch.counts import AMPLITUDE_BINS, LEFT_OUT, RunReport
 from wavebatch.batch.selection import describe_extent
 from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
+from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
+from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
 
 _ANGLE = "incidence_angle"
@@ -90,8 +92,8 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        One line each: a forced survey of another sensor, a selection that leaves nothing, a chain that does not fit
-        the strip's pulse.
+        One line each: a forced survey of another sensor, a selection that leaves nothing, a strip without any waveform
+        or echo, a pulse that is a guess, a chain that does not fit the strip's pulse.
     """
     choice, echoes = prepared.choice, report.count("echoes")
     lines = []
@@ -102,6 +104,8 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
             doubt = "the survey given by --system is of another sensor, or this is a hillside"
             lines.append(f"{doubt}: {prepared.forced}")
     lines += _miss_all(prepared, report)
+    lines += _find_nothing(prepared, report)
+    lines += _doubt_pulse(prepared, report)
     if not choice.doubted or not echoes:
         return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
@@ -120,6 +124,33 @@ def _miss_all(prepared: Prepared, report: RunReport) -> Iterator[str]:
         reasons = ", ".join(f"{n} {LEFT_OUT[name]}" for name, n in report.left_out.items() if n)
         place = describe_extent(prepared.layout, prepared.job.selection)
         yield f"no point is written: of {number}, {reasons}{place and '; ' + place}"
+
+
+def _find_nothing(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A strip without any waveform, or without any echo: its cloud has no attributes."""
+    points, waveforms, echoes = (report.count(name) for name in ("points_in", "waveforms", "echoes"))
+    if points and not waveforms:
+        yield f"none of {points} points has a waveform: all are written unchanged, without attributes"
+    elif waveforms >= LEAST_JUDGED and not echoes:
+        figures, system = prepared.choice.survey.figures, prepared.system
+        down = system.baseline - figures.get("least_count", system.baseline)
+        up = figures.get("largest_count", system.baseline) - system.baseline
+        reason = "nothing rises far enough above the noise"
+        if down > INVERTED * max(up, system.noise_std):
+            reason = f"the signal falls from {system.baseline:.0f} to {system.baseline - down:.0f} DN: it is inverted"
+        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
+
+
+def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
+    """A system pulse that is a guess, because the survey had too few echoes to measure it."""
+    figures, system = prepared.choice.survey.figures, prepared.system
+    alone = figures.get("isolated_echoes")
+    if report.count("echoes") and alone is not None and alone < FEW and "known_pulse_echoes" not in figures:
+        yield (
+            f"the survey found too few isolated echoes, {int(alone)} where {FEW} are needed: the system pulse is a "
+            f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of "
+            "echoes depend on it; give --system, a survey of a longer strip of this sensor"
+        )
 
 
 def _name_height(prepared: Prepared) -> Iterator[str]:
@@ -142,18 +173,10 @@ def _name_copied(prepared: Prepared, report: RunReport) -> Iterator[str]:
 
 
 def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
-    """Waveforms without any echo, and return locations that fit no echo."""
-    waveforms, echoes, matched = (report.count(name) for name in ("waveforms", "echoes", "matched_returns"))
+    """Return locations that fit no echo."""
+    matched = report.count("matched_returns")
     near = matched + report.count("unmatched_returns")
-    if waveforms >= LEAST_JUDGED and not echoes:
-        figures, system = prepared.choice.survey.figures, prepared.system
-        down = system.baseline - figures.get("least_count", system.baseline)
-        up = figures.get("largest_count", system.baseline) - system.baseline
-        reason = "nothing rises far enough above the noise"
-        if down > INVERTED * max(up, system.noise_std):
-            reason = f"the signal falls from {system.baseline:.0f} to {system.baseline - down:.0f} DN: it is inverted"
-        yield f"none of {waveforms} waveforms holds an echo: {reason}; `wavebatch survey` shows what the strip records"
-    elif near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
+    if near >= LEAST_JUDGED and matched < LEAST_MATCHED * near:
         yield (
             f"only {matched} of {near} returns lie where their packet has an echo: the strip's return locations (which "
             "should be picoseconds after the first sample) are doubtful, and so are the positions of added echoes"

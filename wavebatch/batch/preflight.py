@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch.job import StripJob, plan_layout
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.selection import RowSelector
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import StripJob, plan_layout
 from wavebatch.core.errors import ConfigError
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.surveying.flight import read_flight
@@ -74,11 +74,9 @@ def check_outputs(jobs: Sequence[StripJob], options: BatchOptions) -> None:
 
 
 def find_inputs(jobs: Sequence[StripJob]) -> list[Path]:
-    """Return the files that the jobs read."""
-    files = {
-        path for job in jobs for path in (job.path, job.sensor.trajectory, job.selection.polygon) if path is not None
-    }
-    return sorted({Path(path) for path in files})
+    """Return the files that the jobs read, also those that are read already: no output may replace them."""
+    read = {Path(job.selection.polygon) for job in jobs if job.selection.polygon is not None}
+    return sorted(read.union(*(job.files for job in jobs)))
 
 
 def find_outputs(job: StripJob, folder: Path) -> list[Path]:

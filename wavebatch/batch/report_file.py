@@ -17,7 +17,8 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.explain import explain_absence
-from wavebatch.batch.unit import Prepared, StripJob
+from wavebatch.batch.job import StripJob
+from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.text_file import write_text
@@ -57,9 +58,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
-    energy = job.pulse_energy
-    if energy is not None and Path(energy).is_file():
-        energy = take_fingerprint(Path(energy))
+    energy = job.pulse_energy if job.energy_file is None else take_fingerprint(job.energy_file)
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {

@@ -17,12 +17,12 @@ from typing import Any
 
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.dask_cluster import Cluster
+from wavebatch.batch.job import StripJob
 from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
-from wavebatch.batch.processes import WorkerDied, Workers
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import BatchOptions, StripTask
-from wavebatch.batch.unit import StripJob
+from wavebatch.batch.workers.dask_cluster import Cluster
+from wavebatch.batch.workers.processes import WorkerDied, Workers
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.protect import protecting
@@ -124,7 +124,8 @@ def run_batch(
     saved = load_flight(jobs, options)
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
-        workers = Cluster(options.scheduler, options.folder, find_inputs(jobs), on_event)
+        files = sorted({file for job in jobs for file in job.files})
+        workers = Cluster(options.scheduler, options.folder, files, on_event)
     with protecting(find_inputs(jobs)), workers:
         with reporting(options.folder):
             options.folder.mkdir(parents=True, exist_ok=True)
@@ -306,5 +307,6 @@ class _Batch:
             more = {"counts": report["counts"], "remarks": report["remarks"], "warnings": strip.warnings}
             more["serious"] = list(strip.serious)
             if strip.prepared is not None:
-                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": list(strip.prepared.doubts)}
+                lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
+                more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
             self._tell({**event, **more})

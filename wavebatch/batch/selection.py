@@ -31,7 +31,7 @@ from wavebatch.files.las.checked_header import CheckedHeader
 from wavebatch.files.las.point_formats import ANGLE_UNIT
 from wavebatch.stages.chain import STAGES, Chain
 
-_WITHOUT_STAGE = ("echo_time", "echo_flags")
+WITHOUT_STAGE = ("echo_time", "echo_flags")
 """Columns that need no attribute stage."""
 
 _FLAGS = "echo_flags"
@@ -197,7 +197,7 @@ class RowSelector:
     def _names(self) -> dict[str, dict[str, str]]:
         """Names that --where may use, by kind, each with what it stands for; the first kind that has a name counts."""
         made = [name for name in self.chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
-        computed = {name: name for name in [*made, *_WITHOUT_STAGE]}
+        computed = {name: name for name in [*made, *WITHOUT_STAGE]}
         standard = {name: name for name in list_fields(self.layout.point_format)}
         standard |= {"scan_angle": "scan_angle", "scan_angle_rank": "scan_angle"}
         fields = zip(self.layout.carried, self.layout.extra_fields, strict=False)

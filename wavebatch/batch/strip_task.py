@@ -18,12 +18,13 @@ from typing import Any
 
 from wavebatch.batch import report_file
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.dask_cluster import Cluster
 from wavebatch.batch.explain import find_remarks, find_warnings
+from wavebatch.batch.job import StripJob
 from wavebatch.batch.neighbour_pass import SecondPass, process_tile
-from wavebatch.batch.processes import Workers
 from wavebatch.batch.row_transfer import RowStream, process_unit_shared
-from wavebatch.batch.unit import Prepared, StripJob, prepare_strip
+from wavebatch.batch.unit import Prepared, prepare_strip
+from wavebatch.batch.workers.dask_cluster import Cluster
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.cloud.writer import CloudWriter
 from wavebatch.files.disk.fingerprint import take_fingerprint

@@ -1,6 +1,6 @@
 """The work in a worker process: prepare a strip, and take one of its units from packets to output rows.
 
-`strip_task` submits `prepare_strip` once per strip and `process_unit` for each unit; `cli.run` builds the StripJob.
+`strip_task` submits `prepare_strip` once per strip and `process_unit` for each unit.
 Before you change it: all that travels between processes must be picklable, and rows must not depend on block size.
 """
 
@@ -11,27 +11,26 @@ import pickle
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wavebatch.batch.counts import RunReport
-from wavebatch.batch.output_rows import NEEDED, assemble_echoes, assemble_returns, gather_echoes
-from wavebatch.batch.selection import RowSelector, Selection
+from wavebatch.batch.job import StripJob, plan_layout
+from wavebatch.batch.output_rows import assemble_echoes, assemble_returns, gather_echoes
+from wavebatch.batch.selection import RowSelector
 from wavebatch.core.echoes import COLUMNS, RAY, EchoTable
-from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.core.suggest import nearest
+from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Unit
-from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.stages.chain import Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
 from wavebatch.surveying.calibrating.strip_match import match_strip
-from wavebatch.surveying.calibration import Calibration, needs_sensor, with_columns, with_physics
-from wavebatch.surveying.choose_chain import Choice, Request, make_choice, try_chain
+from wavebatch.surveying.calibration import needs_sensor
+from wavebatch.surveying.choose_chain import Choice, make_choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, judge_scale, refuse_units
@@ -45,80 +44,6 @@ USUAL_SAMPLES = 256
 
 LARGEST_HEIGHT_ERROR = 0.3
 """Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
-
-_ALWAYS = ("echo_time", "echo_flags")
-"""Columns that need no attribute stage."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunOptions:
-    """Options of a run that change what is written."""
-
-    direction: str = "auto"
-    headerless: bool = False
-    points: str = "echoes"
-    format: str = "laz"
-    point_format: int | None = None
-    las_version: str = "1.4"
-    names: str = "wavebatch"
-    no_data: str = "-9999"
-    strict: bool = False
-    columns: tuple[str, ...] = ()
-    """Columns to write, in order; see `choose_columns`."""
-    keep_packets: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class StripJob:
-    """A strip to process and how; picklable."""
-
-    path: Path
-    chain: Chain
-    """The chain, or the widest that may be chosen."""
-    options: RunOptions
-    request: Request = Request()
-    """How pulse and chain are chosen."""
-    sensor: SensorRequest = SensorRequest()
-    """Where the sensor's positions come from; used only if the chain needs them."""
-    calibration: Calibration | None = None
-    attenuation: tuple[float, float] | None = None
-    """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
-
-    pulse_energy: str | None = None
-    """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
-    selection: Selection = Selection()
-    """What is written."""
-
-    def extend(self, chain: Chain) -> Chain:
-        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
-        columns that are asked for.
-        """
-        sources = (self.calibration, self.request.system and self.request.system.survey.system)
-        divergence = any(source is not None and source.divergence is not None for source in sources)
-        given = self.sensor != SensorRequest()
-        chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
-        return with_columns(chain, (*self.options.columns, *self.selection.list_wanted()))
-
-    def calibrate(self, system: SystemPulse) -> SystemPulse:
-        """Return the system pulse with the job's calibration and air, if it has them."""
-        system = system if self.calibration is None else self.calibration.apply(system)
-        if self.attenuation is None:
-            return system
-        value, error = self.attenuation
-        return replace(system, attenuation=value, attenuation_error=error)
-
-    def absolute(self) -> StripJob:
-        """Return the job with absolute paths, for processes that work in another folder."""
-        file = self.sensor.trajectory
-        sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        energy = self.pulse_energy
-        if energy is not None and Path(energy).is_file():
-            energy = str(Path(energy).absolute())
-        return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
-
-    def open(self) -> StripReader:
-        """Open the strip; raises InputError where it cannot be read."""
-        return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,78 +106,6 @@ def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
     """Columns that rows carry for a second pass, and the cloud does not get: those of late steps, then the rays."""
     hidden = (name for step in late for name in step.stage.makes if not COLUMNS[name].extra_bytes)
     return (*hidden, *RAY)
-
-
-def name_columns(wanted: str | None) -> tuple[str, ...]:
-    """List the columns that a value of --columns names, in order."""
-    return tuple(entry.strip().removeprefix("+") for entry in (wanted or "").split(",") if entry.strip(" +"))
-
-
-def split_columns(wanted: str | None) -> list[str]:
-    """Return the entries of --columns, with their `+`."""
-    return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
-
-
-def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
-    """Choose the columns to write.
-
-    Parameters
-    ----------
-    chain : Chain
-    wanted : str, optional
-        `a,b` writes these columns only, `+a,+b` adds them. By default all columns of the chain and the flags.
-
-    Returns
-    -------
-    tuple of str
-
-    Raises
-    ------
-    ConfigError
-        Where a column does not exist or the chain does not compute it, and for a chain without positions.
-    """
-    missing = [name for name in NEEDED if name not in chain.makes]
-    if missing:
-        raise ConfigError(
-            f"chain {chain.name}: computes no {', '.join(missing)}, which every point needs; add a "
-            '[[chain]] table with stage = "attribute.position"'
-        )
-    computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
-    default = [*computed, "echo_flags"]
-    entries = split_columns(wanted)
-    added = [entry[1:] for entry in entries if entry.startswith("+")]
-    chosen = [entry for entry in entries if not entry.startswith("+")]
-    if wanted is not None and not entries:
-        raise ConfigError("--columns: names no column; leave it out for the usual ones, or write a,b or +a,+b")
-    for name in [*chosen, *added]:
-        _check_column(name, (*computed, *_ALWAYS))
-    return tuple(dict.fromkeys([*(chosen or default), *added]))
-
-
-def _check_column(name: str, available: tuple[str, ...]) -> None:
-    known = [column.name for column in COLUMNS.values() if column.extra_bytes]
-    if name not in known:
-        raise ConfigError(f"--columns: column {name!r} does not exist; {nearest(name, known)}")
-    if name not in available:
-        makers = [stage.name for stage in STAGES.values() if name in stage.makes]
-        remedy = f"add stage {' or '.join(makers)} to it" if makers else "no stage of this version does"
-        raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
-
-
-def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
-    """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
-    options = job.options
-    return plan_output(
-        facts,
-        options.columns,
-        point_format=options.point_format,
-        las_version=options.las_version,
-        packets=facts if options.keep_packets else None,
-        names=options.names,
-        no_data=options.no_data,
-        points=options.points,
-        strict=options.strict,
-    )
 
 
 def prepare_strip(job: StripJob) -> Prepared:

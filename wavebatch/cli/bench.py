@@ -5,7 +5,6 @@ Only reads options and prints; the measurements are in `wavebatch.tools.bench`.
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from wavebatch.cli.messages import one_line, print_json, print_result, talk
+from wavebatch.cli.messages import format_json, one_line, print_json, print_result, talk
 from wavebatch.cli.options import (
     check_html,
     common_options,
@@ -35,7 +34,7 @@ _MODES = {
     "jobs_model": ("scenes", "pulses", "repeats", "seed"),
 }
 """Modes that measure something else, and the options that they use."""
-_ALWAYS = ("files", "output", "html_file", "as_json", "quiet", "log_file", "log_level", "debug")
+_ALWAYS = ("files", "output", "html_file", "as_json", "quiet", "log_path", "log_level", "debug")
 
 JOBS_PULSES = 600_000
 """Of the strip of --jobs-model: more than ten units."""
@@ -110,22 +109,8 @@ def bench(
     strips = [path for path in files if path.suffix.lower() != ".toml"]
     silent = options["quiet"] or not sys.stderr.isatty()
     say = (lambda text: None) if silent else talk
-    if options["real"]:
-        if not strips or len(strips) < len(files):
-            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
-        _bench_real(strips, output, html_file, options, say)
-        return
-    if against is not None:
-        if html_file is not None:
-            raise click.UsageError("--against has no page: leave --html out; -o writes its table")
-        _bench_against(against, strips, files, output, options, say)
-        return
-    if options["jobs_model"]:
-        if html_file is not None or len(files) > 1 or len(strips) < len(files):
-            raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
-        if len(options["scenes"]) > 1:
-            raise click.UsageError(f"--jobs-model times one scene, not {len(options['scenes'])}; give --scene once")
-        _bench_jobs(strips, output, options, say)
+    if options["real"] or options["jobs_model"] or against is not None:
+        _bench_mode(files, strips, output, against, html_file, options, say)
         return
     if len(strips) > 1:
         raise click.UsageError(f"one strip at a time, not {len(strips)}; chain files end in .toml")
@@ -149,6 +134,27 @@ def bench(
         write_bench_page(html_file, document, text)
         talk(f"{html_file}: written")
     print_result(options["as_json"], document, [text])
+
+
+def _bench_mode(
+    files: Sequence[Path], strips: Sequence[Path], output: Path | None, against: Path | None, html_file: Path | None,
+    options: Mapping[str, Any], say: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Measures what --real, --against or --jobs-model asks for."""
+    if options["real"]:
+        if not strips or len(strips) < len(files):
+            raise click.UsageError("--real needs strips to measure, and no chain file: their surveys choose the chain")
+        _bench_real(strips, output, html_file, options, say)
+    elif against is not None:
+        if html_file is not None:
+            raise click.UsageError("--against has no page: leave --html out; -o writes its table")
+        _bench_against(against, strips, files, output, options, say)
+    else:
+        if html_file is not None or len(files) > 1 or len(strips) < len(files):
+            raise click.UsageError("--jobs-model times one strip by the automatic chain, and has no page")
+        if len(options["scenes"]) > 1:
+            raise click.UsageError(f"--jobs-model times one scene, not {len(options['scenes'])}; give --scene once")
+        _bench_jobs(strips, output, options, say)
 
 
 def _list_given(context: click.Context) -> dict[str, str]:
@@ -195,12 +201,7 @@ def _bench_against(
             named = simulate_strips(scenes, options["pulses"], options["seed"], Path(folder))
         found = compare_runs(other, named, options["repeats"], say=say)
     text, document = format_paired(other, found), to_document(other, found)
-    if output:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "against.txt").write_text(text + "\n")
-        (output / "against.json").write_text(json.dumps(document, indent=2) + "\n")
-        talk(f"wrote {output / 'against.txt'} and {output / 'against.json'}")
-    print_result(options["as_json"], document, [text], "against")
+    _show(options["as_json"], output, text, document, "against")
 
 
 def _bench_jobs(
@@ -221,12 +222,16 @@ def _bench_jobs(
         small = simulate_strips([scene], SMALL_PULSES, options["seed"], folder / "small")[scene]
         found = measure_jobs(strip, small, folder / "out", options["repeats"], say)
     text, document = format_jobs(strip.name, *found), to_document(strip.name, *found)
-    if output:
-        output.mkdir(parents=True, exist_ok=True)
-        (output / "jobs.txt").write_text(text + "\n")
-        (output / "jobs.json").write_text(json.dumps(document, indent=2) + "\n")
-        talk(f"wrote {output / 'jobs.txt'} and {output / 'jobs.json'}")
-    print_result(options["as_json"], document, [text], "jobs")
+    _show(options["as_json"], output, text, document, "jobs")
+
+
+def _show(as_json: bool, output: Path | None, text: str, document: Mapping[str, Any], mode: str) -> None:
+    """Prints the figures of a mode, and writes them as MODE.txt and MODE.json into the folder of -o."""
+    from wavebatch.tools.bench.report import write_texts
+
+    if output is not None:
+        talk(write_texts(output, {f"{mode}.txt": text, f"{mode}.json": format_json(document)}))
+    print_result(as_json, document, [text], mode)
 
 
 def _bench_real(

@@ -1,6 +1,6 @@
 """`wavebatch calibrate`: the calibration constant from targets of known reflectance.
 
-Only reads options and prints; the work is in `wavebatch.surveying.targets`.
+Only reads options and prints; the work is in `wavebatch.surveying.calibrating.targets`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import click
 
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
-from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
@@ -22,8 +21,8 @@ from wavebatch.files.inputs import find_files
 if TYPE_CHECKING:
     from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
     from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap
+    from wavebatch.surveying.calibrating.targets import CalibrationOptions
     from wavebatch.surveying.calibration import ChannelConstant, StripConstant, TargetResult
-    from wavebatch.surveying.targets import CalibrationOptions
 
 
 @click.command()
@@ -110,11 +109,9 @@ def calibrate(
 
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
-    from wavebatch.surveying.targets import CalibrationOptions
+    from wavebatch.surveying.calibrating.targets import CalibrationOptions
     from wavebatch.tools.api.run import find_request
 
-    if options["chain_file"] is not None and options["profile"] is not None:
-        raise ConfigError("--chain and --profile exclude each other; give one of them")
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     request = replace(request, force=options["force"])
     names = ("attenuation", "divergence", "reflectance_error", "direction")

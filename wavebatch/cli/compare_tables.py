@@ -27,9 +27,10 @@ def list_lines(result: Comparison) -> Iterator[str]:
         yield f"left out      A {result.left_out_a:>12}   B {result.left_out_b:>12}   by --where"
     yield from ("", f"echoes        A {result.echoes_a:>12}   B {result.echoes_b:>12}")
     yield f"identical     {result.matched:>14}   missed {result.missed}   extra {result.extra}"
-    yield f"completeness  {b:>14.4f}   correctness {a:.4f}"
-    yield f"identical are {a:>14.2%} of A's   {b:.2%} of B's   {result.identical:.2%} of both"
-    yield f"more points   {result.gain:>+14.2%} in A than in B"
+    yield f"completeness  {_known(b, '.4f'):>14}   correctness {_known(a, '.4f')}"
+    both = _known(result.identical, ".2%")
+    yield f"identical are {_known(a, '.2%'):>14} of A's   {_known(b, '.2%')} of B's   {both} of both"
+    yield f"more points   {_known(result.gain, '+.2%'):>14} in A than in B"
     if result.pulses:
         yield f"exact count   {result.exact_count:>14.4f}   of {count(result.pulses, 'pulse')}"
         yield from ("", "echoes per pulse")
@@ -51,6 +52,11 @@ def list_lines(result: Comparison) -> Iterator[str]:
             if one.number:
                 scaled = (one.rms_per_bound, one.nmad_per_bound, one.calibration, one.calibration_nmad)
                 yield row(f"{kind + ' ' + name:<23}", (one.number, one.bias, one.rmse, *scaled), ".4f")
+
+
+def _known(value: float, form: str) -> str:
+    """The value, or no-data: a share of no echoes."""
+    return "no-data" if math.isnan(value) else format(value, form)
 
 
 def _list_groups(kind: str, groups: dict[str, dict[str, Spread]], units: dict[str, str]) -> Iterator[str]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, printable
+from wavebatch.cli.messages import count, print_json, print_text, printable, talk
 from wavebatch.cli.options import common_options, for_each, recursive_option, strip_options, strips_argument
 from wavebatch.cli.program.completion import complete_files
 from wavebatch.files.inputs import find_files
@@ -40,9 +40,9 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
     these per line. Reads all points and a few thousand waveforms. Of a cloud that wavebatch wrote it shows command,
     chain, version and counts. --json prints one object for one file, else a list of them.
 
-    Exit code: 0 done, 1 a file cannot be read (the others are shown), 2 wrong usage.
+    Exit code: 0 done, 1 a file or its packets cannot be read (the others, and its points, are shown), 2 wrong usage.
     """
-    paths = find_files(strips, recursive=recursive)
+    paths, lost = find_files(strips, recursive=recursive), 0
 
     def show(path: Path) -> dict[str, Any]:
         facts = describe_file(path, **reading)
@@ -50,13 +50,17 @@ def info(strips: tuple[str, ...], recursive: bool, verbose: bool, as_json: bool,
             facts["pulse"] = _describe_pulse(path, **reading)
         if not as_json:
             lines = ["", *_list_lines(facts)][path == paths[0] :]
-            click.echo("\n".join(printable(part) for line in lines for part in line.split("\n")))
+            print_text("\n".join(printable(part) for line in lines for part in line.split("\n")))
+        if "packets" not in facts and facts["problems"]:  # points are shown, packets cannot be
+            nonlocal lost
+            lost += 1
+            talk(f"error: {path}: {facts['problems'][0]}")
         return facts
 
     results, failed = for_each(paths, show, debug=debug)
     if as_json:
         print_json(results[0] if len(paths) == 1 else results)
-    sys.exit(EXIT_UNREADABLE if failed else 0)
+    sys.exit(EXIT_UNREADABLE if failed or lost else 0)
 
 
 def _describe_pulse(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
@@ -102,11 +106,11 @@ def check(
         if as_json:
             continue
         for line in found.problems:
-            click.echo(printable(f"{found.file}: {line}"))
+            print_text(printable(f"{found.file}: {line}"))
         for line in found.notes:
-            click.echo(printable(f"{found.file}: note: {line}"))
+            print_text(printable(f"{found.file}: note: {line}"))
         if found.is_clean:
-            click.echo(printable(f"{found.file}: ok ({found.summary})"))
+            print_text(printable(f"{found.file}: ok ({found.summary})"))
     if as_json:
         print_json(results)
     sys.exit(0 if clean else EXIT_PROBLEMS)

@@ -19,7 +19,8 @@ import click
 
 from wavebatch.cli.messages import one_line, report_errors, talk
 from wavebatch.cli.program.completion import complete_files, complete_flags, complete_profiles
-from wavebatch.cli.program.log_file import LEVELS, begin_log, keep_level
+from wavebatch.cli.program.log_file import LEVELS, LOG, begin_log, keep_level
+from wavebatch.cli.program.settings import EXCLUSIVE, READ
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import protecting, refuse_input
 
@@ -163,7 +164,8 @@ sensor_options = together(
     click.option("--lever-arm", metavar="X,Y,Z", help="Offset from trajectory to scanner: forward, right, down [m]."),
     click.option("--crs", metavar="CRS", help="CRS of the strip, e.g. EPSG:32632; for a trajectory in degrees."),
     click.option("--flight-height", type=click.FloatRange(1.0, 100_000.0), metavar="M",
-                 help="Flight height above ground [m], used if neither trajectory nor vectors give the position."),
+                 help="Flight height above ground [m], used if the packet vectors do not give the position; not with "
+                 "--trajectory."),
 )  # fmt: skip
 
 _COMMON = {
@@ -199,9 +201,12 @@ def _protected(command: Callable) -> Callable:
 
     @functools.wraps(command)
     def call(*args: Any, **options: Any) -> Any:
-        inputs: list[Any] = []
-        outputs: dict[str, Any] = {}
         context = click.get_current_context()
+        _check_together(context)
+        inputs: list[Any] = list(context.meta.get(READ, ()))
+        outputs: dict[str, Any] = {}
+        if LOG in context.meta:
+            outputs[os.path.realpath(context.meta[LOG])] = [context.meta[LOG]]
         for parameter in context.command.params:
             value = context.params.get(parameter.name)
             if isinstance(parameter.type, OutputPath):
@@ -217,6 +222,21 @@ def _protected(command: Callable) -> Callable:
             return command(*args, **options)
 
     return call
+
+
+def _check_together(context: click.Context) -> None:
+    """Raises ConfigError for two options of which only one is possible, and for one that another one needs."""
+    given = {
+        option.name: max(option.opts, key=len)
+        for option in context.command.params
+        if context.params.get(option.name) is not None and context.params[option.name] is not False
+    }
+    for rivals in EXCLUSIVE:
+        names = [given[name] for name in rivals if name in given]
+        if len(names) > 1:
+            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
+    if "force" in given and "system_file" not in given:
+        raise ConfigError("--force is of no use without --system; leave it out")
 
 
 _NO_TOML = (".json", ".csv", ".html", ".las", ".laz", ".yaml", ".yml", ".xml", ".npz")
@@ -277,6 +297,11 @@ def parse_floats(text: str, form: str) -> tuple[float, ...]:
     return numbers
 
 
+def floats_reader(form: str) -> Callable[[click.Context, click.Parameter, str | None], tuple[float, ...] | None]:
+    """The callback of an option that takes numbers of this form, as `parse_floats`."""
+    return lambda context, parameter, text: None if text is None else parse_floats(text, form)
+
+
 def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
     """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
     if len(paths) == 1:
@@ -326,12 +351,10 @@ def read_calibration(options: Mapping[str, Any]) -> Calibration | None:
 
 
 def read_air(options: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError where they do not fit."""
+    """Attenuation and error of --attenuation or --visibility [dB/km]; ConfigError for options without use."""
     from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 
     given, visibility = options["attenuation"], options["visibility"]
-    if given is not None and visibility is not None:
-        raise ConfigError("--attenuation and --visibility exclude each other; give one of them")
     if options["wavelength"] is not None and visibility is None:
         raise ConfigError("--wavelength is of no use without --visibility; give that too")
     if options["attenuation_error"] is not None and given is None and visibility is None:

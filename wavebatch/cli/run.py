@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import sys
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ import click
 from wavebatch.cli.messages import (
     EXIT_USAGE,
     Interrupted,
-    Progress,
     count,
     format_json,
     one_line,
     print_json,
     print_safely,
+    print_text,
     printable,
     talk,
 )
@@ -36,9 +36,9 @@ from wavebatch.cli.options import (
     check_html,
     common_options,
     file_option,
+    floats_reader,
     html_option,
     output_option,
-    parse_floats,
     read_air,
     read_sensor,
     sensor_options,
@@ -48,6 +48,8 @@ from wavebatch.cli.options import (
     where_option,
 )
 from wavebatch.cli.program.completion import complete_flags, complete_written
+from wavebatch.cli.program.log_file import typed_command
+from wavebatch.cli.program.progress import Progress
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.protect import refuse_input
 
@@ -77,10 +79,6 @@ def _read_classes(context: click.Context, parameter: click.Parameter, text: str 
         raise click.BadParameter(f"{text!r} is no list of numbers such as 2,6") from None
 
 
-def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else parse_floats(text, "WEST,SOUTH,EAST,NORTH")
-
-
 @click.command()
 @strips_argument
 @output_option("Folder for clouds and reports; created if it does not exist.", "DIR", folder=True)
@@ -103,7 +101,7 @@ def _read_bbox(context: click.Context, parameter: click.Parameter, text: str | N
               help="Leave out points with one of these flags, e.g. RINGING_SUSPECT,WEAK; return numbers are counted "
               "without them.")
 @click.option("--classes", callback=_read_classes, metavar="LIST", help="Write only points of these classes, e.g. 2,6.")
-@click.option("--bbox", callback=_read_bbox, metavar="W,S,E,N",
+@click.option("--bbox", callback=floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
               help="Write only points of this part: west, south, east, north, in the coordinates of the strips.")
 @file_option("--polygon", metavar="FILE.geojson",
              text="Write only points inside these polygons, in WGS 84, in the CRS that the file names, or in the "
@@ -169,7 +167,7 @@ def run(**options: Any) -> None:
             _check_report(options["html_file"], jobs, batch_options, "--html")
             check_html(options["html_file"])
         if options["dry_run"]:
-            sys.exit(_dry_run(jobs, batch_options, options["as_json"]))
+            sys.exit(_dry_run(jobs, batch_options, options))
         sys.exit(_run(jobs, batch_options, options))
     except KeyboardInterrupt:
         text = "interrupted: finished clouds are complete, no partial file remains; --resume continues"
@@ -181,20 +179,13 @@ def _start_processes(options: dict[str, Any]) -> None:
     jobs = 1 if options["jobs"] is None else options["jobs"] or os.cpu_count() or 1
     # A limit of memory may allow fewer processes, and resume may find nothing to do.
     if jobs > 1 and not (options["memory"] or options["resume"] or options["dry_run"]):
-        from wavebatch.batch.processes import end_early, start_early
+        from wavebatch.batch.workers.processes import end_early, start_early
 
         click.get_current_context().call_on_close(end_early)  # where an option is wrong, no run takes them
         start_early(jobs)
 
 
 def _check_options(options: dict[str, Any]) -> None:
-    pairs = [("chain_file", "profile"), ("chain_file", "tolerance"), ("profile", "tolerance")]
-    pairs += [("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"), ("scheduler", "memory")]
-    given = {name for name, value in options.items() if value is not None and value is not False}
-    for first, second in pairs:
-        if {first, second} <= given:
-            names = [f"--{name.removesuffix('_file')}" for name in (first, second)]
-            raise ConfigError(f"{names[0]} and {names[1]} exclude each other; give one of them")
     report = options["report"]
     if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
         raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
@@ -269,10 +260,7 @@ def _run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     is_reported = _report(result.to_json(), options["report"]) and progress.is_written
     is_reported &= not options["as_json"] or _report(result.to_json(), "-")
     is_reported = _write_page(result, batch_options.folder, options) and is_reported
-    errors = [outcome.error for outcome in result.outcomes]
-    if errors and all(isinstance(error, ConfigError) for error in errors):
-        return EXIT_USAGE
-    return exit_code(result.failed, len(jobs)) or (0 if is_reported else EXIT_UNREPORTED)
+    return find_exit_code([outcome.error for outcome in result.outcomes]) or (0 if is_reported else EXIT_UNREPORTED)
 
 
 def _report(document: dict[str, Any], target: str | None) -> bool:
@@ -298,7 +286,7 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     from wavebatch.tools.html.run_page import write_run_page
 
     try:
-        write_run_page(target, result, folder, " ".join(map(shlex.quote, sys.argv)))
+        write_run_page(target, result, folder, typed_command(click.get_current_context()))
     except Exception as error:  # the clouds are written, whatever becomes of the page
         if options["debug"]:
             traceback.print_exc()
@@ -309,25 +297,31 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     return True
 
 
-def exit_code(failed: int, strips: int) -> int:
-    """0 if all strips are written, EXIT_NOTHING if none is, else EXIT_SOME_FAILED."""
-    if not failed:
-        return 0
-    return EXIT_NOTHING if failed == strips else EXIT_SOME_FAILED
+def find_exit_code(errors: Sequence[BaseException | None]) -> int:
+    """The exit code for the errors of the strips, None for those that are written; all wrong options are wrong usage.
+    """
+    failed = [error for error in errors if error is not None]
+    if not failed or len(failed) < len(errors):
+        return EXIT_SOME_FAILED if failed else 0
+    return EXIT_USAGE if all(isinstance(error, ConfigError) for error in failed) else EXIT_NOTHING
 
 
-def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
+def _dry_run(jobs: list[Any], batch_options: Any, options: dict[str, Any]) -> int:
     from wavebatch.batch.preflight import plan_strip
     from wavebatch.stages.chain_file import effective
 
-    failed, plans = 0, []
+    errors: list[BaseException | None] = []
+    plans, as_json = [], options["as_json"]
     for job in jobs:
         try:
             plan = plan_strip(job, batch_options)
         except Exception as error:
-            failed += 1
+            errors.append(error)
+            if options["debug"]:
+                traceback.print_exc()
             talk(f"error: {one_line(error)}")
             continue
+        errors.append(None)
         plans.append(plan)
         line = (
             f"{plan['strip']}: {plan['action']} {plan['output']}: {count(plan['points'], 'point')}, format "
@@ -335,14 +329,14 @@ def _dry_run(jobs: list[Any], batch_options: Any, as_json: bool) -> int:
             f"about {plan['estimated_bytes'] / 1e6:.1f} MB to write; columns {', '.join(plan['columns'])}"
         )
         if not as_json:
-            click.echo(printable(line))
+            print_text(printable(line))
     for line in () if as_json else click.get_current_context().meta.get("wavebatch.settings", ()):
-        click.echo(f"# setting: {line}")
+        print_text(f"# setting: {line}")
     by = jobs[0].request.describe(jobs[0].chain)
     if as_json:
         print_json({"strips": plans, "chosen_by": by, "chain": effective(jobs[0].chain)}, "plan")
-        return exit_code(failed, len(jobs))
+        return find_exit_code(errors)
     if by is not None:
         click.echo(f"\n# the chain is chosen per strip ({by}); the largest possible one:", nl=False)
     click.echo(f"\n{effective(jobs[0].chain)}", nl=False)
-    return exit_code(failed, len(jobs))
+    return find_exit_code(errors)

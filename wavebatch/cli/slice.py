@@ -32,6 +32,13 @@ from wavebatch.tools.slices.segments import Segment, SliceOptions, cut_slice, fi
 EXIT_SOME_FAILED = 1
 """Some strips failed."""
 
+_NOISE_FLOOR = 5.0
+"""Standard deviations of the noise above the lower quartile of a waveform, which lies 0.7 of them below its mean: one
+sample of noise in 100,000 is higher."""
+
+_ALL = (0, None)
+"""Span of all scan lines."""
+
 _SURVEYED = 2000
 """Waveforms from which the width of the pulse is measured: enough for 1 % of it."""
 
@@ -61,12 +68,12 @@ class Extras:
 @shared.output_option("Draw all segments of --lines in plan and in 3D.", "FILE", "--overview", required=False)
 @shared.output_option("Write the samples of --lines as a cube of line, pulse and time, for `wavebatch plot cube`.",
                       "FILE.npz", "--cube", required=False)
-@click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else (0, None),
+@click.option("--lines", callback=lambda context, parameter, text: shared.parse_span(text) if text else _ALL,
               metavar="N|FIRST:END", help="Scan lines, counted from 0; END is not included.  [default: all]")
 @click.option("--geometry", type=click.Choice(["plane", "time"]), default="plane", show_default=True,
               help="plane: slices are vertical planes; time: rows are pulses, columns times on one axis.")
 @click.option("--std", default=2.0, show_default=True, metavar="STD",
-              help="Search samples above this many standard deviations of the slice.")
+              help="Search samples above this many standard deviations of the slice, and above the noise.")
 @click.option("--sigma", type=float, metavar="NS",
               help="Standard deviation of the pulse [ns].  [default: surveyed from the strip]")
 @click.option("--shortest", default=20.0, show_default=True, metavar="PIXELS",
@@ -109,6 +116,8 @@ def slice_(
     extras = Extras(png, overview, cube)
     if output is None and not extras.targets:
         raise click.UsageError("give -o for the segments, --png or --overview for a picture, or --cube")
+    if options["geojson_crs"] == "keep" and (output is None or output.suffix.lower() != ".geojson"):
+        raise click.UsageError("--geojson-crs keep is of no use without -o FILE.geojson: other files keep the CRS")
     for target in extras.targets:
         refuse_existing(target, options["overwrite"])
     for picture in filter(None, (png, overview)):
@@ -129,19 +138,20 @@ def _slice(
     strip: Path, output: Path | None, lines: tuple[int, int | None], extras: Extras, options: dict[str, Any]
 ) -> dict[str, Any]:
     """Work on one strip; returns its counts and says them."""
-    with StripReader(strip, direction=options["direction"]) as reader:
+    with StripReader(strip, direction=options["direction"]) as reader, reader.scan() as scan:
         crs = None
         if output is not None and output.suffix.lower() == ".geojson":
             known = find_crs(reader.facts.crs, reader.facts.header.vlrs)
             crs = plan_crs(strip, known, options["geojson_crs"])
-        scan = reader.scan()
-        sigma = options["sigma"]
-        if sigma is None:
-            sigma = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system.sigma_ref
-        settings = shared.from_options(SliceOptions, options, sigma=sigma)
+        sigma, floor = options["sigma"], 0.0
+        if scan.with_waveform:
+            system = survey_blocks(reader.sample_blocks(scan, _SURVEYED), learn=False).system
+            sigma, floor = system.sigma_ref if sigma is None else sigma, _NOISE_FLOOR * system.noise_std
+        settings = shared.from_options(SliceOptions, options, sigma=2.0 if sigma is None else sigma, floor=floor)
         counts = _find(reader, scan, settings, output, lines, extras, crs, options["overwrite"])
     if not counts["lines"]:
-        talk(f"{strip}: has no scan line with a number in --lines")
+        none = "no scan line" if scan.with_waveform else "no waveform, so no scan line"
+        talk(f"{strip}: has {none}" + ("" if lines == _ALL else " with a number in --lines"))
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
     if not options["quiet"]:
         talk(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")

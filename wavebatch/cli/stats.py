@@ -16,7 +16,7 @@ from typing import Any
 
 import click
 
-from wavebatch.cli.messages import count, print_json, printable, row, talk
+from wavebatch.cli.messages import count, print_json, print_text, printable, row, talk
 from wavebatch.cli.options import (
     clouds_argument,
     common_options,
@@ -91,7 +91,7 @@ def stats(
     if as_json:
         print_json({"files": [_plain(one) for one in each], "total": _plain(total)})
     elif shown:
-        click.echo("\n\n".join("\n".join(map(printable, _list_lines(one))) for one in shown))
+        print_text("\n\n".join("\n".join(map(printable, _list_lines(one))) for one in shown))
     sys.exit(EXIT_UNREADABLE if failed else 0)
 
 

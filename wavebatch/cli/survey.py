@@ -92,6 +92,7 @@ def survey(
     if chain_file is not None:
         write_text(chain_file, chain_text(saved.survey), overwrite=overwrite)
     document = _document(saved, facts)
+    print_result(as_json, document, _lines(saved, facts))
     if html_file is not None:
         from wavebatch.tools.html.survey_page import write_survey_page
 
@@ -99,7 +100,6 @@ def survey(
         failed = {*facts.get("failed", ()), *facts.get("misfits", ())}
         used = [path for path in paths if str(path) not in failed]
         write_survey_page(html_file, saved.survey, document, used, **reading)
-    print_result(as_json, document, _lines(saved, facts))
     for target in (output, chain_file, angles, html_file):
         if target is not None:
             talk(f"{target}: written")

@@ -129,7 +129,8 @@ class _Parser:
         """The whole text as a tree."""
         tree = self._read_or()
         if self._kind != "end":
-            self._fail("the condition ends here" if self._value == ")" else "`and`, `or` or the end is missing before")
+            ends = self._value == ")"
+            self._fail("the condition ends here, before" if ends else "`and`, `or` or the end is missing before")
         return tree
 
     def _advance(self) -> None:
@@ -150,7 +151,7 @@ class _Parser:
 
     def _fail(self, reason: str) -> NoReturn:
         what = "the end" if self._kind == "end" else repr(self._value)
-        raise ConfigError(f"--where: character {self._place}: {reason} {what}".replace("here ", "here, before "))
+        raise ConfigError(f"--where: character {self._place}: {reason} {what}")
 
     def _read_or(self) -> tuple:
         tree = self._read_and()

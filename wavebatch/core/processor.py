@@ -1,7 +1,7 @@
 """What kind of processor computes here: kinds differ in the last bits of sums, and a survey's decisions follow them.
 
-`batch.dask_cluster` refuses workers of another kind, because a strip's bytes would depend on which worker it meets.
-NumPy and its BLAS choose code for the processor when they load; the probe shows what was chosen by its results.
+`batch.workers.dask_cluster` refuses workers of another kind, because a strip's bytes would depend on which worker it
+meets. NumPy and its BLAS choose code for the processor when they load; the probe shows what was chosen by its results.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.las.crs import CrsUnits, parse_wkt, read_crs_definition
+from wavebatch.files.las.crs import CrsUnits, find_epsg, parse_wkt, read_crs_definition
 from wavebatch.files.las.header import LasHeader
 
 WGS84 = "OGC:CRS84"
@@ -217,9 +217,8 @@ def _code(definition: str) -> str | None:
     """`EPSG:n` of a definition that names a projected CRS by its code."""
     if definition.startswith("EPSG:"):
         return definition
-    found = re.search(r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$', definition)
-    known = found and parse_wkt(definition) != CrsUnits()
-    return f"EPSG:{found[1]}" if found and known else None
+    code = find_epsg(definition)
+    return f"EPSG:{code}" if code and parse_wkt(definition) != CrsUnits() else None
 
 
 def _densify(ring: np.ndarray, step: float) -> np.ndarray:

@@ -15,9 +15,10 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
+from wavebatch.files.las.crs import find_epsg
 from wavebatch.files.las.geotiff_wkt import find_code
 from wavebatch.files.las.header import Vlr
-from wavebatch.files.wkt_repair import repair_wkt
+from wavebatch.files.wkt_repair import drop_empty_codes, repair_wkt
 
 GEOJSON_CRS = ("wgs84", "keep")
 """Values of --geojson-crs."""
@@ -90,8 +91,7 @@ def plan_crs(path: Path, crs: str | None, mode: str) -> GeoJsonCrs:
 
 def _name(crs: str) -> dict[str, Any]:
     """The member `crs` of GeoJSON 2008, which GDAL and QGIS read: an EPSG code, or else the WKT."""
-    found = re.search(r'(?:AUTHORITY\["EPSG","|ID\["EPSG",)(\d+)"?\]\s*\]\s*$', crs) or re.fullmatch(r"EPSG:(\d+)", crs)
-    code = int(found[1]) if found else 0
-    # RIEGL writes code 0, which GDAL would look up.
-    plain = re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", crs)
-    return {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}" if code else plain}}
+    short = re.fullmatch(r"EPSG:(\d+)", crs)
+    code = int(short[1]) if short else find_epsg(crs)
+    name = f"urn:ogc:def:crs:EPSG::{code}" if code else drop_empty_codes(crs)
+    return {"type": "name", "properties": {"name": name}}

@@ -50,13 +50,6 @@ class RasterLayout:
     """Of the coordinates."""
 
 
-_ONE_FILE = {"GDAL_PAM_ENABLED": "NO"}
-"""Setting of GDAL: nothing goes into a file beside the raster."""
-
-_UPRIGHT = re.compile(r',AXIS\["[^"]*",up(?:,[A-Z]+\[(?:[^\[\]]|\[[^\[\]]*\])*\])*\]')
-"""An axis of heights in WKT 2."""
-
-
 def check_raster(target: Path, *, overwrite: bool) -> None:
     """Raise ConfigError if the suffix is not that of a GeoTIFF or rasterio is missing, InputError if it exists."""
     if target.suffix.lower() not in (".tif", ".tiff"):
@@ -96,46 +89,37 @@ def _read_crs(text: str, where: str) -> Any:
         return found
 
 
-def _make_writable(crs: Any, where: str) -> Any:
-    """The CRS as GeoTIFF keys hold it: without its heights if need be. ConfigError where they cannot hold it.
-
-    GDAL would put it into a file beside the raster, and the raster itself would have none.
-    """
-    error: Exception | None = None
-    for found in (crs, _without_heights(crs)):
-        try:
-            if found is not None and _is_kept(found):
-                return found
-        except Exception as caught:  # of GDAL, which has no keys for some numbers that it reads
-            error = caught
-    raise _complain(where, "written", error or ConfigError("GeoTIFF has no keys for it"))
-
-
-def _is_kept(crs: Any) -> bool:
-    """Whether a small raster in memory still has its CRS when it is read."""
-    import rasterio
-
-    with rasterio.Env(**_ONE_FILE), rasterio.MemoryFile() as memory:
-        place = rasterio.Affine(2.0, 0.0, 2.0, 0.0, -2.0, 2.0)
-        shape = {"width": 1, "height": 1, "count": 1, "dtype": "uint8"}
-        with memory.open(driver="GTiff", crs=crs, transform=place, **shape):
-            pass
-        with memory.open() as file:
-            return file.crs is not None
-
-
-def _without_heights(crs: Any) -> Any:
-    """A projected CRS of three axes with the first two only; None where it is another one."""
-    from rasterio.crs import CRS
-
-    text = crs.to_wkt(version="WKT2_2019")
-    plane = _UPRIGHT.sub("", text).replace("CS[Cartesian,3]", "CS[Cartesian,2]")
-    return CRS.from_wkt(plane) if text.startswith("PROJCRS[") and plane != text else None
-
-
 def _complain(where: str, what: str, error: Exception) -> ConfigError:
     why = " ".join(str(error).split())
     return ConfigError(f"{where}: the CRS cannot be {what} ({why[:120]}); give it with --crs EPSG:n")
+
+
+def _flatten(crs: Any) -> Any:
+    """The CRS without its third axis: keys of a GeoTIFF have no place for one, and GDAL then writes no CRS at all.
+
+    RiPROCESS gives its UTM zones an axis of height.
+    """
+    from rasterio.crs import CRS
+
+    text = crs.to_wkt(version="WKT2_2019")
+    third = text.find("ORDER[3]")
+    if not text.startswith("PROJCRS[") or third < 0:
+        return crs
+    start = text.rindex(",AXIS[", 0, third)
+    depth, end = 0, start
+    for token in re.finditer(r'"[^"]*"|[][]', text[start:]):
+        depth += {"[": 1, "]": -1}.get(token[0], 0)
+        if not depth and token[0] == "]":
+            end = start + token.end()
+            break
+    return CRS.from_wkt((text[:start] + text[end:]).replace("CS[Cartesian,3]", "CS[Cartesian,2]"))
+
+
+def _writing() -> Any:
+    """Settings of GDAL: what a GeoTIFF cannot hold goes to no .aux.xml, which would have the temporary file's name."""
+    from rasterio.env import Env
+
+    return Env(GDAL_PAM_ENABLED="NO")
 
 
 class RasterWriter(Closing):
@@ -150,26 +134,29 @@ class RasterWriter(Closing):
         import rasterio
         from rasterio import Affine
 
-        crs = None if layout.crs is None else _make_writable(_read_crs(layout.crs, str(target)), str(target))
         self._draft = Draft(target, overwrite=overwrite)
         self._target = target
         self._layout = layout
         try:
-            with rasterio.Env(**_ONE_FILE):
+            with _writing():
+                crs = None if layout.crs is None else _flatten(_read_crs(layout.crs, str(target)))
                 self._file = rasterio.open(
                     self._draft.path, "w", driver="GTiff", width=layout.columns, height=layout.rows, count=len(bands),
                     dtype=layout.dtype, nodata=layout.no_data, crs=crs, tiled=True, blockxsize=TILE, blockysize=TILE,
                     transform=Affine(layout.size, 0, layout.west, 0, -layout.size, layout.north), interleave="band",
                     compress="deflate", predictor=3, zlevel=6, bigtiff="if_safer", sparse_ok=True,
                 )  # fmt: skip
-            self._file.update_tags(**tags)
-            for number, band in enumerate(bands, 1):
-                self._file.set_band_description(number, band.description)
-                self._file.set_band_unit(number, band.unit)
+                self._file.update_tags(**tags)
+                for number, band in enumerate(bands, 1):
+                    self._file.set_band_description(number, band.description)
+                    self._file.set_band_unit(number, band.unit)
         except BaseException as error:
             self._draft.discard()
             if isinstance(error, rasterio.errors.RasterioError | OSError):
                 raise InputError(f"{target}: cannot be written: {error}; check disk and permissions") from error
+            if layout.crs is not None and type(error).__module__.startswith("rasterio"):
+                # GDAL has no keys for some numbers that it has read.
+                raise _complain(str(target), "written", error) from error
             raise
 
     def write_tile(self, row: int, column: int, values: np.ndarray) -> None:
@@ -187,7 +174,8 @@ class RasterWriter(Closing):
             )
         stored = np.where(np.isnan(cut), self._layout.no_data, cut).astype(self._layout.dtype)
         try:
-            self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
+            with _writing():
+                self._file.write(stored, window=Window(column * TILE, row * TILE, columns, rows))
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
 
@@ -196,17 +184,19 @@ class RasterWriter(Closing):
         import rasterio
 
         try:
-            with rasterio.Env(**_ONE_FILE):
+            with _writing():
                 self._file.close()
+                with rasterio.open(self._draft.path) as written:
+                    lost = self._layout.crs is not None and written.crs is None
         except (rasterio.errors.RasterioError, OSError) as error:
             raise InputError(f"{self._target}: cannot be written: {error}; check disk and permissions") from error
+        if lost:
+            raise ConfigError(f"{self._target}: a GeoTIFF cannot hold the CRS of the clouds; use --crs EPSG:n")
         self._draft.publish()
 
     def close(self) -> None:
         """Remove what was not published; may be called twice."""
         if not self._file.closed:
-            import rasterio
-
-            with rasterio.Env(**_ONE_FILE):
+            with _writing():
                 self._file.close()
         self._draft.discard()

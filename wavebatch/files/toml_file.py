@@ -148,6 +148,10 @@ def _is_deep(document: dict[str, Any]) -> bool:
     return bool(level)
 
 
+KINDS = {"chain": "a chain file", "system": "a survey", "calibration": "a calibration"}
+"""TOML files of wavebatch, by the option that takes them."""
+
+
 @dataclass(frozen=True, slots=True)
 class TomlTable:
     """A table of a TOML file with checks; each check raises ConfigError with file, table, key and remedy."""
@@ -156,6 +160,15 @@ class TomlTable:
     """Keys and values as tomllib read them."""
     where: str
     """Start of every message: the file and the table, for example "a.toml: [system]"."""
+
+    def check_kind(self, kind: str) -> None:
+        """Raise ConfigError where the document is another of wavebatch's files, with the option that takes it."""
+        schema = self.values.get("schema")
+        found = schema.removeprefix("wavebatch.").split("/")[0] if isinstance(schema, str) else ""
+        if not schema and isinstance(self.values.get("chain"), list):
+            found = "chain"
+        if found in KINDS and found != kind:
+            raise ConfigError(f"{self.where}: this is {KINDS[found]}, not {KINDS[kind]}: give it as --{found}")
 
     def check_keys(self, known: Iterable[str], needed: Iterable[str] = (), remedy: str = "") -> None:
         """Raise ConfigError for a key that is not known, with the nearest known one, and for a needed one not there."""

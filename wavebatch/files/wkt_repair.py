@@ -40,10 +40,12 @@ def repair_wkt(wkt: str) -> str:
         found = _METRE.match(wkt, start, end)
         if found and _is_one(found[1]):
             repaired = repaired[:start] + _DEGREE + repaired[end:]
-    if repaired == wkt:
-        return wkt
-    # RiPROCESS also gives code 0, which GDAL looks up and does not find: a GeoTIFF then has no projection.
-    return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", repaired)
+    return wkt if repaired == wkt else drop_empty_codes(repaired)
+
+
+def drop_empty_codes(wkt: str) -> str:
+    """Return a WKT without the code 0 of RiPROCESS: GDAL looks it up in vain, and a GeoTIFF then has no projection."""
+    return re.sub(r',\s*AUTHORITY\["EPSG","0"\]', "", wkt)
 
 
 def _list_units(wkt: str) -> list[tuple[int, int]]:

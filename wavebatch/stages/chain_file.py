@@ -87,6 +87,7 @@ def parse_chain(text: str, name: str) -> Chain:
         Where the chain is wrong.
     """
     document = parse_toml(text, name)
+    document.check_kind("chain")
     document.check_keys(["chain"])
     steps = tuple(map(_read_step, document.tables("chain")))
     return Chain(steps, name)

@@ -1,7 +1,8 @@
 """The calibration of a sensor: its constants, what they were measured with, and the stages that it adds to a chain.
 
-`targets` measures a calibration, `calibrating.calibration_file` keeps it as CAL.toml, and `wavebatch run` fits it to
-each strip with `calibrating.strip_match`. Before you change it: give new fields a default, since older files lack them.
+`calibrating.targets` measures a calibration, `calibrating.calibration_file` keeps it as CAL.toml, and `wavebatch run`
+fits it to each strip with `calibrating.strip_match`. Before you change it: give new fields a default, since older files
+lack them.
 """
 
 from __future__ import annotations

@@ -22,10 +22,12 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.point_formats import locate
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.kernels.geometry.normals import Surroundings, measure_normals, thin_out
+from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.stages.attribute.light import is_alone
 from wavebatch.stages.attribute.width_angle import added_variance
-from wavebatch.surveying.lone_echoes import MIN_SNR
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, decompose_sample
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN
+from wavebatch.surveying.measuring.residuals import decompose_sample
 
 ROUNDS = 10
 """Steps from the mode of the variances to the mean around it."""
@@ -35,6 +37,9 @@ SAMPLED_UNITS = 8
 
 LEAST_NEIGHBOURS = 8
 """Points of a plane, as by default in stage attribute.incidence_angle_normals."""
+
+WIDER = 0.5
+"""Steps in which the radius grows until neighbourhoods hold a third scan line [m]."""
 
 RADII = (1.5, 12.0)
 """Least and largest radius of a neighbourhood that is chosen by the distance between points [m]."""
@@ -101,8 +106,11 @@ def choose_radius(reader: StripReader, scan: StripScan) -> float:
     Returns
     -------
     float
-        Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS; at least 1.5, at most 12.
+        Radius [m] in which nine tenths of the points have half more than LEAST_NEIGHBOURS, and these lie on more than
+        two scan lines; at least 1.5, at most 12.
     """
+    if not reader.unit_count():
+        return RADII[0]
     unit = reader.read_unit(reader.unit_count() // 2, scan)
     return _choose_radius(locate(unit.points, reader.facts.header)) if len(unit.points) else RADII[0]
 
@@ -113,8 +121,20 @@ def _choose_radius(xyz: np.ndarray) -> float:
     if len(xyz) <= number:
         return RADII[0]
     some = xyz[:: max(len(xyz) // 500, 1)]
-    distance = scipy.spatial.cKDTree(xyz).query(some, k=number)[0][:, -1]
-    return float(np.clip(np.ceil(10.0 * np.quantile(distance, 0.9)) / 10.0, *RADII))
+    tree = scipy.spatial.cKDTree(xyz)
+    distance = tree.query(some, k=number)[0][:, -1]
+    radius = float(np.clip(np.ceil(10.0 * np.quantile(distance, 0.9)) / 10.0, *RADII))
+    while radius < RADII[1] and _share_in_two_lines(xyz, tree, some, radius) > 0.1:
+        radius = min(round(radius + WIDER, 1), RADII[1])
+    return radius
+
+
+def _share_in_two_lines(xyz: np.ndarray, tree: scipy.spatial.cKDTree, some: np.ndarray, radius: float) -> float:
+    """Share of the points whose neighbours lie on two scan lines, seen from above: they have no angle."""
+    near = tree.query_ball_point(some, radius)
+    group = np.repeat(np.arange(len(some)), [len(rows) for rows in near])
+    offset = xyz[np.concatenate(near).astype(np.int64)] - some[group]
+    return float(np.mean(in_two_lines(offset[:, 0], offset[:, 1], group, len(some))))
 
 
 def sample_slopes(reader: StripReader, scan: StripScan, fill: object, n_waveforms: int) -> Iterator[Slopes]:

@@ -25,7 +25,14 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.surveying.measure import FAR_OFF, FEW, FIRST_WIDTH, find_edge, measure_gaussian, measure_quiet
+from wavebatch.surveying.measuring.noise_and_width import (
+    FAR_OFF,
+    FEW,
+    FIRST_WIDTH,
+    find_edge,
+    measure_gaussian,
+    measure_quiet,
+)
 from wavebatch.surveying.survey import Level, Survey, compare_levels, describe_level, pool_blocks, survey_blocks
 from wavebatch.surveying.system_file import SavedSurvey
 from wavebatch.surveying.systems.known_systems import compare_pulses, find_lone, fit_alone, take_strongest, with_pulse

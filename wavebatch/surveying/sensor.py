@@ -52,6 +52,11 @@ JERK, JERK_LEFT = 1.0, 0.025
 """Change of acceleration of an aircraft in turbulent air [m/s3], assumed where fewer windows overlap; and what a
 parabola leaves of it: a root mean square of JERK half^3 times this."""
 
+SCANNER = 1.3e-4
+"""Distance, as a share of the range, from where rays meet to the scanner's origin: a mirror whose facet moves, or a
+scan angle with a wrong scale, bends all rays alike, and no residual shows it. It is 7.2 cm of 559 m on the RIEGL strip
+whose PulseWaves file has the origin of each pulse."""
+
 LEAST_DOUBT = 2.0
 """Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
 
@@ -165,7 +170,7 @@ def find_sensor(reader: StripReader, scan: StripScan, request: SensorRequest) ->
     refuse_units(reader, scan)
     vectors, pairs = sample_rays(reader, scan)
     if request.trajectory is not None:
-        return _from_file(reader, vectors, request)
+        return _from_file(reader, vectors, request, scan.packets > 1)
     for kind, rays in (("direction vectors", vectors), ("pairs of returns", pairs)):
         found = estimate_path(rays, kind)
         if found is not None:
@@ -224,9 +229,15 @@ def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
     return ()
 
 
-def _from_file(reader: StripReader, rays: Rays, request: SensorRequest) -> SensorSource:
+def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several: bool) -> SensorSource:
     crs = request.crs or find_crs(reader.facts.crs, reader.facts.header.vlrs)
     known = read_trajectory(request.trajectory, crs=crs, lever_arm=request.lever_arm)
+    times = rays.time[np.isfinite(rays.time) & (rays.time != 0)]
+    if several and (not len(times) or times.min() == times.max()):
+        raise InputError(
+            f"{request.trajectory}: cannot be used, because the points of this strip have no GPS times, or all the "
+            "same; give --flight-height instead"
+        )
     if not len(rays.time):
         return SensorSource("trajectory", known, facts=(("file", request.trajectory.name),))
     start, stop = float(rays.time[0]), float(rays.time[-1])
@@ -330,7 +341,7 @@ def estimate_path(rays: Rays, kind: str) -> SensorSource | None:
     xyz += velocity * (time - inside)[:, None]
     path = Trajectory.build(time, xyz, velocity, gap=(max(WIDER) + 1) * NODE_SECONDS)
     distance = round(float(np.median([fit.distance for fit, _, _ in found])), 2)
-    error, facts = _overall_error(found, rays), _describe(found, path, rays)
+    error, facts = _overall_error(found, rays, distance), _describe(found, path, rays)
     return SensorSource(kind, path, distance=distance, error=error, facts=facts)
 
 
@@ -357,8 +368,9 @@ def _node_times(nodes: np.ndarray, node: float, low: float, high: float, middle:
     return np.unique(times)
 
 
-def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: Rays) -> float:
-    """Root mean square of the range's error over all windows [m]: what the fits say, and what they contradict."""
+def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: Rays, distance: float) -> float:
+    """Root mean square of the range's error over all windows [m]: what the fits say, what they contradict, and what
+    none of them can see."""
     squares, apart = [], []
     for number, (fit, _, within) in enumerate(found):
         near = np.abs(rays.time - fit.centre) <= fit.half
@@ -373,7 +385,7 @@ def _overall_error(found: list[tuple[SensorFit, np.ndarray, np.ndarray]], rays: 
         motion = 0.5 * np.mean(apart)  # both windows are off
     else:
         motion = (JERK * JERK_LEFT * max(fit.half for fit, _, _ in found) ** 3) ** 2
-    return float(np.sqrt(np.mean(squares) + motion))
+    return float(np.sqrt(np.mean(squares) + motion + (SCANNER * distance) ** 2))
 
 
 def _contradiction(fit: SensorFit, later: SensorFit) -> np.ndarray:

@@ -16,21 +16,20 @@ from wavebatch.kernels.signal.noise import find_levels
 from wavebatch.kernels.signal.signal import quiet_mean, transpose_samples
 from wavebatch.stages.clean import clean_block, measure_defects
 from wavebatch.stages.pulse_tables import clip_level
-from wavebatch.surveying.learn_pulse import find_clear, find_isolated, find_strong, learn_pulse, refine_pulse
-from wavebatch.surveying.lone_echoes import MIN_SNR
-from wavebatch.surveying.measure import (
+from wavebatch.surveying.measuring.learn_pulse import find_clear, find_isolated, find_strong, learn_pulse, refine_pulse
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
+from wavebatch.surveying.measuring.misfit import measure_misfit
+from wavebatch.surveying.measuring.noise_and_width import (
     ENOUGH_TO_LEARN,
     FEW,
     FIRST_WIDTH,
     RESIDUAL_LOOK,
     SETTLED,
-    decompose_sample,
     find_saturation,
     measure_gaussian,
-    measure_misfit,
-    measure_residuals,
     thin_block,
 )
+from wavebatch.surveying.measuring.residuals import decompose_sample, measure_residuals
 from wavebatch.surveying.systems.known_systems import find_source, take_pulse
 from wavebatch.surveying.systems.skew import measure_skew
 

@@ -80,6 +80,7 @@ def parse_survey(text: str, name: str) -> SavedSurvey:
         With file, table and key, and the nearest known word for an unknown key.
     """
     table = parse_toml(text, name)
+    table.check_kind("system")
     known = ("schema", "version", "strip", "sensor", "waveforms", "system", "figures", "decision", "fingerprint")
     table.check_keys(known, ("schema", "system"), REMEDY)
     table.check_schema(SYSTEM_SCHEMA, "survey again")

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from wavebatch.tools.rasters.grid import GridResult
 
 
-def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
-
-
 @click.command()
 @shared.clouds_argument
 @shared.recursive_option
@@ -36,7 +32,7 @@ def _read_bounds(context: click.Context, parameter: click.Parameter, text: str |
               help="Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
               "rasters fit together.")
 @shared.output_option("Raster to write: .tif.", "X.tif")
-@click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
+@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
               help="Part to write: west, south, east, north [m].  [default: all]")
 @shared.selection_options
 @click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")

@@ -7,6 +7,7 @@ else has succeeded: matplotlib takes long to import and may be missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +39,6 @@ def _read_times(context: click.Context, parameter: click.Parameter, text: str | 
     return "all" if text == "all" else _read_range(context, parameter, text)
 
 
-def _read_bounds(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else shared.parse_floats(text, "WEST,SOUTH,EAST,NORTH")
-
-
 @click.group(cls=NearestGroup)
 def plot() -> None:
     """Draw waveforms, histograms, maps, sections and profiles as .png, .svg or .pdf.
@@ -57,7 +54,7 @@ def plot() -> None:
               callback=lambda context, parameter, texts: tuple(map(shared.parse_span, texts)),
               help="Draw these packets, counted from 0; END is not included; may be repeated.  [default: six, spread "
               "over the strip]")
-@click.option("--point", "points", multiple=True, type=int, metavar="N",
+@click.option("--point", "point_numbers", multiple=True, type=int, metavar="N",
               help="Draw the packet of this point, counted from 0; may be repeated.")
 @click.option("--gps-time", "times", multiple=True, type=float, metavar="T",
               help="Draw the pulse nearest to this GPS time [s]; may be repeated.")
@@ -89,15 +86,19 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
     from wavebatch.core.flag_names import read_flags
     from wavebatch.tools.plots.packets import Wanted
 
-    if options["flags_with"] and (options["packets"] or options["points"] or options["times"]):
+    if options["flags_with"] and (options["packets"] or options["point_numbers"] or options["times"]):
         raise ConfigError("--flags-with chooses the waveforms; leave out --packet, --point and --gps-time")
-    if options["random"] and any(options[name] for name in ("packets", "points", "times", "flags_with")):
+    if options["random"] and any(options[name] for name in ("packets", "point_numbers", "times", "flags_with")):
         raise ConfigError("--random chooses the waveforms; leave out --packet, --point, --gps-time and --flags-with")
     if options["sheet"] and (options["show"] or options["table"]):
         raise ConfigError("--sheet has no room for --show and --echoes; leave one of them out")
     tabular = output.suffix.lower() == ".csv"
+    for name, option in (("sheet", "--sheet"), ("show", "--show"), ("shown", "--times")) if tabular else ():
+        if options[name]:
+            raise ConfigError(f"{option} is for pictures; leave it out, or name another file than {output}")
     check_target(output, overwrite=options["overwrite"]) if tabular else _check(output, options)
-    wanted = shared.from_options(Wanted, options, flags=read_flags(options["flags_with"]))
+    flags = read_flags(options["flags_with"])
+    wanted = shared.from_options(Wanted, options, points=options["point_numbers"], flags=flags)
     views, chain = _view(strip, wanted, options, ranges=tabular or options["table"])
     if tabular:
         from wavebatch.tools.plots.echo_table import format_echoes
@@ -105,11 +106,10 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
         write_text(output, format_echoes(views), overwrite=options["overwrite"])
     else:
         _draw_waveforms(views, output, strip.name, chain, options)
+    echoes = sum(len(view.echoes) for view in views)
     if not options["quiet"]:
-        echoes = sum(len(view.echoes) for view in views)
         talk(f"{output}: {count(len(views), 'waveform')}, {count(echoes, 'echo')}")
     if options["as_json"]:
-        echoes = sum(len(view.echoes) for view in views)
         print_json({"output": str(output), "chain": chain, "waveforms": len(views), "echoes": echoes})
 
 
@@ -154,7 +154,8 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
         places = find_places(reader, scan, wanted, lambda block: choice.chain.run(block, system))
         run, fill = choice.chain, None
         if ranges:
-            run, fill = add_ranges(choice.chain, reader, scan)
+            run, fill, error = add_ranges(choice.chain, reader, scan)
+            system = replace(system, sensor_error=error)
         views = read_views(reader, scan, places, run, system, options["show"], fill)
         return views, describe_chain(choice.chain)
 
@@ -266,7 +267,7 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
-@click.option("--bounds", callback=_read_bounds, metavar="W,S,E,N",
+@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
               help="Part to show: west, south, east, north [m].  [default: all]")
 @shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")

@@ -43,10 +43,6 @@ def _left_out(tally: Any) -> str:
     return f", {tally.left_out} left out" * bool(tally.left_out)
 
 
-def _read_line(context: click.Context, parameter: click.Parameter, text: str | None) -> tuple[float, ...] | None:
-    return None if text is None else shared.parse_floats(text, "X0,Y0,X1,Y1")
-
-
 def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool = False) -> tuple[list[Path], bool]:
     """Clouds, files of segments, or one file of voxels; and whether they are of segments.
 
@@ -74,7 +70,7 @@ def _find(clouds: Sequence[Path], options: dict[str, Any], *, or_segments: bool 
 @shared.clouds_argument
 @shared.recursive_option
 @_output
-@click.option("--line", callback=_read_line, metavar="X0,Y0,X1,Y1",
+@click.option("--line", callback=shared.floats_reader("X0,Y0,X1,Y1"), metavar="X0,Y0,X1,Y1",
               help="Ends of the section, in the coordinates of the clouds.  [default: along the longer extent]")
 @click.option("--width", type=float, metavar="W",
               help="Show what lies within half of W from the line.  [default: a fiftieth of its length]")

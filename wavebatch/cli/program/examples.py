@@ -98,7 +98,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "Which points": (
         "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",
-        "points_", "times", "most", "random", "limit",
+        "point_numbers", "times", "most", "random", "limit",
     ),
     "Output": (
         "output", "points", "columns", "column", "names", "file_format", "point_format", "las_version", "keep_packets",

@@ -19,7 +19,8 @@ import click
 
 from wavebatch.core.errors import ConfigError
 
-_LEVEL = "wavebatch.log_level"
+_LEVEL, LOG = "wavebatch.log_level", "wavebatch.log_path"
+"""Keys of a context's `meta`: the level, and the file of the log."""
 
 LEVELS = ("error", "warning", "info")
 
@@ -87,6 +88,11 @@ def log(message: str, level: str | None = None) -> None:
         click.echo(f"warning: --log-file: cannot be written, so it ends here: {error}", err=True)
 
 
+def typed_command(context: click.Context) -> str:
+    """The command line as it was typed, with the short name of the program."""
+    return " ".join([context.find_root().info_name or "wavebatch", *map(shlex.quote, sys.argv[1:])])
+
+
 def keep_level(context: click.Context, parameter: click.Parameter, level: str) -> None:
     """Keeps the level for `begin_log`, which comes after it."""
     context.meta[_LEVEL] = level
@@ -97,8 +103,8 @@ def begin_log(context: click.Context, parameter: click.Parameter, path: Path | N
     if path is None or context.resilient_parsing:
         return
     try:
-        command = " ".join([context.command_path, *map(shlex.quote, sys.argv[2:])])
-        open_log(path, context.meta.get(_LEVEL, "info"), command)
+        open_log(path, context.meta.get(_LEVEL, "info"), typed_command(context))
     except ConfigError as error:
         raise click.UsageError(str(error), ctx=context) from error
+    context.meta[LOG] = path
     context.call_on_close(close_log)

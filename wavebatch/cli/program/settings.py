@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,14 +20,22 @@ from wavebatch.core.errors import ConfigError
 FILE = "wavebatch.toml"
 PREFIX = "WAVEBATCH_"
 
+READ = "wavebatch.settings_read"
+"""Key of a context's `meta`: names of the files from which settings are in force."""
+
 NEVER = ("overwrite", "force", "help", "debug")
 """Options that are given on the command line only: they may destroy files, or hide that a result is wrong."""
 
+IN_NO_FILE = {"run": ("report", "resume", "scheduler")}
+"""Options by command that replace files without --overwrite, or trust other machines: wavebatch.toml may have come with
+the data."""
+
 EXCLUSIVE = (
-    {"chain_file", "profile", "tolerance"}, {"overwrite", "resume"}, {"quiet", "verbose"}, {"scheduler", "jobs"},
-    {"scheduler", "memory"},
+    ("chain_file", "profile", "tolerance"), ("overwrite", "resume"), ("quiet", "verbose"), ("scheduler", "jobs"),
+    ("scheduler", "memory"), ("attenuation", "visibility"), ("trajectory", "flight_height"),
 )  # fmt: skip
-"""Options of which only one is possible: one on the command line takes the place of the others in the settings."""
+"""Options of which only one is possible: one on the command line, or in a variable, takes the place of the others in
+what counts less."""
 
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 """Names of the arguments that are files to read; settings lie beside the first."""
@@ -57,6 +65,7 @@ class Settings:
         from wavebatch.cli.messages import talk
 
         context.meta["wavebatch.settings"] = tuple(self.lines())
+        context.meta[READ] = [source for source in self.sources.values() if not source.startswith(PREFIX)]
         shown = [line for name, line in zip(self.values, self.lines(), strict=True)
                  if not context.params.get("quiet") or not self.sources[name].startswith(PREFIX)]  # fmt: skip
         if shown:
@@ -73,18 +82,22 @@ def find_settings(command: click.Command, arguments: list[str]) -> Settings | No
     options = {one.name: one for one in command.params if isinstance(one, click.Option)}
     given = {one.name for one in order if one.name in options}
     path = _find_file(parsed)
-    values: dict[str, Any] = {}
-    sources: dict[str, str] = {}
-    if path is not None:
-        for name, value in _read_file(path, command, options).items():
-            values[name], sources[name] = value, str(path)
-    for name, variable, value in _read_variables(command, options):
-        values[name], sources[name] = value, variable
-    taken = given | {name for rivals in EXCLUSIVE if rivals & given for name in rivals}
-    values = {name: value for name, value in values.items() if name not in taken}
-    if not values:
+    in_file = {} if path is None else _read_file(path, command, options)
+    found = {name: (value, str(path)) for name, value in in_file.items()}
+    in_variables = {name: (value, variable) for name, variable, value in _read_variables(command, options)}
+    found = {**_without_rivals(found, in_variables), **in_variables}
+    found = _without_rivals({name: one for name, one in found.items() if name not in given}, given)
+    if not found:
         return None
+    values, sources = ({name: one[place] for name, one in found.items()} for place in (0, 1))
     return Settings(values, sources, {name: _option_name(options[name]) for name in values})
+
+
+def _without_rivals(found: Mapping[str, Any], stronger: Iterable[str]) -> dict[str, Any]:
+    """The settings without those that exclude one of the names that count more."""
+    names = set(stronger)
+    taken = {name for rivals in EXCLUSIVE if names & set(rivals) for name in rivals if name not in names}
+    return {name: value for name, value in found.items() if name not in taken}
 
 
 def _option_name(option: click.Option) -> str:
@@ -143,6 +156,9 @@ def _read_file(path: Path, command: click.Command, options: Mapping[str, click.O
             raise click.UsageError(f"{path}: [{_title(command)}] has no option {key!r}; {nearest(key, list(known))}")
         if known[key] in NEVER:
             raise click.UsageError(f"{path}: {key} can be given on the command line only; remove it from the file")
+        if known[key] in IN_NO_FILE.get(_title(command), ()):
+            where = "on the command line or in a variable only, since the file may have come with the data"
+            raise click.UsageError(f"{path}: {key} can be given {where}; remove it")
         found[known[key]] = _convert(value, options[known[key]], path)
     return found
 

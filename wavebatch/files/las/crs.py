@@ -95,6 +95,15 @@ def metres_per_unit(units: Sequence[CrsUnits]) -> tuple[float, float, float]:
     return along, along, up
 
 
+_EPSG = re.compile(r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$')
+
+
+def find_epsg(wkt: str) -> int | None:
+    """Return the EPSG code of the CRS that a WKT describes; None where it gives none, or 0 as RiPROCESS does."""
+    found = _EPSG.search(wkt)
+    return int(found[1]) or None if found else None
+
+
 def looks_geocentric(mins: Sequence[float], maxs: Sequence[float]) -> bool:
     """Whether the extent of a strip lies on the surface of the Earth as seen from its centre.
 

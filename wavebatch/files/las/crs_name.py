@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from wavebatch.files.las.crs import read_crs
+from wavebatch.files.las.crs import find_epsg, read_crs
 from wavebatch.files.las.geotiff_wkt import find_code
 from wavebatch.files.las.header import read_header
 
@@ -38,5 +38,5 @@ def name_crs(text: str) -> str:
     named = re.match(r'\s*\w+\s*[\[(]\s*"([^"]*)"', text)
     if named is None:
         return " ".join(text.split())
-    code = re.search(r'(?:AUTHORITY|ID)\s*\[\s*"EPSG"\s*,\s*"?(\d+)"?\s*\]\s*\]\s*$', text)
-    return named[1] + (f" (EPSG:{code[1]})" if code and int(code[1]) else "")
+    code = find_epsg(text)
+    return named[1] + (f" (EPSG:{code})" if code else "")

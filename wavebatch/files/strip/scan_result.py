@@ -57,6 +57,11 @@ class StripScan(Closing):
         """What a user should know about how samples are stored, one line each."""
         return tuple(note for form in self.forms.values() for note in form.notes)
 
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Those of the warnings about points whose packets cannot be used."""
+        return tuple(describe_oddities(self.reasons, 0))
+
     def close(self) -> None:
         """Remove the temporary file."""
         self.context.close()

@@ -13,6 +13,7 @@ import scipy  # parts of it load when they are first asked for
 
 from wavebatch.kernels.geometry.plane_halves import compare_halves, misfit_of_angles
 from wavebatch.kernels.geometry.planes import Planes, fit_planes, is_flat, measure_angles
+from wavebatch.kernels.geometry.two_lines import in_two_lines
 from wavebatch.kernels.physics.incidence import STEEPEST
 
 PAIRS = 500_000
@@ -39,7 +40,7 @@ class Gap(IntEnum):
     KNOWN = 1
     """It has an angle."""
     FEW_NEIGHBOURS = 2
-    """Fewer than min_points neighbours."""
+    """Fewer than min_points neighbours, or all that are in the plane on two scan lines."""
     NO_PLANE = 3
     """The neighbours form no plane that the point lies in."""
     TOO_STEEP = 4
@@ -149,6 +150,7 @@ def measure_normals(
         point itself not in it, or two planes (a ridge) fit so much better that the angle may be off by more than
         max_error. TOO_STEEP: the ray nearly lies in the plane; plants seen by one sweep of the scanner form such a
         plane, which is no surface.
+        FEW_NEIGHBOURS: also where those in the plane lie on two scan lines, through which a plane always goes.
     """
     angle, error = np.full((2, len(points)), np.nan, np.float32)
     gap = np.full(len(points), Gap.NO_RAY, np.uint8)
@@ -193,11 +195,14 @@ def _judge(
     rows = np.flatnonzero(surface)
     folded[rows] = _find_folds(offset, point, planes, unit, rows)
     surface &= ~((error <= max_error) & (np.hypot(error, folded) > max_error))
+    rows = np.flatnonzero(surface)
+    untried = np.zeros(n, bool)
+    untried[rows] = _find_two_lines(offset, point, planes, rows)
     error = np.hypot(error, folded)
     gap = np.where(error <= max_error, Gap.KNOWN, Gap.UNCERTAIN)
     gap = np.where(angle > STEEPEST, Gap.TOO_STEEP, gap)
     gap = np.where(surface, gap, Gap.NO_PLANE)
-    gap = np.where(count < min_points, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
+    gap = np.where((count < min_points) | untried, Gap.FEW_NEIGHBOURS, gap).astype(np.uint8)
     known = gap == Gap.KNOWN
     return np.where(known, angle, np.nan), np.where(known, error, np.nan), gap
 
@@ -206,9 +211,23 @@ def _find_folds(
     offset: np.ndarray, point: np.ndarray, planes: Planes, unit: np.ndarray, rows: np.ndarray
 ) -> np.ndarray:
     """How far the angles of points `rows` may be off because their neighbours are two planes [rad]."""
-    place = np.full(len(unit), -1)
+    offset, point, some = _take(offset, point, planes, rows)
+    return misfit_of_angles(compare_halves(offset, point, some), some, unit[rows])
+
+
+def _find_two_lines(offset: np.ndarray, point: np.ndarray, planes: Planes, rows: np.ndarray) -> np.ndarray:
+    """Which of the points `rows` have a plane through two scan lines only, which nothing could contradict."""
+    offset, point, some = _take(offset, point, planes, rows)
+    away, u, v = (np.einsum("ki,ki->k", offset - some.centre[point], some.axes[point, :, axis]) for axis in range(3))
+    near = np.abs(away) <= some.limit[point]
+    return in_two_lines(u[near], v[near], point[near], len(rows))
+
+
+def _take(
+    offset: np.ndarray, point: np.ndarray, planes: Planes, rows: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Planes]:
+    """Only the neighbourhoods of some points, numbered by their place among these."""
+    place = np.full(len(planes.kept), -1)
     place[rows] = np.arange(len(rows))
     local = place[point]
-    some = Planes(*(part[rows] for part in planes))
-    halves = compare_halves(offset[local >= 0], local[local >= 0], some)
-    return misfit_of_angles(halves, some, unit[rows])
+    return offset[local >= 0], local[local >= 0], Planes(*(part[rows] for part in planes))

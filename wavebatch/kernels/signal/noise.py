@@ -430,8 +430,13 @@ def residual_noise(
     if len(values) < LEAST_PAIRS:
         return None
     low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
-    limit = CLIPPED * max(0.5 * (high - low), QUANTISATION_STD)
+    # Quantiles of whole counts may give half of the spread, so that it is found in two steps.
+    wide = 2 * CLIPPED * max(0.5 * (high - low), QUANTISATION_STD)
+    spread = np.sqrt(np.mean(np.clip(values - np.float32(middle), -wide, wide) ** 2, dtype=np.float64))
+    limit = CLIPPED * max(float(spread), QUANTISATION_STD)
     deviation = np.where(used, np.clip(residual - np.float32(middle), -limit, limit), np.float32(0))
+    # The median of whole counts is one of them; taken for the mean it would make all samples seem correlated.
+    deviation -= used * np.float32(np.sum(deviation, dtype=np.float64) / len(values))
     variance = np.sum(deviation * deviation, dtype=np.float64) / len(values)
     found = []
     for lag in range(1, min(lags, residual.shape[1] - 1) + 1):

@@ -176,8 +176,9 @@ def position(
     """Coordinates of each echo along its ray [m], relative to the returns of its packet, and the return it matches.
 
     Return locations differ from the fit by an offset that all returns of a packet share (phase of the emitted pulse, a
-    detector of leading edges). The offset is measured on the matched returns and subtracted. Packets without a matched
-    return keep the raw location and are flagged.
+    detector of leading edges). The offset is measured on the matched returns and subtracted. Where the returns of a
+    packet contradict each other by more than their errors, range_err also has the error of their mean. Packets without
+    a matched return keep the raw location and are flagged.
 
     Parameters
     ----------
@@ -190,6 +191,7 @@ def position(
     """
     waveform = echoes.waveform
     offset = np.zeros(len(block))
+    doubt = np.zeros(len(block))
     known = np.zeros(len(block), bool)
     point = np.full(len(echoes), -1, np.int64)
     returns = block.returns
@@ -198,7 +200,7 @@ def position(
         for _ in range(2):  # the second time with the offset that the first one found
             shifted = returns.time + offset[returns.waveform]
             match = match_returns(waveform, echoes.time, returns.waveform, shifted, reach)
-            offset, known = _shared_offset(len(block), echoes, match, returns.time)
+            offset, doubt, known = _shared_offset(len(block), echoes, match, returns.time)
         point = np.where(match >= 0, returns.point[match], -1)
     along = echoes.time - offset[waveform]
     xyz = block.origin[waveform] + block.direction[waveform] * along[:, None]
@@ -210,7 +212,7 @@ def position(
         y=xyz[:, 1],
         z=xyz[:, 2],
         point=point,
-        range_err=(echoes.time_err * speed[waveform]).astype(np.float32),
+        range_err=(np.hypot(echoes.time_err, doubt[waveform]) * speed[waveform]).astype(np.float32),
     )
     if returns is None:
         return echoes
@@ -219,8 +221,11 @@ def position(
 
 def _shared_offset(
     n: int, echoes: EchoTable, match: np.ndarray, return_time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Offset of the fits from the return locations per waveform [ns], weighted by the errors, and where it is known."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offset of the fits from the return locations per waveform [ns], weighted by the errors, and where it is known.
+
+    Between them its error [ns] by the scatter of the returns; 0 where their errors explain it, and for single returns.
+    """
     rows = np.flatnonzero(match >= 0)
     error = echoes.time_err[rows].astype(np.float64)
     weight = 1.0 / np.maximum(np.where(np.isfinite(error), error, 1.0), 1e-3) ** 2
@@ -228,4 +233,8 @@ def _shared_offset(
     waveform = echoes.waveform[rows]
     total = np.bincount(waveform, weight, minlength=n)
     offset = np.bincount(waveform, weight * difference, minlength=n) / np.where(total > 0, total, 1.0)
-    return offset, total > 0
+    others = np.bincount(waveform, minlength=n) - 1
+    scatter = np.bincount(waveform, weight * (difference - offset[waveform]) ** 2, minlength=n)
+    contradict = (others > 0) & (scatter > others)
+    doubt = np.sqrt(np.where(contradict, scatter, 0.0) / (np.maximum(others, 1) * np.where(total > 0, total, 1.0)))
+    return offset, doubt, total > 0

@@ -30,10 +30,11 @@ def incidence_angle_normals(
     `run` computes it in a second pass, when all points of the strip are there; a block alone gives no-data. The plane
     is fitted to all points within the radius that are not outliers. It needs neither sensor nor divergence.
 
-    No-data where there are fewer than min_points; where the points are no plane (plants: less than 60 % of them in it,
-    thicker than a fifth of its width, or the echo not in it) or clearly two (a ridge, a valley or a step close by);
-    where the angle exceeds 80 degrees (one sweep of the scanner over plants makes a plane that contains its rays); and
-    where its error exceeds max_error. The error holds what two planes in place of one would change.
+    No-data where there are fewer than min_points, or only two scan lines of them (any two lines are in a plane); where
+    the points are no plane (plants: less than 60 % of them in it, thicker than a fifth of its width, or the echo not in
+    it) or clearly two (a ridge, a valley or a step close by); where the angle exceeds 80 degrees (one sweep of the
+    scanner over plants makes a plane that contains its rays); and where its error exceeds max_error. The error holds
+    what two planes in place of one would change.
 
     Parameters
     ----------

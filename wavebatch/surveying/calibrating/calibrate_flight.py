@@ -20,9 +20,7 @@ from wavebatch.surveying.calibrating.adjust_flight import Adjustment, adjust_con
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
 from wavebatch.surveying.calibrating.target_file import Target
-from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
-from wavebatch.surveying.targets import (
+from wavebatch.surveying.calibrating.targets import (
     MOST_ECHOES,
     CalibrationOptions,
     build_calibration,
@@ -30,6 +28,8 @@ from wavebatch.surveying.targets import (
     measure_ranging,
     open_strip_source,
 )
+from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
 
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""

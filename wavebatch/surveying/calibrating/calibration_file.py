@@ -86,6 +86,7 @@ def parse_calibration(text: str, name: str) -> Calibration:
         When a key is unknown, missing or out of its range, or where section_constant does not fit the others.
     """
     table = parse_toml(text, name)
+    table.check_kind("calibration")
     table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, "channel", "flight_strip", "target", "fingerprint"))
     table.check_schema(CALIBRATION_SCHEMA)
     values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}

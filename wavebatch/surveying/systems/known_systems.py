@@ -25,8 +25,9 @@ from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.flags import RINGING_REACH
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import pulse_shape, shape_limits
-from wavebatch.surveying.lone_echoes import find_strongest, fit_lone
-from wavebatch.surveying.measure import measure_gaussian, subtract_echoes
+from wavebatch.surveying.measuring.lone_echoes import find_strongest, fit_lone
+from wavebatch.surveying.measuring.noise_and_width import measure_gaussian
+from wavebatch.surveying.measuring.residuals import subtract_echoes
 from wavebatch.surveying.systems.system_table import read_system
 
 LEAST_ECHOES = 8

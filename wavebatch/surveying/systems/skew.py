@@ -15,8 +15,8 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.free_skew import MOST_SKEW, SkewPrior, fit_skews
 from wavebatch.kernels.fit.least_squares import OUTSIDE, Limits, Windows
 from wavebatch.stages.noise import pooled
-from wavebatch.surveying.lone_echoes import MIN_SNR
-from wavebatch.surveying.measure import ENOUGH_TO_LEARN, FEW, find_edge
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
 
 MOST_FITTED = 400
 """Echoes whose skews are measured; more do not make the skew of the strip better known."""

@@ -11,13 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns, name_columns
 from wavebatch.batch.preflight import check_outputs, plan_memory
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.selection import build_selection
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns, name_columns
 from wavebatch.core.condition import Condition
-from wavebatch.core.errors import ConfigError
+from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
@@ -310,6 +311,7 @@ def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, 
     """Raise ConfigError for files that the chain, or another option, would ignore."""
     if sensor.trajectory is not None and sensor.height is not None:
         raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
+    _check_trajectory(sensor)
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
              "--attenuation": air, "--pulse-energy": energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
@@ -318,3 +320,14 @@ def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, 
                   "--pulse-energy": "amplitude_normalized"}  # fmt: skip
         stage = f"attribute.{stages.get(option, 'range')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
+
+
+def _check_trajectory(sensor: SensorRequest) -> None:
+    """Raise ConfigError once where the trajectory cannot be read, not for each strip after its survey."""
+    if sensor.trajectory is None:
+        return
+    try:
+        with reporting_reads(sensor.trajectory, "trajectory "), open_regular(sensor.trajectory):
+            pass
+    except InputError as error:
+        raise ConfigError(str(error)) from error

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from wavebatch.batch.job import RunOptions, StripJob, choose_columns
 from wavebatch.batch.run import run_batch
 from wavebatch.batch.strip_task import BatchOptions
-from wavebatch.batch.unit import RunOptions, StripJob, choose_columns
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile

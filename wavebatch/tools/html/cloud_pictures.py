@@ -13,6 +13,7 @@ import numpy as np
 
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.columns_reader import ColumnsReader
+from wavebatch.files.las.crs_name import describe_crs
 from wavebatch.tools.html.drawing.charts import CloudMap, draw_histogram, draw_map
 
 SIDE = 240
@@ -51,7 +52,8 @@ def picture_cloud(path: Path, columns: Sequence[str]) -> tuple[list[str], list[s
             for facts, edges, number, out in zip(reader.facts, bins, counts, beyond, strict=True)
             if edges is not None
         ]
-        return histograms, [draw_map(one) for one in cells.finish([(f.name, f.unit) for f in reader.facts])]
+        names = [(facts.name, facts.unit) for facts in reader.facts]
+        return histograms, [draw_map(one) for one in cells.finish(names, describe_crs(path)[1])]
 
 
 def _choose_bins(values: np.ndarray) -> np.ndarray | None:
@@ -91,10 +93,10 @@ class _Cells:
             self.known[place] += np.bincount(cell[known], minlength=len(self.count))
             self.sums[place] += np.bincount(cell[known], values[known], minlength=len(self.count))
 
-    def finish(self, names: list[tuple[str, str]]) -> list[CloudMap]:
-        """The map of density, and the mean of each column."""
+    def finish(self, names: list[tuple[str, str]], length: str) -> list[CloudMap]:
+        """The map of density, and the mean of each column; length: unit of the coordinates."""
         density = np.where(self.count > 0, self.count / self.size**2, np.nan)
-        maps = [("points per area", "1/m2", density)]
+        maps = [("points per area", f"1/{length}2", density)]
         with np.errstate(invalid="ignore", divide="ignore"):
             maps += [(f"mean {name}", unit, total / number)
                      for (name, unit), total, number in zip(names, self.sums, self.known, strict=True)
@@ -107,7 +109,7 @@ class _Cells:
             if len(known):
                 shown = tuple(np.percentile(known, _SHOWN).tolist())
                 grid = values.reshape(self.rows, self.columns)
-                found.append(CloudMap(title, unit, grid, extent, float(f"{self.size:.3g}"), shown, note))
+                found.append(CloudMap(title, unit, grid, extent, float(f"{self.size:.3g}"), length, shown, note))
         return found
 
 

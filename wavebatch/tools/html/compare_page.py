@@ -62,6 +62,7 @@ def _echo_parts(result: Comparison | Matchup, one: Any, broken: Sequence[str]) -
 
 
 def _summarise(one: Comparison) -> str:
+    left = f"{one.left_out_a:,} points of A, {one.left_out_b:,} of B"
     return markup.facts([
         ("A", one.a), ("B", one.b), ("matched by", f"{one.matched_by}, within {one.tolerance_ns:g} ns"),
         ("echoes of A", f"{one.echoes_a:,}"), ("echoes of B", f"{one.echoes_b:,}"),
@@ -70,6 +71,7 @@ def _summarise(one: Comparison) -> str:
         ("correctness", markup.number(one.correctness, ".4f")),
         ("same number of echoes", f"{markup.number(one.exact_count, '.4f')} of {one.pulses:,} pulses"),
         ("more points in A", markup.number(one.gain, "+.2%")),
+        *([("left out by --where", left)] if one.left_out_a or one.left_out_b else []),
     ])  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.core.units import MAD_TO_STD
+from wavebatch.core.units import FWHM_PER_SIGMA, MAD_TO_STD
 
 FIGURES: dict[str, tuple[str, str, float]] = {
     "echoes": ("echoes per waveform", ".3f", 0.02),
@@ -40,18 +40,19 @@ def measure_strip(report: Mapping[str, Any]) -> dict[str, float]:
     counts, quality = report["counts"], report["quality"]
     system = report["strip"]["system"]
     passed = sum(counts["passed_through"].values())
+    rows = counts["points_out"] + sum(counts["left_out"].values())
 
     def percent(number: float, whole: float) -> float:
         return 100 * number / whole if whole else math.nan
 
     return {
         "echoes": counts["echoes"] / counts["waveforms"] if counts["waveforms"] else math.nan,
-        "passed": percent(passed, counts["points_out"]),
+        "passed": percent(passed, rows),
         "added": percent(counts["added_echoes"], counts["echoes"]),
         "weak": percent(counts["flags"]["WEAK"], counts["points_out"]),
         "amplitude": _known(quality["amplitude_dn"]["p50"]),
         "width": _known(quality["echo_width_ns"]["p50"]),
-        "pulse": 2.354820045 * system["sigma_ref_ns"],
+        "pulse": FWHM_PER_SIGMA * system["sigma_ref_ns"],
         "noise": system["noise_std_dn"],
     }
 

@@ -26,12 +26,14 @@ MOST_PARTS = 40
 
 @dataclass(frozen=True, slots=True)
 class _Strip:
-    """A strip of the batch; report None where it failed or its report cannot be read."""
+    """A strip of the batch."""
 
     outcome: Outcome
     number: int
     cloud: Path
-    report: dict[str, Any] | None
+    report: Path
+    has_report: bool
+    """False where it failed, or its report cannot be read."""
     figures: dict[str, float]
 
 
@@ -41,7 +43,7 @@ def write_run_page(target: Path, result: BatchResult, folder: Path, command: str
     marks = find_outliers([strip.figures for strip in strips])
     # Strips to look at come first where there are too many to show all.
     order = sorted(strips, key=lambda strip: (not marks[strip.number], strip.number))
-    shown = {strip.number for strip in [one for one in order if one.report is not None][:MOST_PARTS]}
+    shown = {strip.number for strip in [one for one in order if one.has_report][:MOST_PARTS]}
     write_page(target, _title(strips), _parts(result, strips, marks, shown, command))
 
 
@@ -51,21 +53,25 @@ def _title(strips: Sequence[_Strip]) -> str:
 
 
 def _read_strip(outcome: Outcome, number: int, folder: Path) -> _Strip:
-    report = None
-    if outcome.status != "failed":
-        try:
-            report = json.loads(report_path(outcome.job, folder).read_text("utf-8"))
-        except (OSError, ValueError):  # moved or changed after the run; the index then has its counts only
-            report = None
+    place = report_path(outcome.job, folder)
+    report = None if outcome.status == "failed" else _read_report(place)
     figures_ = {} if report is None else measure_strip(report)
-    return _Strip(outcome, number, cloud_path(outcome.job, folder), report, figures_)
+    return _Strip(outcome, number, cloud_path(outcome.job, folder), place, report is not None, figures_)
+
+
+def _read_report(path: Path) -> dict[str, Any] | None:
+    """A report; None where it was moved or changed after the run: the index then has the strip's counts only."""
+    try:
+        return json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        return None
 
 
 def _parts(
     result: BatchResult, strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set[int], command: str
 ) -> Iterator[str]:
-    report = result.report.to_json()
-    counts = report["counts"]
+    whole = result.report.to_json()
+    counts = whole["counts"]
     yield _summary(result, counts)
     failed = [f"{one.outcome.job.path}: {' '.join(str(one.outcome.error).split())}" for one in strips
               if one.outcome.error is not None]  # fmt: skip
@@ -73,11 +79,13 @@ def _parts(
         yield markup.section("Failed strips", markup.bullets(failed, "warning"), mark="failed")
     if len(strips) > 1:
         yield _index(strips, marks, shown)
-        yield markup.section("All strips together", count_tables(counts), figures(figures_of(report["quality"])),
-                             flag_table(counts))  # fmt: skip
+        points = strips[0].outcome.job.options.points  # the same for all
+        yield markup.section("All strips together", count_tables(counts, points),
+                             figures(figures_of(whole["quality"])), flag_table(counts))  # fmt: skip
     for strip in strips:
-        if strip.number in shown and strip.report is not None:
-            body = draw_strip(strip.outcome.job.path, strip.cloud, strip.report)
+        report = _read_report(strip.report) if strip.number in shown else None  # one at a time: there may be thousands
+        if report is not None:
+            body = draw_strip(strip.outcome.job.path, strip.cloud, report)
             notes = [f"{FIGURES[key][0]}: {words}" for key, words in marks[strip.number].items()]
             unusual = markup.bullets([f"differs from the other strips: {note}" for note in notes], "warning")
             heading = markup.section(strip.outcome.job.path.name, unusual, body, mark=f"strip-{strip.number}")
@@ -97,6 +105,8 @@ def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
         ("passed through", f"{passed:,}"),
         ("points out", f"{counts['points_out']:,}"),
     ]
+    left = sum(counts["left_out"].values())
+    cards[-1:-1] = [("left out", f"{left:,}")] if left else []
     body = "".join(f'<div class="card"><b>{markup.text(value)}</b>{markup.text(name)}</div>' for name, value in cards)
     lines = [f"{states.count('skipped')} of the strips were up to date (--resume)."] if "skipped" in states else []
     if result.advice:
@@ -121,7 +131,7 @@ def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set
         if len(strips) >= FEWEST
         else f"Strips are held against each other where there are at least {FEWEST}."
     ]
-    if len(shown) < sum(strip.report is not None for strip in strips):
+    if len(shown) < sum(strip.has_report for strip in strips):
         notes.append(
             f"{len(shown)} strips have a part of their own below, marked ones first; `run --resume --html` of single "
             "strips shows the others."

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.counts import COUNTS
+from wavebatch.batch.counts import COUNTS, LEFT_OUT, list_sums
 from wavebatch.core.echoes import FLAG_MEANINGS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.no_data import REASONS, NoData
@@ -33,7 +33,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     choice = report["choice"]
     parts = [
         warnings,
-        markup.section("Counts", count_tables(report["counts"]), level=3),
+        markup.section("Counts", count_tables(report["counts"], report["options"]["points"]), level=3),
         markup.section("Survey", markup.paragraph(f"The survey is from: {survey['from']}."),
                        draw_survey(system, survey["figures"], survey["waveforms"]), level=3),
         markup.section("Decisions", markup.paragraph(f"Chain: {choice['chain']}, chosen by: {choice['by']}."),
@@ -48,37 +48,31 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     return "\n".join(filter(None, parts))
 
 
-def count_tables(counts: Mapping[str, Any]) -> str:
-    """Every count with its meaning, and the sums that must hold."""
+def count_tables(counts: Mapping[str, Any], points: str) -> str:
+    """Every count with its meaning, and the sums that must hold; points: what was written, as in `list_sums`."""
     rows = [[name, counts[name], meaning] for name, meaning in COUNTS.items()]
     rows += [[f"passed through: {name}", number, EchoFlag[name].meaning]
              for name, number in counts["passed_through"].items()]  # fmt: skip
-    return markup.table(["count", "number", "meaning"], rows) + list_sums(counts)
+    rows += [[f"left out: {name}", number, f"points that {LEFT_OUT[name]}"]
+             for name, number in counts["left_out"].items() if number]  # fmt: skip
+    return markup.table(["count", "number", "meaning"], rows) + draw_sums(counts, points)
 
 
-def list_sums(counts: Mapping[str, Any]) -> str:
+def draw_sums(counts: Mapping[str, Any], points: str) -> str:
     """The sums that the counts must give, with their numbers; one that does not hold is marked."""
-    get, passed = counts.__getitem__, sum(counts["passed_through"].values())
-    written = get("points_out") - passed
-    sums = [
-        ("points of the strip", "points_in",
-         ["points_with_waveform", "points_without_waveform", "points_broken"]),
-        ("points with a waveform", "points_with_waveform", ["matched_returns", "unmatched_returns", "no_echo_returns"]),
-        ("echoes", "echoes", ["matched_returns", "added_echoes"]),
-    ]  # fmt: skip
     rows = []
-    for title, whole, parts in sums:
-        total = sum(map(get, parts))
-        words = " + ".join(f"{get(part):,} {part}" for part in parts)
-        rows.append([title, get(whole), words, _holds(total == get(whole))])
-    kind = "echoes" if written == get("echoes") else "matched_returns"
-    words = f"{get(kind):,} {kind} + {passed:,} passed through"
-    rows.append(["points written", get("points_out"), words, _holds(get(kind) + passed == get("points_out"))])
+    for name, parts in list_sums(counts, points).items():
+        fine = sum(parts.values()) == counts[name]
+        check = "adds up" if fine else markup.Cell('<span class="mark">does not add up</span>')
+        rows.append([name, counts[name], _write_sum(parts), check])
     return markup.table(["sum", "number", "is", "check"], rows, caption="Sums that must hold")
 
 
-def _holds(fine: bool) -> Any:
-    return "adds up" if fine else markup.Cell('<span class="mark">does not add up</span>')
+def _write_sum(parts: Mapping[str, int]) -> str:
+    """`2 echoes + 1 passed through: NO_ECHO - 1 left out: where`; parts of 0 are named only where there is no other."""
+    shown = {name: number for name, number in parts.items() if number} or parts
+    words = "".join(f" {'-' if number < 0 else '+'} {abs(number):,} {name}" for name, number in shown.items())
+    return words.removeprefix(" + ").strip()
 
 
 def flag_table(counts: Mapping[str, Any]) -> str:

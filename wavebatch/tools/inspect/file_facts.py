@@ -7,15 +7,12 @@ are read once, in bounded memory, because headers are often wrong.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import fields
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wavebatch.batch.unit import RunOptions
 from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
@@ -27,6 +24,7 @@ from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, read_classes, split_numbers
 from wavebatch.surveying.inspect_strip import describe_strip
+from wavebatch.tools.inspect.account import describe_account
 
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
@@ -39,23 +37,30 @@ _MOST_SOURCES = 20
 def describe_file(path: Path, *, direction: str = "auto", headerless: bool = False) -> dict[str, Any]:
     """Return everything that `wavebatch info` shows of a file, as plain values.
 
-    direction, headerless: as for `describe_strip`, for files with waveforms. Raises InputError where the file cannot be
-    read.
+    direction, headerless: as for `describe_strip`, for files with waveforms. What cannot be read of the packets or the
+    points goes to `problems`. Raises InputError where the header cannot be read.
     """
     checked = read_checked_header(path, waveforms=False)
     header = checked.header
+    facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
     if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
-        facts = describe_strip(path, direction=direction, headerless=headerless)
-    else:
-        facts = {"file": str(path), "bytes": header.file_size, "problems": [], "warnings": [], "notes": []}
+        facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
     accounts = read_accounts(header)
-    facts["provenance"] = [_describe_account(account) for account in accounts]
+    facts["provenance"] = [describe_account(account) for account in accounts]
     try:
         facts |= _describe_points(path, header, bool(accounts))
     except InputError as error:
         facts["problems"] = [*facts["problems"], " ".join(str(error).split()).removeprefix(f"{path}: ")]
     return without_nan(facts)
+
+
+def _describe_waveforms(path: Path, direction: str, headerless: bool) -> dict[str, Any]:
+    """What a strip holds besides points; the reason where its packets cannot be found, because points still can."""
+    try:
+        return describe_strip(path, direction=direction, headerless=headerless)
+    except InputError as error:
+        return {"problems": [" ".join(str(error).split()).removeprefix(f"{path}: ")]}
 
 
 def _describe_header(path: Path, checked: CheckedHeader) -> dict[str, Any]:
@@ -95,48 +100,6 @@ def _describe_extra(record: ExtraRecord) -> dict[str, Any]:
         "scale": None if record.scaling is None else record.scaling[0],
         "no_data": None if no_data is None else [str(value) for value in no_data.tolist()],
     }
-
-
-def _describe_account(account: Mapping[str, Any]) -> dict[str, Any]:
-    """What made a cloud: version, command, chain, input; what the account does not hold is None."""
-    options, request, source = (_table(account.get(name)) for name in ("options", "request", "input"))
-    return {
-        "version": account.get("wavebatch"),
-        "command": _name_command(options, request, source),
-        "input": source.get("file"),
-        "chain": account.get("chain"),
-        "chosen_by": _table(account.get("choice")).get("by"),
-        "columns": _table(account.get("columns")),
-    }
-
-
-def _table(value: Any) -> dict[str, Any]:
-    return value if isinstance(value, dict) else {}
-
-
-def _name_command(options: Mapping[str, Any], request: Mapping[str, Any], source: Mapping[str, Any]) -> str:
-    """A command that makes this cloud, where the files that it names are at hand."""
-    parts = ["wavebatch run", str(source.get("file", "STRIP")), "-o DIR"]
-    by = str(request.get("chain", ""))
-    if by.startswith("tolerance"):
-        parts.append(f"--tolerance {by.removeprefix('tolerance ').replace(' ', '')}")
-    elif by != "auto":
-        parts.append("--chain CHAIN.toml")
-    sensor = _table(request.get("sensor"))
-    trajectory = _table(sensor.get("trajectory"))
-    parts += [f"--trajectory {trajectory.get('file', 'FILE')}"] if trajectory else []
-    parts += [f"--flight-height {sensor['height']}"] if sensor.get("height") else []
-    parts += ["--survey flight"] if request.get("survey") == "flight" else []
-    parts += ["--system SYSTEM.toml"] if request.get("system") and request.get("survey") != "flight" else []
-    parts += ["--calibration CAL.toml"] if request.get("calibration") else []
-    for field in fields(RunOptions):
-        value = options.get(field.name, field.default)
-        if field.name == "columns":
-            continue  # the columns that were written are listed by themselves
-        if value != field.default:
-            name = f"--{field.name.replace('_', '-')}"
-            parts.append(name if value is True else f"{name} {value}")
-    return " ".join(parts)
 
 
 class _Totals:

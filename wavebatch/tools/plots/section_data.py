@@ -107,8 +107,8 @@ def cut_section(
         raise clouds.complain(total)
     if not sample.seen:
         raise InputError(
-            f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} of the line from {start[0]:.10g} "
-            f"{start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
+            f"{paths[0]}: none of {total.values} points lies within {0.5 * width:g} {unit} of the line from "
+            f"{start[0]:.10g} {start[1]:.10g} to {end[0]:.10g} {end[1]:.10g}"
         )
     places = sample.read()["place"]
     low, high = choose_frame(places[:, 1], length)

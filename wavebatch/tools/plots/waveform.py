@@ -70,6 +70,8 @@ class WaveformView:
     """Times of the returns of the input [ns], f8 (r,)."""
     seen: DetectorSignal | None = None
     """What the detector saw, if it was asked for."""
+    sensor_error: float = 0.0
+    """Error of the sensor's position along the ray [m], as far as it is known."""
 
     @property
     def spacing(self) -> float:
@@ -133,19 +135,19 @@ def read_views(
 
 def add_ranges(
     chain: Chain, reader: StripReader, scan: StripScan
-) -> tuple[Chain, Callable[[WaveformBlock], WaveformBlock] | None]:
-    """The chain with the distances of echoes from the sensor, and the function that gives blocks their sensor.
+) -> tuple[Chain, Callable[[WaveformBlock], WaveformBlock] | None, float]:
+    """The chain with the distances of echoes from the sensor, the function that gives blocks their sensor, its error.
 
-    The chain as it is, and None, where it computes no positions or those of the sensor are not known.
+    The chain as it is, None and 0, where it computes no positions or those of the sensor are not known.
     """
     if not {"x", "y", "z"} <= {*chain.makes}:
-        return chain, None
+        return chain, None, 0.0
     try:
         source = find_sensor(reader, scan, SensorRequest())
     except InputError:  # coordinates in feet or degrees
-        return chain, None
+        return chain, None, 0.0
     step = () if "range" in chain.makes else (Step(STAGES["attribute.range"]),)
-    return Chain((*chain.steps, *step), chain.name), source.fill
+    return Chain((*chain.steps, *step), chain.name), source.fill, source.error
 
 
 def describe_chain(chain: Chain) -> str:
@@ -188,7 +190,7 @@ def build_views(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
                 np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table,
-                returns, seen[row],
+                returns, seen[row], system.sensor_error,
             )  # fmt: skip
         )
     return views

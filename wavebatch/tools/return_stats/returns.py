@@ -37,6 +37,9 @@ from wavebatch.tools.return_stats.dead_zones import DeadZone, Distances
 _MOST_PAIR = 15
 """Classes of pairs by return number; the last one holds all higher numbers."""
 
+_NOT_A_TIME = np.uint64(0x7FF8 << 48)
+"""Bits of a NaN: above the key of every GPS time that is a number and at least 0."""
+
 _ROW = np.dtype([("key", "<u8"), ("xyz", "<f8", 3), ("number", "u1"), ("total", "u1"), ("echo", "?")])
 _SURE = 3.0
 """A sensor limit is reported if pulses with the most returns outnumber those with one less by so many standard
@@ -148,6 +151,9 @@ def _tally_cloud(path: Path, divisions: Sequence[Division], where: Condition | N
                 buckets.add(shaped, lambda part: (np.arange(len(part)), spread_keys(part["key"], number)))
             for bucket in range(number):
                 tally.add_pulses(buckets.read(bucket))
+        if keys.untimed:
+            notes = f"{keys.untimed} points have no GPS time (0 or NaN): pulses by their return numbers there"
+            tally.notes.append(notes)
         tally.left_out = reader.left_out
     return tally
 
@@ -157,16 +163,27 @@ class _Keys:
 
     def __init__(self, by_time: bool) -> None:
         self._by_time, self._pulse, self._last = by_time, 0, 255
+        self.untimed = 0
+        """Points without a time of their own, while others have one."""
 
     def of(self, rows: np.ndarray) -> np.ndarray:
         """Pulse number of each row, u8 (n,)."""
-        if self._by_time:
-            return time_keys(rows["gps_time"])
-        if not len(rows):
+        if not self._by_time:
+            return self._count_up(rows["number"])
+        keys = time_keys(rows["gps_time"])
+        # Hundreds of points without a time are no pulse of hundreds of returns.
+        missing = np.flatnonzero(np.isnan(rows["gps_time"]) | (rows["gps_time"] == 0))
+        keys[missing] = _NOT_A_TIME + self._count_up(rows["number"][missing])
+        self.untimed += len(missing)
+        return keys
+
+    def _count_up(self, numbers: np.ndarray) -> np.ndarray:
+        """Runs of rising return numbers, counted from 1, u8 (n,); goes on where the last piece ended."""
+        if not len(numbers):
             return np.empty(0, np.uint64)
-        starts = rows["number"] <= np.concatenate([[self._last], rows["number"][:-1]])
+        starts = numbers <= np.concatenate([[self._last], numbers[:-1]])
         pulse = self._pulse + np.cumsum(starts)
-        self._pulse, self._last = int(pulse[-1]), int(rows["number"][-1])
+        self._pulse, self._last = int(pulse[-1]), int(numbers[-1])
         return pulse.astype(np.uint64)
 
 

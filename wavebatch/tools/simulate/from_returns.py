@@ -189,8 +189,8 @@ def synthesize_strip(
     the first one. The ray runs from the first to the last return; lone returns take the direction that the pulses
     around them have at their scan angle. All points keep their coordinates and fields (extra bytes are left out); point
     formats 0 to 3 become 4 and 5, 6 to 8 become 9 and 10. Memory does not grow with the cloud.
-    Raises InputError where the cloud cannot be read or has no GPS times, or the target exists, ConfigError where it
-    lacks a column, or a column holds no widths or shares; no file remains then.
+    Raises InputError where the cloud cannot be read, has no GPS times or is not in metres, or the target exists,
+    ConfigError where it lacks a column, or a column holds no widths or shares; no file remains then.
     """
     options = options or SynthesisOptions()
     recordings = [options.recording(length) for length in _LENGTHS]
@@ -199,6 +199,10 @@ def synthesize_strip(
             raise InputError(
                 f"{cloud}: point format {reader.point_format} has no GPS times, which are needed to group points into "
                 "pulses; give a cloud of another point format"
+            )
+        if reader.metres != (1.0, 1.0, 1.0):
+            raise InputError(
+                f"{cloud}: coordinates are {reader.unit}, but times along a ray need metres; project it to metres first"
             )
         model = partial(open_light, reader.path, options.radar, options.sigma, options.spacing,
                         widths=options.widths, shares=options.shares)  # fmt: skip

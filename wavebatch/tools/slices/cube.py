@@ -22,6 +22,9 @@ from wavebatch.tools.slices.lines import ScanLine
 MOST_VALUES = 200_000_000
 """Most values of a cube (800 MB): it is built in memory."""
 
+_LARGEST = 1e30
+"""Largest time [ns] and sample [DN]; damaged files have larger ones."""
+
 
 class CubeBuilder:
     """Collects scan lines, one after the other, and writes them as a cube."""
@@ -102,9 +105,6 @@ def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
         depth = depth - depth[known].min()
     start = np.where(known, depth / np.where(known, speed, 1.0), 0.0)
     return np.split(start, np.cumsum([len(line) for line in lines])[:-1])
-
-_LARGEST = 1e30
-"""Largest time [ns] and sample [DN]; damaged files have larger ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

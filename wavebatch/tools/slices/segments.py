@@ -34,6 +34,8 @@ class SliceOptions:
     """Least length of a segment [pixels]: a pixel is the length of a sample in a plane, else a sample or a pulse."""
     most: int = 20
     """Most segments per slice."""
+    floor: float = 0.0
+    """Samples up to this far above their level are not searched [DN]: the noise of the strip."""
 
     def __post_init__(self) -> None:
         if self.geometry not in GEOMETRIES:
@@ -116,6 +118,7 @@ class Segment:
 def cut_slice(line: ScanLine, options: SliceOptions) -> Slice:
     """The slice of a scan line."""
     limit = np.float64(options.std) * line.value.std(dtype=np.float64)  # no float32 holds the largest --std
+    limit = max(limit, options.floor)  # a slice of water and sky has lines of noise
     roi = line.value > limit
     zero, start = np.zeros(3), np.zeros(len(line))
     if options.geometry == "time":

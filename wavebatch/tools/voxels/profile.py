@@ -25,7 +25,7 @@ from wavebatch.stages.detect.candidates import signal_above
 from wavebatch.stages.noise import pooled
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.stages.reference_pulse import reference_pulse
-from wavebatch.surveying.learn_pulse import AFTER, BEFORE
+from wavebatch.surveying.measuring.learn_pulse import AFTER, BEFORE
 
 METHODS = ("richardson_lucy", "gold", "wiener")
 ITERATIONS = {"richardson_lucy": 40, "gold": 100}

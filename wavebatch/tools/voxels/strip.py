@@ -34,7 +34,7 @@ from wavebatch.surveying.system_file import SavedSurvey, describe_system
 from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.voxels.ceiling import Ceiling, find_ceiling
 from wavebatch.tools.voxels.floor import Floor
-from wavebatch.tools.voxels.gap import SAMPLED, find_rule
+from wavebatch.tools.voxels.gap import SAMPLED, RatioFacts, find_rule
 from wavebatch.tools.voxels.grid import COLUMNS, VoxelGrid, energy_unit
 from wavebatch.tools.voxels.output import VoxelSpace, check_target, write_voxels
 from wavebatch.tools.voxels.profile import Deconvolution, deconvolve_block
@@ -192,21 +192,28 @@ def voxelize_strip(
                 voxels=voxels,
                 profiles=None if profiles is None else str(profiles),
                 profile_samples=0 if writer is None else writer.samples,
-                size=grid.size,
-                shape=tuple(grid.shape.tolist()),
-                origin=tuple((grid.low * grid.size).tolist()),
-                outside=grid.outside,
-                energy=grid.energy,
-                unknown=grid.unknown,
-                method=options.deconvolution.method,
+                method=deconvolution.method,
                 pulse_fwhm=pulse.sigma_ref * FWHM_PER_SIGMA,
                 noise=pulse.noise_std,
                 sensor=None if calibration is None else source.kind,
-                reflectance_ratio=ratio.ratio,
-                reflectance_ratio_err=ratio.error,
-                reflectance_ratio_source=ratio.source,
                 warnings=doubts,
+                **_list_figures(grid, ratio),
             )
+
+
+def _list_figures(grid: VoxelGrid, ratio: RatioFacts) -> dict[str, Any]:
+    """What the summary says about the grid and the reflectance ratio."""
+    return {
+        "size": grid.size,
+        "shape": tuple(grid.shape.tolist()),
+        "origin": tuple((grid.low * grid.size).tolist()),
+        "outside": grid.outside,
+        "energy": grid.energy,
+        "unknown": grid.unknown,
+        "reflectance_ratio": ratio.ratio,
+        "reflectance_ratio_err": ratio.error,
+        "reflectance_ratio_source": ratio.source,
+    }
 
 
 def _write_both(

@@ -35,8 +35,8 @@ class VoxelFile:
             raise ConfigError(f"{path}: voxels have no echo_flags to select by")
         what, remedy = "voxels of `wavebatch voxelize`", "make them again"
         columns = {f"{column.name}?": ("fu", 1) for column in COLUMNS}
-        facts = {"index": ("i", 2), "origin": ("f", 1), "size": ("f", 0), "crs": ("U", 0), "meta": ("U", 0)}
-        self._data = read_npz(path, {**facts, **columns}, what, remedy)
+        needed = {"index": ("i", 2), "origin": ("f", 1), "size": ("f", 0), "crs": ("U", 0), "meta": ("U", 0)}
+        self._data = read_npz(path, {**needed, **columns}, what, remedy)
         self._index, self._origin = self._data["index"], self._data["origin"].astype(np.float64)
         self.size = float(self._data["size"])
         lengths = {len(self._data[column.name]) for column in COLUMNS if column.name in self._data}
@@ -52,8 +52,8 @@ class VoxelFile:
         name = selection.column
         if name is not None and name not in known:
             raise ConfigError(f"{path}: has no column {name!r}; {nearest(name, known)}")
-        facts = known.get(name)
-        unit, meaning = (facts.unit, facts.meaning) if facts else ("-", "")
+        drawn = known.get(name)
+        unit, meaning = (drawn.unit, drawn.meaning) if drawn else ("-", "")
         self.facts = ColumnFacts(name or "voxels", unit, meaning, 0.0)
 
     def read(self) -> Iterator[tuple[int, np.ndarray, Tally]]:

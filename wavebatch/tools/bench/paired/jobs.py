@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from wavebatch.batch.processes import Workers
-from wavebatch.batch.run import run_batch
+from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.unit import prepare_strip
+from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.tools.api.run import plan_run
@@ -188,9 +188,7 @@ def run_lap(strip: Path, folder: Path, jobs: int) -> Lap:
     before = _usage()
     result = run_batch(*planned)
     after = _usage()
-    for outcome in result.outcomes:
-        if outcome.error is not None:
-            raise outcome.error
+    _raise_failure(result)
     elapsed, own, workers = (late - early for early, late in zip(before, after, strict=True))
     return Lap(elapsed, own, workers, result.report.count("waveforms"))
 
@@ -203,8 +201,17 @@ def run_small(strip: Path, folder: Path) -> float:
         copy.write_bytes(strip.read_bytes())
     planned = plan_run(copies, folder / "clouds", jobs=2)
     _, before, _ = _usage()
-    run_batch(*planned)
-    return (_usage()[1] - before) / SMALL_STRIPS
+    result = run_batch(*planned)
+    _, after, _ = _usage()
+    _raise_failure(result)
+    return (after - before) / SMALL_STRIPS
+
+
+def _raise_failure(result: BatchResult) -> None:
+    """Raise the error of the first strip that failed: its time is not that of a run."""
+    for outcome in result.outcomes:
+        if outcome.error is not None:
+            raise outcome.error
 
 
 def _usage() -> tuple[float, float, float]:

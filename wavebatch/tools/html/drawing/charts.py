@@ -38,9 +38,11 @@ class CloudMap:
     values: np.ndarray
     """f8 (rows, columns), the first row is the southernmost; NaN without a value."""
     extent: tuple[float, float, float, float]
-    """West, east, south, north [m]."""
+    """West, east, south, north."""
     size: float
-    """Side of a cell [m]."""
+    """Side of a cell."""
+    length: str
+    """Unit of both."""
     shown: tuple[float, float]
     """Values at the ends of the colour scale."""
     note: str
@@ -82,7 +84,7 @@ def draw_pulse(system: SystemPulse, spacing: float, title: str = "System pulse")
 
 def draw_waveform(view: WaveformView, note: str = "") -> str:
     """A small picture of a waveform: samples, fit, echoes (up) and returns of the input (below)."""
-    near = _signal_span(view)
+    near = view.span
     inside = (view.time >= near[0]) & (view.time <= near[1])
     shown = view.samples[inside]
     curve = np.full(len(view.fine), np.nan) if view.fit is None else view.fit
@@ -108,19 +110,6 @@ def draw_waveform(view: WaveformView, note: str = "") -> str:
     words = [f"{len(peaks)} {'echo' if len(peaks) == 1 else 'echoes'}", *([note] if note else [])]
     names = sorted({flag.name for flag in EchoFlag for value in view.echoes.flags if int(value) & flag})
     return figure(chart.render(), ", ".join([*words, *names]))
-
-
-def _signal_span(view: WaveformView) -> tuple[float, float]:
-    """The part that holds echoes, returns and samples above the noise, with some room [ns]."""
-    high = view.time[np.nan_to_num(view.samples, nan=-np.inf) > view.baseline + 5 * view.std]
-    places = np.concatenate([view.echoes.time, view.returns, high])
-    end = float(view.time[-1]) if len(view.time) > 1 else 1.0
-    places = places[np.isfinite(places) & (places >= 0) & (places <= end)]
-    if not len(places):
-        return 0.0, end
-    room = 12 * view.spacing
-    low, top = max(0.0, float(places.min()) - room), min(end, float(places.max()) + room)
-    return (low, top) if top > low else (0.0, end)
 
 
 def _describe_echo(view: WaveformView, row: int) -> str:
@@ -167,18 +156,19 @@ def draw_counts(counts: Mapping[str, int] | Sequence[tuple[str, int]], *, title:
 
 
 def draw_map(found: CloudMap) -> str:
-    """A map of a column: cells coloured from the 2nd to the 98th percentile, north up, metres equal in both axes."""
+    """A map of a column: cells coloured from the 2nd to the 98th percentile, north up, equal scales."""
     rows, columns = found.values.shape
     west, east, south, north = found.extent
     wide = 420
     high = int(np.clip((wide - 80) * (north - south) / max(east - west, 1e-9), 120, 900)) + 78
     across = min(wide - 72, (high - 70) * (east - west) / max(north - south, 1e-9))
-    chart = Chart(Axis(0, east - west), Axis(0, north - south), title=found.title, labels=("m east", "m north"),
+    labels = f"{found.length} east", f"{found.length} north"
+    chart = Chart(Axis(0, east - west), Axis(0, north - south), title=found.title, labels=labels,
                   size=(int(across) + 72, high))  # fmt: skip
     chart.image(image_address(color_cells(found.values[::-1], *found.shown)))
     low, top = (tick_label(float(f"{value:.4g}")) for value in found.shown)
     words = (
-        f"dark {low} to bright {top} {found.unit}; {columns} x {rows} cells of {found.size:g} m; origin "
+        f"dark {low} to bright {top} {found.unit}; {columns} x {rows} cells of {found.size:g} {found.length}; origin "
         f"{west:.2f} E, {south:.2f} N{found.note}"
     )
     return figure(chart.render(), words)

@@ -10,20 +10,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
-import logging
 import pickle
 import platform
-import socket
-import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, InvalidStateError
+from concurrent.futures import BrokenExecutor, Future
 from pathlib import Path
 from typing import Any
 
-from wavebatch.batch.processes import settle, wait_uninterrupted
-from wavebatch.batch.worker_check import (
+from wavebatch.batch.workers.dask_client import connected, one_line, silent
+from wavebatch.batch.workers.futures import end_future, wait_uninterrupted
+from wavebatch.batch.workers.worker_check import (
     compare_workers,
     describe_worker,
     list_sizes,
@@ -37,19 +34,14 @@ from wavebatch.files.disk.temp_folders import owning_scratch, use_scratch
 
 PATIENCE = 60.0
 """Seconds without a worker, or without an answer of the scheduler, after which a cluster counts as lost."""
-_CONNECT = 4.0
-"""Seconds to wait for a connection, and for the scheduler's first answer."""
 _WORKERS = 10.0
 """Seconds to wait for the first worker."""
 _POLL = 5.0
 """Seconds between two questions to the scheduler."""
 _SAME = ("wavebatch", "numpy", "scipy")
 """Packages that must have one version everywhere, because results depend on them."""
-_SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
-"""Kinds of addresses that dask knows and that other machines can have."""
 _MISFIT = "misfit"
 """Answer of a worker that joined later and does not fit."""
-_LOUD = ("distributed", "distributed.client", "distributed.core", "distributed.utils_perf", "tornado", "asyncio")
 _ADVICE = "check that it runs, and run again with --resume: finished clouds are complete"
 
 
@@ -63,7 +55,7 @@ class Cluster:
     folder : Path
         Of the outputs; temporary files that workers share lie in it.
     files : sequence of Path
-        That all workers must see: strips and trajectories.
+        That all workers must see: `StripJob.files`.
     tell : callable, optional
         Called with the events of `run_batch`: here, of a worker that joins and does not fit.
 
@@ -101,8 +93,8 @@ class Cluster:
         if importlib.util.find_spec("distributed") is None:
             raise ConfigError(f"--scheduler: dask's distributed is not installed: {advise_install('distributed')}")
         with contextlib.ExitStack() as stack:
-            stack.enter_context(_silent())
-            self._client = stack.enter_context(_connected(self.address))
+            stack.enter_context(silent())
+            self._client = stack.enter_context(connected(self.address))
             self.limit = 2 * self._count_threads()
             self._check_versions()
             with reporting(self._folder):
@@ -211,7 +203,7 @@ class Cluster:
         try:
             return self._client.run(function, *arguments)
         except Exception as error:
-            raise ConfigError(f"--scheduler {self.address}: a worker cannot be asked: {_one_line(error)}") from error
+            raise ConfigError(f"--scheduler {self.address}: a worker cannot be asked: {one_line(error)}") from error
 
     def _translate(self, error: BaseException) -> BaseException:
         """The error of a call, in the words of wavebatch where it comes from the cluster."""
@@ -228,7 +220,7 @@ class Cluster:
         return error
 
     def _lost(self, reason: object) -> BrokenExecutor:
-        return BrokenExecutor(f"{self.address}: the cluster is lost ({_one_line(reason)}); {_ADVICE}")
+        return BrokenExecutor(f"{self.address}: the cluster is lost ({one_line(reason)}); {_ADVICE}")
 
 
 class _Promise(Future):
@@ -246,20 +238,17 @@ class _Promise(Future):
         self._remote.add_done_callback(self._take)
 
     def _take(self, remote: Any) -> None:
-        with contextlib.suppress(InvalidStateError):
-            try:
-                result, error = pickle.loads(remote.result())
-                if error == _MISFIT:
-                    self._put_aside(*result)
+        try:
+            result, error = pickle.loads(remote.result())
+            if error == _MISFIT:
+                self._put_aside(*result)
+                if not self.cancelled():
                     self._remote = self._send()
                     self._remote.add_done_callback(self._take)
-                    return
-            except BaseException as failure:
-                result, error = None, self._translate(failure)
-            if error is None:
-                self.set_result(result)
-            else:
-                self.set_exception(error)
+                return
+        except BaseException as failure:
+            result, error = None, self._translate(failure)
+        end_future(self, result, error)
 
     def cancel(self) -> bool:
         """Cancel the call, and release it so that the cluster drops it too."""
@@ -278,76 +267,6 @@ def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
         use_scratch(None)
 
 
-@contextlib.contextmanager
-def _connected(address: str) -> Iterator[Any]:
-    """A client of the cluster; ConfigError where it cannot be reached."""
-    from distributed import Client
-
-    try:
-        _knock(address)
-        _check_keys(address)
-        options = {"timeout": _CONNECT, "set_as_default": False, "name": "wavebatch"}
-        client = _call_in_time(_CONNECT + 0.5, lambda: Client(address, **options))
-    except Exception as error:
-        raise ConfigError(
-            f"--scheduler {address}: cannot be reached: {_one_line(error)}; give the address that dask scheduler prints"
-        ) from error
-    try:
-        yield client
-    finally:
-        with contextlib.suppress(Exception):
-            client.close(timeout=_POLL)
-
-
-def _knock(address: str) -> None:
-    """Raise OSError or ValueError where no scheduler listens; a client that fails can hang and leave threads."""
-    scheme, separator, place = address.rpartition("://")
-    if separator and scheme not in _SCHEMES:
-        raise ValueError(f"no scheduler has an address of the kind {scheme}://; known are {', '.join(_SCHEMES)}")
-    host, _, port = place.rpartition(":")
-    if not host or not port.isdigit():
-        raise ValueError("it has no host and port")
-    socket.create_connection((host.strip("[]"), int(port)), timeout=_CONNECT).close()
-
-
-def _check_keys(address: str) -> None:
-    """Raise ValueError where TLS is wanted and dask has no keys; a client that fails complains again when it ends."""
-    from distributed.security import Security
-
-    if address.startswith("tls://") and Security().get_connection_args("client").get("ssl_context") is None:
-        raise ValueError("dask has no certificate and key here (distributed.comm.tls in its configuration); set them")
-
-
-def _call_in_time(seconds: float, function: Callable) -> Any:
-    """The result of `function()`; TimeoutError where it takes longer, while its thread goes on."""
-    future: Future = Future()
-    threading.Thread(target=settle, args=(future, function), daemon=True).start()
-    return future.result(timeout=seconds)
-
-
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Silence dask's own messages on stderr: wavebatch reports the same in one line."""
-    import dask
-    import distributed  # noqa: F401 - creates the loggers that are silenced below
-
-    levels = {name: logging.getLogger(name).level for name in _LOUD}
-    quiet = dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TiB"})
-    with quiet, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            for name in _LOUD:
-                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-            yield
-        finally:
-            for name, level in levels.items():
-                logging.getLogger(name).setLevel(level)
-
-
 def _with_packets(path: Path) -> list[Path]:
     """The strip, and the packet file beside it."""
     return [path, *(file for file in (path.with_suffix(".wdp"), path.with_suffix(".WDP")) if file.exists())]
-
-
-def _one_line(reason: object) -> str:
-    return " ".join(str(reason).split())[:200] or type(reason).__name__

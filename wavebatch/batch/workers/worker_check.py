@@ -90,7 +90,7 @@ def travelling_call() -> Callable[[bytes, dict[str, str]], bytes]:
         import traceback
 
         try:
-            from wavebatch.batch.worker_check import describe_worker
+            from wavebatch.batch.workers.worker_check import describe_worker
 
             found = describe_worker()
         except Exception as error:  # an older wavebatch, or none

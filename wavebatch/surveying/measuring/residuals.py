@@ -1,4 +1,7 @@
-"""The parts of a survey: noise, width and shape of the system pulse, residuals and threshold, from isolated echoes."""
+"""What fits leave of a sample: noise outside of the echoes, its correlation, and its growth with the signal.
+
+The survey takes its noise from here once it has a pulse (docs/algorithms.md R3, H10 to H12).
+"""
 
 from __future__ import annotations
 
@@ -7,60 +10,18 @@ from itertools import combinations
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD, SQRT_PI
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import cut_windows
-from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_matrix
-from wavebatch.kernels.fit.next_echo import propose_echo
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.render import render_echoes
 from wavebatch.kernels.signal.filters import filter_autocorrelation, filter_energy, filter_symmetric, gaussian_taps
-from wavebatch.kernels.signal.noise import estimate_noise, keep_longest, residual_noise
-from wavebatch.kernels.signal.signal import transpose_samples
+from wavebatch.kernels.signal.noise import residual_noise
 from wavebatch.stages.clean import clean_block
 from wavebatch.stages.decompose.fit import adaptive
 from wavebatch.stages.detect.maximum import matched_filter
 from wavebatch.stages.noise import pooled as pooled_noise
-from wavebatch.stages.pulse_tables import clip_level, model_parameters, noise_factors, pulse_shape, shape_limits
-from wavebatch.surveying.lone_echoes import MIN_SNR, find_strongest, fit_lone
-
-MOST_ROUNDS = 12
-"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
-
-FAR_OFF = 0.1
-"""Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
-
-SETTLED = 0.01
-"""Change of the width, as a share of it, below which it stays."""
-
-FIRST_LOOK = 2048
-"""Waveforms from which the noise and the width to begin with are found."""
-
-RESIDUAL_LOOK = 4096
-"""Waveforms whose residuals are looked at."""
-
-FEW = 20
-"""Isolated echoes below which the width of the system pulse is a guess."""
-
-ENOUGH_TO_LEARN = 50
-"""Isolated echoes from which a pulse can be learned (R2)."""
-
-FIRST_WIDTH = 2.0
-"""First guess of the system pulse's width [samples]."""
-
-REPEATED, LEAST_REPEATED = 0.04, 25
-"""Share, and least number, of the clear echoes that must have nearly one width for it to be the pulse's."""
-
-REPEAT_SPAN = 0.06
-"""How far these widths may lie apart, as a share of them."""
-
-CLIMB = 0.10
-"""How far above the narrowest of them the pulse's width is looked for: three times the scatter of widths at SNR 40."""
-
-UNDITHERED, DITHERED = 0.35, 0.41
-"""Below a quiet noise of 0.35 DN rounding hides how large the noise is: up to 0.3 DN never leave the level's count.
-With the error of rounding that is 0.41 DN."""
+from wavebatch.stages.pulse_tables import model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.noise_and_width import DITHERED, ENOUGH_TO_LEARN, FEW, UNDITHERED
 
 WEAK = 60.0
 """Amplitude, over DITHERED, up to which the misfit of a learned pulse is less than rounding."""
@@ -68,158 +29,22 @@ WEAK = 60.0
 LEAST_WINDOW = 6
 """Samples outside of echoes from which a waveform counts for the noise."""
 
+CALM = 0.6
+"""Share of the waveforms, those with the least power in the pulse's filter, that the noise's correlation comes from."""
+
 OUTSIDE_REACH = 3.0
 """Widths of an echo around it that are its own, not noise."""
 
 SAME_NOISE = 1.1
 """Ratio of the noise of quiet samples and of residuals up to which they are the same noise."""
 
-LEAST_QUIET = 0.15
-"""Share of quiet samples below which noise comes from residuals of good fits."""
-
 GROWTH_REACH, GROWTH_STEP, GROWTH_CLASS = 1.5, 0.25, 60
 """Widths of an echo around it in which the growth of noise is looked for, steps of the lag there, and the echoes of a
 class of heights: misfit of the pulse is taken off by lag and class."""
 
-MISFIT_QUANTILE = 0.8
-"""Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
-
-SCATTERED = 1.4
-"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
-
-NOISE_PROMISE = 8.0
-"""Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
-
-CORE_REACH = 4.0
-"""Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
-
 COLOURED, MOST_COLOURED = 1.2, 10.0
 """Noise of a pulse over that of a sample from which noise is coloured, and the most that its variance may be over what
 fits leave at no signal."""
-
-TAIL_BEFORE, TAIL_AFTER = 6, 40
-"""Widths of the pulse before and after an echo in which its tail is measured."""
-
-LEAST_TAIL = 0.002
-"""Share of an echo below which its tail is as the pulse says."""
-
-
-def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
-    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
-
-    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
-    """
-    saturation = find_saturation(block.samples, block.digitizer.max_count)
-    few = thin_block(block, FIRST_LOOK)
-    width, last = first, first if known else 0.0
-    for _ in range(MOST_ROUNDS):
-        if abs(width - last) <= SETTLED * width:
-            break
-        system, last = _gaussian_system(few, width, saturation), width
-        width = _isolated_width(few, system)
-    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
-    last, width = width, _isolated_width(block, system)
-    if known and abs(width / last - 1) > FAR_OFF:
-        return measure_gaussian(block, width)
-    return replace(system, sigma_ref=width * block.spacing)
-
-
-def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
-    """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
-    saturation = find_saturation(block.samples, block.digitizer.max_count)
-    return _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
-
-
-def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
-    """About `number` waveforms spread over the block, at least as many where it has them."""
-    return block.rows(slice(None, None, max(len(block) // number, 1)))
-
-
-def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
-    """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
-    missing = None if block.missing is None else keep_longest(block.missing.T)
-    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
-    correlation = tuple(noise.correlation.tolist())
-    seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
-    known = noise.std if noise.share >= LEAST_QUIET else 0.0
-    hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
-    return SystemPulse(
-        sigma_ref=width * block.spacing,
-        baseline=noise.level,
-        baseline_spread=noise.spread,
-        recovery=float(noise.recovery * block.spacing),
-        noise_std=max(seen, noise.std, hidden),
-        noise_by_kind={"quiet": known, "quiet_smoothed": noise.smoothed_std, "quiet_pulse": seen},
-        correlation=correlation,
-        saturation=saturation,
-    )
-
-
-def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
-    """Width [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped.
-
-    Where most of them are at the edge of the widths that `system` allows it is that edge, so that the next round can
-    go beyond it; with too few of them the system's width stays.
-    """
-    n = len(block)
-    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
-    if system.baseline_spread > system.noise_std:
-        noise = pooled_noise(block, system)
-    echoes = fit_lone(block, noise, system, MIN_SNR)
-    free = (echoes.flags & int(EchoFlag.AT_BOUND)) == 0
-    widths, errors = echoes.sigma / block.spacing, echoes.sigma_err / block.spacing
-    if 2 * free.sum() > len(free):
-        widths, errors = widths[free], errors[free]
-    if len(widths) < FEW:
-        return system.sigma_ref / block.spacing
-    return float(np.clip(find_edge(widths, errors), 0.5, 50.0))
-
-
-def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
-    """Width of the system pulse: the narrowest width that echoes repeat.
-
-    Slopes and plants only widen echoes, so the pulse is at the lower edge of their widths; the most common width is
-    that of the canopy in a forest. A few narrower ones (spikes, cut echoes) do not move it: an edge is where
-    REPEATED of all echoes lie within REPEAT_SPAN of each other. From there the densest half within CLIMB is taken, so
-    that over level ground, where noise scatters the widths around that of the pulse, it is the centre.
-
-    Parameters
-    ----------
-    widths : (m,)
-        Of clear single echoes, any unit.
-    errors : (m,), optional
-        Their standard deviations. Widths that scatter by more than usual are allowed to lie further apart.
-
-    Returns
-    -------
-    float
-        In the unit of the widths.
-    """
-    typical = 0.0 if errors is None else float(np.median(errors / widths))
-    allowed, climb = max(REPEAT_SPAN, 3 * typical), max(CLIMB, 5 * typical)
-    ordered = np.log(np.sort(widths.astype(np.float64)))
-    hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
-    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
-    close = span <= allowed
-    first = int(np.argmax(close)) if close.any() else int(np.argmin(span))
-    near = ordered[first : np.searchsorted(ordered, ordered[first] + climb, side="right")]
-    half = max(len(near) // 2, min(2, len(near)))
-    inner = near[half - 1 :] - near[: len(near) - half + 1]
-    begin = int(np.argmin(inner))
-    return float(np.exp(np.median(near[begin : begin + half])))
-
-
-def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
-    """Count at which the digitizer clips: its maximum, or a maximum that many waveforms share on flat tops (H6)."""
-    top = int(samples.max(initial=0))
-    if top == 0:
-        return None
-    at_top = samples == top
-    flat = (at_top[:, 1:] & at_top[:, :-1]).any(axis=1)
-    if top == max_count:
-        return float(top)
-    reached = at_top.any(axis=1).sum()
-    return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
 
 
 def decompose_sample(block: WaveformBlock, system: SystemPulse) -> EchoTable:
@@ -344,16 +169,14 @@ def _cover(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return np.cumsum(steps[:, :-1], axis=1) > 0
 
 
-def _pulse_noise(
-    residual: np.ndarray, used: np.ndarray, width: float
-) -> tuple[float, np.ndarray, np.ndarray]:
+def _pulse_noise(residual: np.ndarray, used: np.ndarray, width: float) -> tuple[float, np.ndarray, np.ndarray]:
     """Noise of a pulse's amplitude, as that of a sample of white noise, and the calm half of the waveforms (k,).
 
     The median over the waveforms of the power that a matched filter finds in them: echoes too weak to be fitted raise
     it in some of them only. 0 where too few have enough samples.
 
-    Third: the covariance at lags 0, 1, ... that the noise of the calm half lacks. They have less power in the filter
-    than noise has, by chance too, and what lacks has the shape of the filter's own correlation.
+    Third: the covariance at lags 0, 1, ... that the noise of the calm half lacks. By chance, too, they have less power
+    in the filter than others; what lacks has the shape of the filter's own correlation.
     """
     taps = gaussian_taps(width)
     weight = used.T.astype(np.float32)
@@ -368,94 +191,10 @@ def _pulse_noise(
     # Median of chi2 with k degrees of freedom, over k; not fewer than 4, since what drifts is alike in all waveforms.
     freedom = np.maximum(np.median(number[rows]) / (2.5 * width + 1), 4.0)
     typical = float(np.median(power) / (1 - 2 / (9 * freedom)) ** 3)
-    calm = power <= np.quantile(power, 0.6)
+    calm = power <= np.quantile(power, CALM)
     shape = filter_autocorrelation(taps)
     lack = max(typical - float(power[calm].mean()), 0.0) / (2 * np.sum(shape * shape) - 1)
     return float(np.sqrt(typical)), rows[calm], lack * shape
-
-
-def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
-    """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-    system : SystemPulse
-    strong : EchoTable
-        The strongest single echoes that no target has widened, one per waveform.
-
-    Returns
-    -------
-    SystemPulse
-        `misfit`: an echo that is added to a strong one must explain more than this share of its energy.
-        `tail_misfit`: by lag, the share of a strong echo that is left before and after it.
-
-    Notes
-    -----
-    Each strong echo is fitted alone; a score test says how much chi2 one more echo would gain. A wrong pulse promises
-    the same share of the energy for all of them, a second target for a few: the share that MISFIT_QUANTILE of them
-    stay below is the pulse's. Receivers compress high amplitudes, so that echoes of middle strength fit better than
-    strong ones (docs/algorithms.md R3, R5).
-    """
-    if len(strong) < FEW:
-        return system
-    rows = np.arange(len(strong), dtype=np.int32)
-    part = block.rows(strong.waveform)
-    noise = pooled_noise(part, system)
-    fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
-    fitted = fitted.take(find_strongest(fitted, len(part))[0])
-    promise = _promise(part, noise, system, fitted)
-    ratio = fitted.amplitude.astype(np.float64) / system.noise_std
-    energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
-    share = (promise - NOISE_PROMISE) / energy
-    misfit = 0.0
-    if len(share) >= FEW:
-        misfit = SCATTERED * float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0)))
-    return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
-
-
-def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
-    """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
-    spacing = part.spacing
-    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
-    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
-    main = model_parameters(shape, limits, whole)
-    s = part.samples.shape[1]
-    reach = int(np.ceil(CORE_REACH * system.sigma_ref / spacing))
-    middle = np.rint(whole[:, 1]).astype(np.int64)
-    low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
-    windows, begin = cut_windows(
-        part.samples, noise.for_fits, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
-        clip_level(part, system), system.noise_gain, part.missing,
-    )  # fmt: skip
-    main[:, 1] -= begin
-    parameters = main[:, :, None]
-    rows = evaluate_model(windows, parameters, shape)
-    box = Limits(np.array([0.0, -np.inf, limits.low])[:, None], np.array([np.inf, np.inf, limits.high])[:, None])
-    return propose_echo(windows, parameters, rows, gram_matrix(rows), box, limits.ref)[1]
-
-
-def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
-    """(lag [ns], share) where strong echoes leave more than noise, in steps of the pulse's width."""
-    ref = system.sigma_ref / part.spacing
-    taps = gaussian_taps(ref)
-    energy = filter_energy(taps)
-    residual = subtract_echoes(part, system, echoes)[echoes.waveform]
-    left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
-    left /= echoes.amplitude[:, None]
-    lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
-    expected = system.noise_std / np.median(echoes.amplitude) / np.sqrt(energy)
-    profile = []
-    for place in range(-TAIL_BEFORE, TAIL_AFTER):
-        here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
-        if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
-            continue
-        middle = np.median(here)
-        spread = MAD_TO_STD * np.median(np.abs(here - middle)) if len(here) else 0.0
-        share = abs(middle) + 2 * np.sqrt(max(spread**2 - expected**2, 0.0))
-        if share > LEAST_TAIL:
-            profile.append((float(place * system.sigma_ref), float(share)))
-    return tuple(profile)
 
 
 def _robust_std(values: np.ndarray) -> float:

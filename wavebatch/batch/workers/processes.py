@@ -10,48 +10,32 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import importlib
 import multiprocessing
 import os
 import pickle
 import queue
 import signal
-import sys
 import threading
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, wait
+from concurrent.futures import Future
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from wavebatch.batch.workers.futures import end_future, settle, wait_uninterrupted
+from wavebatch.batch.workers.serve import END, PATIENCE, serve_calls
+from wavebatch.core.errors import InputError
 from wavebatch.core.interrupts import uninterrupted
 from wavebatch.core.memory import ONE_THREAD, keep_freed_memory
-from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, remove_memory_of, use_scratch
+from wavebatch.files.disk.temp_folders import owning_memory, owning_scratch, use_scratch
 
 _POLL = 1.0
 """Seconds between two looks at the processes, for a death that their pipes do not show."""
 
-_PATIENCE = 3.0
-"""Seconds that processes have to end by themselves."""
-
-_LATENCY = 0.1
-"""Seconds after which Ctrl-C is seen at the latest while results are waited for."""
-
 _NAME = "wavebatch"
 """Start of the names of our processes."""
-
-_FIRST_MODULE = "wavebatch.batch.row_transfer"
-"""What a new process imports while it waits: with it comes nearly all that calls need."""
-
-_END = b""
-"""Sent to a process in place of a call: it ends. A pipe that closes without it means that this process was killed."""
-
-_SET_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of linux/prctl.h."""
 
 
 class WorkerDied(Exception):
@@ -138,7 +122,7 @@ class Workers:
                 worker.look()
             if not any(worker.serves for worker in self._workers):  # calls that no process has taken
                 for future in futures:
-                    _settle(future, error=WorkerDied())
+                    end_future(future, error=WorkerDied())
         return done
 
     def restart(self) -> None:
@@ -155,14 +139,14 @@ class Workers:
                 if worker.call is not None:
                     worker.process.kill()
                 self._calls.put(None)
-            deadline = time.monotonic() + _PATIENCE
+            deadline = time.monotonic() + PATIENCE
             for worker in self._workers:
                 worker.process.join(max(deadline - time.monotonic(), 0))
         finally:
             with uninterrupted():  # also after Ctrl-C while it waits above
                 for worker in self._workers:
                     worker.process.kill()  # also one that is stopped
-                    worker.process.join(_PATIENCE)
+                    worker.process.join(PATIENCE)
                 self._workers, self._calls = [], queue.SimpleQueue()
 
 
@@ -175,10 +159,17 @@ def _kill_all() -> None:
 
 
 def start_early(jobs: int) -> None:
-    """Start processes that the next Workers will take: they import their modules while this process imports its own."""
+    """Start processes that the next Workers will take: they import their modules while this process imports its own.
+
+    Raises InputError where the system has no more processes.
+    """
     with uninterrupted(), _single_threaded(), _ctrl_c_held():  # half a start would leave a process that complains
         while len(_early) < jobs:
-            _early.append(_Process())
+            try:
+                _early.append(_Process())
+            except OSError as error:
+                why = error.strerror or error
+                raise InputError(f"process {len(_early) + 1} of --jobs cannot be started ({why}); use fewer") from error
 
 
 @atexit.register  # called before that of multiprocessing, which would wait for stopped processes
@@ -200,7 +191,7 @@ class _Process:
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, there = context.Pipe()
-        self.process = context.Process(target=_work, args=(there,), daemon=True)
+        self.process = context.Process(target=serve_calls, args=(there,), daemon=True)
         self.process.name = f"{_NAME}-{self.process.name}"
         try:
             self.process.start()
@@ -210,7 +201,7 @@ class _Process:
     def end(self) -> None:
         """End it at once."""
         self.process.kill()
-        self.process.join(_PATIENCE)
+        self.process.join(PATIENCE)
         self.pipe.close()
 
 
@@ -244,12 +235,12 @@ class _Worker:
                 self.call = call
                 result, error = self._ask(call.pickled)
                 self.call = None
-                _settle(call.future, result, error)
-            self._pipe.send_bytes(_END)
+                end_future(call.future, result, error)
+            self._pipe.send_bytes(END)
         except (EOFError, OSError):  # the process is dead
             self.serves = False
             if self.call is not None:
-                _settle(self.call.future, error=WorkerDied())
+                end_future(self.call.future, error=WorkerDied())
         finally:
             self.serves = False
             self._pipe.close()
@@ -266,7 +257,7 @@ class _Worker:
         if self._seen_dead:  # a second look: its thread had time to take the last result
             self.serves = False
             if call is not None:
-                _settle(call.future, error=WorkerDied())
+                end_future(call.future, error=WorkerDied())
         self._seen_dead = True
 
 
@@ -275,38 +266,6 @@ def _unpack(answer: bytes) -> tuple[Any, BaseException | None]:
         return pickle.loads(answer)
     except Exception as error:
         return None, error
-
-
-def wait_uninterrupted(futures: list[Future], seconds: float) -> set[Future]:
-    """Return the futures that are done within so many seconds, or as soon as one is.
-
-    An interrupt inside `wait` may leave a lock taken. The thread that settles this future would then hold it for ever,
-    and so would `cancel`. So interrupts come between short waits only.
-    """
-    deadline = time.monotonic() + seconds
-    while True:
-        with uninterrupted():
-            done = wait(futures, timeout=_LATENCY, return_when=FIRST_COMPLETED).done
-        if done or time.monotonic() > deadline:
-            return done
-
-
-def _settle(future: Future, result: Any = None, error: BaseException | None = None) -> None:
-    """Give the future its end, unless it has one."""
-    with contextlib.suppress(InvalidStateError):
-        if error is None:
-            future.set_result(result)
-        else:
-            future.set_exception(error)
-
-
-def settle(future: Future, function: Callable, *arguments: Any) -> Future:
-    """Run `function(*arguments)` here; its result or its error becomes that of `future`."""
-    try:
-        future.set_result(function(*arguments))
-    except Exception as error:
-        future.set_exception(error)
-    return future
 
 
 @contextlib.contextmanager
@@ -334,55 +293,3 @@ def _ctrl_c_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _work(pipe: Connection) -> None:
-    """In a new process: make calls until the parent process says that there are no more."""
-    _wake_when_parent_dies()  # before all else: until then nothing wakes this process if it is stopped
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
-    keep_freed_memory()
-    end = threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True)
-    end.start()
-    with contextlib.suppress(Exception):  # the call that needs it reports the error
-        importlib.import_module(_FIRST_MODULE)
-    with contextlib.suppress(EOFError, OSError):
-        while (call := pipe.recv_bytes()) != _END:
-            pipe.send_bytes(_answer(call))
-        return
-    end.join()  # else this process would be gone before it has cleaned up
-
-
-def _wake_when_parent_dies() -> None:
-    """Let Linux continue this process, if it is stopped, when its parent dies: `_end_with` then cleans up and ends it.
-
-    A signal that kills would leave what the parent shared in memory.
-    """
-    if sys.platform == "linux":
-        import ctypes
-
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(_SET_DEATH_SIGNAL, signal.SIGCONT)
-
-
-def _answer(pickled: bytes) -> bytes:
-    """The pickled result and error of a call."""
-    try:
-        function, arguments = pickle.loads(pickled)
-        return pickle.dumps((function(*arguments), None), pickle.HIGHEST_PROTOCOL)
-    except Exception as error:
-        error.add_note(traceback.format_exc())
-        return _pickle_error(error)
-
-
-def _pickle_error(error: Exception) -> bytes:
-    try:
-        return pickle.dumps((None, error))
-    except Exception:
-        return pickle.dumps((None, RuntimeError(repr(error))))
-
-
-def _end_with(parent: Any) -> None:
-    """End this process when its parent has died, without what the parent shared in memory until the next run."""
-    parent.join()
-    remove_memory_of(parent.pid, _PATIENCE)
-    os._exit(1)

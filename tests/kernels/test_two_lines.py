@@ -1,0 +1,52 @@
+"""Points on two scan lines: any two parallel lines are in a plane, so their plane proves nothing."""
+
+import numpy as np
+import pytest
+
+from wavebatch.kernels.geometry.normals import Gap, Surroundings, measure_normals
+from wavebatch.kernels.geometry.two_lines import in_two_lines
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def lines(rng, number, *, apart=1.2, turned=0.0, jitter=0.03, n=16, sets=300):
+    """u, v and set of points on parallel lines."""
+    along = rng.uniform(-1.5, 1.5, (sets, n))
+    across = apart * (np.arange(n) % number) + rng.normal(0, jitter, (sets, n))
+    a, b = np.cos(turned), np.sin(turned)
+    return (a * along - b * across).ravel(), (b * along + a * across).ravel(), np.repeat(np.arange(sets), n)
+
+
+@pytest.mark.parametrize("degrees", range(0, 180, 13))
+def test_two_lines_are_found_in_any_direction_and_three_are_not(rng, degrees):
+    assert in_two_lines(*lines(rng, 2, turned=np.radians(degrees)), 300).mean() > 0.98
+    for number in (3, 4, 7):
+        assert in_two_lines(*lines(rng, number, turned=np.radians(degrees)), 300).mean() < 0.01
+
+
+@pytest.mark.parametrize(("n", "most"), [(8, 0.04), (10, 0.01), (16, 0.001)])
+def test_points_at_random_are_rarely_two_lines(rng, n, most):
+    u, v = rng.uniform(-1, 1, (2, 5000 * n))
+    assert in_two_lines(u, v, np.repeat(np.arange(5000), n), 5000).mean() <= most
+
+
+def gable(spacing):
+    """Points on a roof of 40 degrees, in scan lines along its ridge, 0.3 m apart in them; the rest is far away."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(-8.5, 9) * spacing, np.arange(-30, 31) * 0.3))
+    return np.stack([x, y, -np.abs(x) * np.tan(np.radians(40))], axis=1)
+
+
+def test_the_lines_on_both_sides_of_a_ridge_are_no_level_plane():
+    points = gable(1.2)
+    inner = np.abs(points[:, 1]) < 6
+    ridge = points[inner & (np.abs(points[:, 0]) < 1)]
+    (angle, error), gap = measure_normals(
+        ridge, np.tile(DOWN, (len(ridge), 1)), Surroundings(points), radius=1.5, min_points=8, max_error=5.0
+    )
+    known = gap == Gap.KNOWN
+    assert (np.abs(angle[known] - 40) < 5 * error[known]).all(), "it was level, with an error below a degree"
+    wide = points[inner & (np.abs(points[:, 0]) > 3) & (np.abs(points[:, 0]) < 6)]
+    (angle, error), gap = measure_normals(
+        wide, np.tile(DOWN, (len(wide), 1)), Surroundings(points), radius=2.5, min_points=8, max_error=5.0
+    )
+    assert (gap == Gap.KNOWN).all() and angle == pytest.approx(40, abs=0.5)

@@ -1,0 +1,176 @@
+"""A strip to process and how: what the command line and the public API ask for, and the workers get.
+
+`tools.api.run` builds a StripJob per strip; `unit` does what it asks for.
+Before you change it: a job travels to other processes, and all of it that decides the output is in `describe_job` of
+`report_file`, or --resume would keep clouds that are not what is asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from wavebatch.batch.output_rows import NEEDED
+from wavebatch.batch.selection import WITHOUT_STAGE, Selection
+from wavebatch.core.echoes import COLUMNS
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.cloud.layout import OutputLayout, plan_output
+from wavebatch.files.strip.reader import StripFacts, StripReader
+from wavebatch.stages.chain import STAGES, Chain
+from wavebatch.surveying.calibration import Calibration, with_columns, with_physics
+from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.sensor import SensorRequest
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """Options of a run that change what is written."""
+
+    direction: str = "auto"
+    headerless: bool = False
+    points: str = "echoes"
+    format: str = "laz"
+    point_format: int | None = None
+    las_version: str = "1.4"
+    names: str = "wavebatch"
+    no_data: str = "-9999"
+    strict: bool = False
+    columns: tuple[str, ...] = ()
+    """Columns to write, in order; see `choose_columns`."""
+    keep_packets: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StripJob:
+    """A strip to process and how; picklable."""
+
+    path: Path
+    chain: Chain
+    """The chain, or the widest that may be chosen."""
+    options: RunOptions
+    request: Request = Request()
+    """How pulse and chain are chosen."""
+    sensor: SensorRequest = SensorRequest()
+    """Where the sensor's positions come from; used only if the chain needs them."""
+    calibration: Calibration | None = None
+    attenuation: tuple[float, float] | None = None
+    """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
+
+    pulse_energy: str | None = None
+    """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
+    selection: Selection = Selection()
+    """What is written."""
+
+    def extend(self, chain: Chain) -> Chain:
+        """Return the chain with the physical stages that trajectory, calibration and divergence allow, and those of the
+        columns that are asked for.
+        """
+        sources = (self.calibration, self.request.system and self.request.system.survey.system)
+        divergence = any(source is not None and source.divergence is not None for source in sources)
+        given = self.sensor != SensorRequest()
+        chain = with_physics(chain, sensor=given, calibrated=self.calibration is not None, divergence=divergence)
+        return with_columns(chain, (*self.options.columns, *self.selection.list_wanted()))
+
+    def calibrate(self, system: SystemPulse) -> SystemPulse:
+        """Return the system pulse with the job's calibration and air, if it has them."""
+        system = system if self.calibration is None else self.calibration.apply(system)
+        if self.attenuation is None:
+            return system
+        value, error = self.attenuation
+        return replace(system, attenuation=value, attenuation_error=error)
+
+    @property
+    def energy_file(self) -> Path | None:
+        """The file of `pulse_energy`; None where that names an extra byte."""
+        file = None if self.pulse_energy is None else Path(self.pulse_energy)
+        return file if file is not None and file.is_file() else None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that the processes read, without those of packets."""
+        return tuple(path for path in (self.path, self.sensor.trajectory, self.energy_file) if path is not None)
+
+    def absolute(self) -> StripJob:
+        """Return the job with absolute paths, for processes that work in another folder."""
+        file = self.sensor.trajectory
+        sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
+        energy = self.pulse_energy if self.energy_file is None else str(self.energy_file.absolute())
+        return replace(self, path=self.path.absolute(), sensor=sensor, pulse_energy=energy)
+
+    def open(self) -> StripReader:
+        """Open the strip; raises InputError where it cannot be read."""
+        return StripReader(self.path, direction=self.options.direction, headerless=self.options.headerless)
+
+
+def name_columns(wanted: str | None) -> tuple[str, ...]:
+    """List the columns that a value of --columns names, in order."""
+    return tuple(entry.removeprefix("+") for entry in _split_columns(wanted) if entry.strip(" +"))
+
+
+def _split_columns(wanted: str | None) -> list[str]:
+    """The entries of --columns, with their `+`."""
+    return [entry.strip() for entry in (wanted or "").split(",") if entry.strip()]
+
+
+def choose_columns(chain: Chain, wanted: str | None = None) -> tuple[str, ...]:
+    """Choose the columns to write.
+
+    Parameters
+    ----------
+    chain : Chain
+    wanted : str, optional
+        `a,b` writes these columns only, `+a,+b` adds them. By default all columns of the chain and the flags.
+
+    Returns
+    -------
+    tuple of str
+
+    Raises
+    ------
+    ConfigError
+        Where a column does not exist or the chain does not compute it, and for a chain without positions.
+    """
+    missing = [name for name in NEEDED if name not in chain.makes]
+    if missing:
+        raise ConfigError(
+            f"chain {chain.name}: computes no {', '.join(missing)}, which every point needs; add a "
+            '[[chain]] table with stage = "attribute.position"'
+        )
+    computed = [name for name in chain.makes if name in COLUMNS and COLUMNS[name].extra_bytes]
+    default = [*computed, "echo_flags"]
+    entries = _split_columns(wanted)
+    added = [entry[1:] for entry in entries if entry.startswith("+")]
+    chosen = [entry for entry in entries if not entry.startswith("+")]
+    if wanted is not None and not entries:
+        raise ConfigError("--columns: names no column; leave it out for the usual ones, or write a,b or +a,+b")
+    for name in [*chosen, *added]:
+        _check_column(name, (*computed, *WITHOUT_STAGE))
+    return tuple(dict.fromkeys([*(chosen or default), *added]))
+
+
+def _check_column(name: str, available: tuple[str, ...]) -> None:
+    known = [column.name for column in COLUMNS.values() if column.extra_bytes]
+    if name not in known:
+        raise ConfigError(f"--columns: column {name!r} does not exist; {nearest(name, known)}")
+    if name not in available:
+        makers = [stage.name for stage in STAGES.values() if name in stage.makes]
+        remedy = f"add stage {' or '.join(makers)} to it" if makers else "no stage of this version does"
+        raise ConfigError(f"--columns: the chain does not compute {name!r}; {remedy}")
+
+
+def plan_layout(job: StripJob, facts: StripFacts) -> OutputLayout:
+    """Plan the layout of the strip's output; raises InputError or ConfigError where it cannot be written."""
+    options = job.options
+    return plan_output(
+        facts,
+        options.columns,
+        point_format=options.point_format,
+        las_version=options.las_version,
+        packets=facts if options.keep_packets else None,
+        names=options.names,
+        no_data=options.no_data,
+        points=options.points,
+        strict=options.strict,
+    )

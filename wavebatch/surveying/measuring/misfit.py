@@ -1,0 +1,126 @@
+"""What the pulse's model leaves unexplained of strong single echoes, at the echo and in its tail.
+
+Growth and detection ask more of an echo beside a strong one by these figures (docs/algorithms.md R3, R5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoTable
+from wavebatch.core.units import MAD_TO_STD, SQRT_PI
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.cluster import cut_windows
+from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_matrix
+from wavebatch.kernels.fit.next_echo import propose_echo
+from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
+from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
+from wavebatch.surveying.measuring.lone_echoes import find_strongest
+from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
+from wavebatch.surveying.measuring.residuals import subtract_echoes
+
+MISFIT_QUANTILE = 0.8
+"""Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
+
+SCATTERED = 1.4
+"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
+
+NOISE_PROMISE = 8.0
+"""Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
+
+CORE_REACH = 4.0
+"""Widths of the pulse around an echo in which its misfit is looked for; beyond them it is the tail's."""
+
+TAIL_BEFORE, TAIL_AFTER = 6, 40
+"""Widths of the pulse before and after an echo in which its tail is measured."""
+
+LEAST_TAIL = 0.002
+"""Share of an echo below which its tail is as the pulse says."""
+
+
+def measure_misfit(block: WaveformBlock, system: SystemPulse, strong: EchoTable) -> SystemPulse:
+    """The system with what its pulse leaves unexplained of strong single echoes, as shares of their amplitude.
+
+    Parameters
+    ----------
+    block : WaveformBlock
+    system : SystemPulse
+    strong : EchoTable
+        The strongest single echoes that no target has widened, one per waveform.
+
+    Returns
+    -------
+    SystemPulse
+        `misfit`: an echo that is added to a strong one must explain more than this share of its energy.
+        `tail_misfit`: by lag, the share of a strong echo that is left before and after it.
+
+    Notes
+    -----
+    Each strong echo is fitted alone; a score test says how much chi2 one more echo would gain. A wrong pulse promises
+    the same share of the energy for all of them, a second target for a few: the share that MISFIT_QUANTILE of them
+    stay below is the pulse's. Receivers compress high amplitudes, so that echoes of middle strength fit better than
+    strong ones (docs/algorithms.md R3, R5).
+    """
+    if len(strong) < FEW:
+        return system
+    rows = np.arange(len(strong), dtype=np.int32)
+    part = block.rows(strong.waveform)
+    noise = pooled_noise(part, system)
+    fitted = adaptive(part, noise, system, replace(strong, waveform=rows), max_echoes=1, significance=0.0)
+    fitted = fitted.take(find_strongest(fitted, len(part))[0])
+    promise = _promise(part, noise, system, fitted)
+    ratio = fitted.amplitude.astype(np.float64) / system.noise_std
+    energy = SQRT_PI * ratio**2 * fitted.sigma / block.spacing
+    share = (promise - NOISE_PROMISE) / energy
+    misfit = 0.0
+    if len(share) >= FEW:
+        misfit = SCATTERED * float(np.sqrt(max(np.quantile(share, MISFIT_QUANTILE), 0.0)))
+    return replace(system, misfit=misfit, tail_misfit=_measure_tail(part, system, fitted))
+
+
+def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
+    """Fall of chi2 (m,) that one more echo promises near each echo, the only one of its waveform."""
+    spacing = part.spacing
+    shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
+    whole = np.stack([echoes.amplitude, echoes.time / spacing, echoes.sigma / spacing], axis=1).astype(np.float64)
+    main = model_parameters(shape, limits, whole)
+    s = part.samples.shape[1]
+    reach = int(np.ceil(CORE_REACH * system.sigma_ref / spacing))
+    middle = np.rint(whole[:, 1]).astype(np.int64)
+    low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
+    windows, begin = cut_windows(
+        part.samples, noise.for_fits, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
+        clip_level(part, system), system.noise_gain, part.missing,
+    )  # fmt: skip
+    main[:, 1] -= begin
+    parameters = main[:, :, None]
+    rows = evaluate_model(windows, parameters, shape)
+    box = Limits(np.array([0.0, -np.inf, limits.low])[:, None], np.array([np.inf, np.inf, limits.high])[:, None])
+    return propose_echo(windows, parameters, rows, gram_matrix(rows), box, limits.ref)[1]
+
+
+def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:
+    """(lag [ns], share) where strong echoes leave more than noise, in steps of the pulse's width."""
+    ref = system.sigma_ref / part.spacing
+    taps = gaussian_taps(ref)
+    energy = filter_energy(taps)
+    residual = subtract_echoes(part, system, echoes)[echoes.waveform]
+    left = filter_symmetric(np.nan_to_num(residual).T.astype(np.float32), taps).T / np.float32(energy)
+    left /= echoes.amplitude[:, None]
+    lag = (np.arange(residual.shape[1]) - (echoes.time / part.spacing)[:, None]) / ref
+    expected = system.noise_std / np.median(echoes.amplitude) / np.sqrt(energy)
+    profile = []
+    for place in range(-TAIL_BEFORE, TAIL_AFTER):
+        here = left[(lag >= place - 0.5) & (lag < place + 0.5) & np.isfinite(residual)]
+        if abs(place) < 3 or len(here) < ENOUGH_TO_LEARN:
+            continue
+        middle = np.median(here)
+        spread = MAD_TO_STD * np.median(np.abs(here - middle)) if len(here) else 0.0
+        share = abs(middle) + 2 * np.sqrt(max(spread**2 - expected**2, 0.0))
+        if share > LEAST_TAIL:
+            profile.append((float(place * system.sigma_ref), float(share)))
+    return tuple(profile)

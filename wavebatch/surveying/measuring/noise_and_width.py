@@ -1,0 +1,179 @@
+"""Noise and width of the system pulse, each from the other, from isolated echoes: where a survey begins.
+
+Whatever else it measures starts from here. Before you change it: widths must not depend on which waveforms of a strip
+were looked at (tests/surveying/test_other_sensors.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from wavebatch.core.echoes import EchoFlag
+from wavebatch.core.units import QUANTISATION_STD
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.signal.noise import estimate_noise, keep_longest
+from wavebatch.kernels.signal.signal import transpose_samples
+from wavebatch.stages.noise import pooled as pooled_noise
+from wavebatch.stages.pulse_tables import noise_factors
+from wavebatch.surveying.measuring.lone_echoes import MIN_SNR, fit_lone
+
+MOST_ROUNDS = 12
+"""Times that noise and width are found from each other; a step goes at most from 0.7 to 4 times a width."""
+
+FAR_OFF = 0.1
+"""Change of a width that was nearly known, as a share of it, from which it is looked for from the start."""
+
+SETTLED = 0.01
+"""Change of the width, as a share of it, below which it stays."""
+
+FIRST_LOOK = 2048
+"""Waveforms from which the noise and the width to begin with are found."""
+
+RESIDUAL_LOOK = 4096
+"""Waveforms whose residuals are looked at."""
+
+FEW = 20
+"""Isolated echoes below which the width of the system pulse is a guess."""
+
+ENOUGH_TO_LEARN = 50
+"""Isolated echoes from which a pulse can be learned (R2)."""
+
+FIRST_WIDTH = 2.0
+"""First guess of the system pulse's width [samples]."""
+
+REPEATED, LEAST_REPEATED = 0.04, 25
+"""Share, and least number, of the clear echoes that must have nearly one width for it to be the pulse's."""
+
+REPEAT_SPAN = 0.06
+"""How far these widths may lie apart, as a share of them."""
+
+CLIMB = 0.10
+"""How far above the narrowest of them the pulse's width is looked for: three times the scatter of widths at SNR 40."""
+
+UNDITHERED, DITHERED = 0.35, 0.41
+"""Below a quiet noise of 0.35 DN rounding hides how large the noise is: up to 0.3 DN never leave the level's count.
+With the error of rounding that is 0.41 DN."""
+
+LEAST_QUIET = 0.15
+"""Share of quiet samples below which noise comes from residuals of good fits."""
+
+
+def measure_gaussian(block: WaveformBlock, first: float = FIRST_WIDTH, *, known: bool = False) -> SystemPulse:
+    """Noise and the width of isolated echoes, each from the other, until the width stays; then once more from all.
+
+    first: width to begin with [samples], and to end with where too few echoes are isolated; known: it is nearly right.
+    """
+    saturation = find_saturation(block.samples, block.digitizer.max_count)
+    few = thin_block(block, FIRST_LOOK)
+    width, last = first, first if known else 0.0
+    for _ in range(MOST_ROUNDS):
+        if abs(width - last) <= SETTLED * width:
+            break
+        system, last = _gaussian_system(few, width, saturation), width
+        width = _isolated_width(few, system)
+    system = _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+    last, width = width, _isolated_width(block, system)
+    if known and abs(width / last - 1) > FAR_OFF:
+        return measure_gaussian(block, width)
+    return replace(system, sigma_ref=width * block.spacing)
+
+
+def measure_quiet(block: WaveformBlock, width: float) -> SystemPulse:
+    """A Gaussian of a width that is known [samples], and the noise outside of the echoes."""
+    saturation = find_saturation(block.samples, block.digitizer.max_count)
+    return _gaussian_system(thin_block(block, RESIDUAL_LOOK), width, saturation)
+
+
+def thin_block(block: WaveformBlock, number: int) -> WaveformBlock:
+    """About `number` waveforms spread over the block, at least as many where it has them."""
+    return block.rows(slice(None, None, max(len(block) // number, 1)))
+
+
+def _gaussian_system(block: WaveformBlock, width: float, saturation: float | None) -> SystemPulse:
+    """A Gaussian of this width [samples], and the noise that is left outside of its echoes."""
+    missing = None if block.missing is None else keep_longest(block.missing.T)
+    noise = estimate_noise(transpose_samples(block.samples), int(np.ceil(3 * width)), missing=missing)
+    correlation = tuple(noise.correlation.tolist())
+    seen = float(noise.std * noise_factors(GAUSSIAN, width, correlation)[0])
+    known = noise.std if noise.share >= LEAST_QUIET else 0.0
+    hidden = DITHERED if noise.std < UNDITHERED else QUANTISATION_STD
+    return SystemPulse(
+        sigma_ref=width * block.spacing,
+        baseline=noise.level,
+        baseline_spread=noise.spread,
+        recovery=float(noise.recovery * block.spacing),
+        noise_std=max(seen, noise.std, hidden),
+        noise_by_kind={"quiet": known, "quiet_smoothed": noise.smoothed_std, "quiet_pulse": seen},
+        correlation=correlation,
+        saturation=saturation,
+    )
+
+
+def _isolated_width(block: WaveformBlock, system: SystemPulse) -> float:
+    """Width [samples] of clean echoes that are alone in their waveform, SNR above 20, not near an edge or clipped.
+
+    Where most of them are at the edge of the widths that `system` allows it is that edge, so that the next round can
+    go beyond it; with too few of them the system's width stays.
+    """
+    n = len(block)
+    noise = Noise(np.full(n, system.baseline, np.float32), np.full(n, system.noise_std, np.float32))
+    if system.baseline_spread > system.noise_std:
+        noise = pooled_noise(block, system)
+    echoes = fit_lone(block, noise, system, MIN_SNR)
+    free = (echoes.flags & int(EchoFlag.AT_BOUND)) == 0
+    widths, errors = echoes.sigma / block.spacing, echoes.sigma_err / block.spacing
+    if 2 * free.sum() > len(free):
+        widths, errors = widths[free], errors[free]
+    if len(widths) < FEW:
+        return system.sigma_ref / block.spacing
+    return float(np.clip(find_edge(widths, errors), 0.5, 50.0))
+
+
+def find_edge(widths: np.ndarray, errors: np.ndarray | None = None) -> float:
+    """Width of the system pulse: the narrowest width that echoes repeat.
+
+    Slopes and plants only widen echoes, so the pulse is at the lower edge of their widths; the most common width is
+    that of the canopy in a forest. A few narrower ones (spikes, cut echoes) do not move it: an edge is where
+    REPEATED of all echoes lie within REPEAT_SPAN of each other. From there the densest half within CLIMB is taken, so
+    that over level ground, where noise scatters the widths around that of the pulse, it is the centre.
+
+    Parameters
+    ----------
+    widths : (m,)
+        Of clear single echoes, any unit.
+    errors : (m,), optional
+        Their standard deviations. Widths that scatter by more than usual are allowed to lie further apart.
+
+    Returns
+    -------
+    float
+        In the unit of the widths.
+    """
+    typical = 0.0 if errors is None else float(np.median(errors / widths))
+    allowed, climb = max(REPEAT_SPAN, 3 * typical), max(CLIMB, 5 * typical)
+    ordered = np.log(np.sort(widths.astype(np.float64)))
+    hold = min(max(LEAST_REPEATED, int(np.ceil(REPEATED * len(ordered)))), len(ordered))
+    span = ordered[hold - 1 :] - ordered[: len(ordered) - hold + 1]
+    close = span <= allowed
+    first = int(np.argmax(close)) if close.any() else int(np.argmin(span))
+    near = ordered[first : np.searchsorted(ordered, ordered[first] + climb, side="right")]
+    half = max(len(near) // 2, min(2, len(near)))
+    inner = near[half - 1 :] - near[: len(near) - half + 1]
+    begin = int(np.argmin(inner))
+    return float(np.exp(np.median(near[begin : begin + half])))
+
+
+def find_saturation(samples: np.ndarray, max_count: int) -> float | None:
+    """Count at which the digitizer clips: its maximum, or a maximum that many waveforms share on flat tops (H6)."""
+    top = int(samples.max(initial=0))
+    if top == 0:
+        return None
+    at_top = samples == top
+    flat = (at_top[:, 1:] & at_top[:, :-1]).any(axis=1)
+    if top == max_count:
+        return float(top)
+    reached = at_top.any(axis=1).sum()
+    return float(top) if flat.sum() >= max(3, 0.5 * reached) and reached >= 5 else None
