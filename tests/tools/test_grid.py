@@ -4,7 +4,6 @@ import laspy
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from writer_tools import data_file
 
 from wavebatch.cli import main
 from wavebatch.files.las.crs import read_crs_definition
@@ -184,13 +183,6 @@ def test_a_crs_with_heights_is_written_without_them(rasterio, rng, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.las", "x.tif"]
     with rasterio.open(tmp_path / "x.tif") as found:
         assert found.crs.is_projected and "Transverse_Mercator" in found.crs.to_wkt() and found.descriptions[0]
-
-
-def test_the_raster_of_a_real_strip_has_its_crs(rasterio, tmp_path):
-    _run(data_file("riegl-q680i/100429_152240_2535pt_UTM.las"), "--statistic", "density", "-o", tmp_path / "x.tif")
-    assert [path.name for path in tmp_path.iterdir()] == ["x.tif"]
-    with rasterio.open(tmp_path / "x.tif") as found:
-        assert found.crs.is_projected and "33" in found.crs.to_wkt()[:60]
 
 
 def test_clouds_of_two_systems_are_refused_and_a_missing_one_is_said(rasterio, rng, tmp_path):
