@@ -170,7 +170,7 @@ class Attacker:
     def _disturb(self, process: subprocess.Popen, attack: Attack) -> tuple[bool, int | str, str]:
         """Send the signals; whether the process had begun, and its exit code or "hangs", and stderr."""
         time.sleep(attack.share * self.seconds[attack.name])
-        is_ready = _has_signal(process.pid, "SigCgt", signal.SIGTERM)  # from then on no signal may be lost
+        is_ready = _handles_signals(process.pid)
         target, _, rest = attack.kind.partition(" ")
         with contextlib.suppress(ProcessLookupError):
             if target == "worker":
@@ -324,6 +324,11 @@ def _without_times(value: object) -> object:
     if isinstance(value, dict):
         return {k: _without_times(v) for k, v in value.items() if k not in ("timing", "seconds", "status", "command")}
     return [_without_times(one) for one in value] if isinstance(value, list) else value
+
+
+def _handles_signals(pid: int) -> bool:
+    """Whether the program has begun: from then on no signal may be lost."""
+    return _has_signal(pid, "SigCgt", signal.SIGTERM)
 
 
 def _has_signal(pid: int, name: str, number: int) -> bool:
