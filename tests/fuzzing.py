@@ -369,8 +369,11 @@ def _judge(done: dict[str, Any], out: Path, before: set[str], case: Case) -> str
 
 
 def _is_summary(path: Path) -> bool:
-    """Whether it is the report of a batch, which says why nothing is written."""
-    return path.is_file() and b'"wavebatch.batch-report/' in path.read_bytes()
+    """Whether it is the report or page of a batch, which says why nothing is written, or its empty folder."""
+    if path.is_dir():
+        return not any(path.iterdir())
+    data = path.read_bytes() if path.is_file() else b""
+    return b'"wavebatch.batch-report/' in data or data.lower().startswith(b"<!doctype html")
 
 
 def _has_bar(case: Case) -> bool:
