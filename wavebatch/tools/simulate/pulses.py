@@ -38,6 +38,9 @@ class PulseModel:
         return replace(self, lobes=self.lobes + ring)
 
 
+LEAST_SIGMA = 0.001
+"""Shortest pulse [ns]: no detector shows 1 ps, and times in units of far shorter ones overflow."""
+
 PULSES: dict[str, PulseModel] = {
     "gaussian": PulseModel(),
     "skewed": PulseModel(kappa=0.1),
@@ -71,8 +74,9 @@ def shape_pulse(
     shape = old if pulse is None else find_pulse(pulse)
     width = sigma or (shape.sigma if shape.lobes else old.sigma)
     skew = shape.kappa if kappa is None else kappa
-    if not (0 < width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
-        raise ConfigError(f"pulse: sigma {width} ns must be above 0, kappa {skew} and ringing {ringing} within +-0.5")
+    if not (LEAST_SIGMA <= width < 1000 and abs(skew) <= 0.5 and abs(ringing) <= 0.5):
+        limits = f"above 0 ({LEAST_SIGMA} to 1000)"
+        raise ConfigError(f"pulse: sigma {width} ns must be {limits}, kappa {skew} and ringing {ringing} within +-0.5")
     return replace(shape, sigma=width, kappa=skew).with_ringing(ringing)
 
 
