@@ -178,7 +178,7 @@ def test_names_are_printed_without_escapes_of_the_terminal(tmp_path):
     ("option", "code", "why"),
     [("--chain", 2, "nothing writes into this pipe"), ("--system", 2, "nothing writes into this pipe"),
      ("--calibration", 2, "nothing writes into this pipe"), ("--polygon", 2, "nothing writes into this pipe"),
-     ("--log-file", 2, "is a pipe; choose a file"), ("--trajectory", 4, "is a folder, a pipe or a device; give a file"),
+     ("--log-file", 2, "is a pipe; choose a file"), ("--trajectory", 2, "is a folder, a pipe or a device; give a file"),
      ("--report", 1, "cannot be written")],
 )  # fmt: skip
 def test_a_pipe_without_another_end_is_refused(tmp_path, option, code, why):
@@ -210,7 +210,7 @@ def test_a_chain_can_come_through_a_pipe(tmp_path):
 @pytest.mark.parametrize(
     ("words", "code"),
     [("run {a} -o {o} --chain /dev/zero", 2), ("run @/dev/zero -o {o}", 2), ("info /dev/zero", 1),
-     ("run {a} -o {o} --trajectory /dev/zero", 4), ("stats {a} --polygons /dev/zero", 2)],
+     ("run {a} -o {o} --trajectory /dev/zero", 2), ("stats {a} --polygons /dev/zero", 2)],
 )  # fmt: skip
 def test_a_device_that_never_ends_is_no_input(tmp_path, words, code):
     strip = make_raw(60).write(tmp_path / "a.las")

@@ -143,7 +143,7 @@ def test_only_the_error(strips, clouds, tmp_path):
 )
 def test_wrong_parameters_are_one_line(strips, tmp_path, value, message):
     chain = tmp_path / "c.toml"
-    chain.write_text(CHAIN.replace("radius = 2.0", value))
+    chain.write_text(CHAIN.replace("radius = 2.5", value))
     done = CliRunner().invoke(main, ["run", str(strips / "slope.las"), "-o", str(tmp_path / "out"), "-c", str(chain)])
     assert done.exit_code == 2
     assert f"({STAGE}): {message}" in done.stderr and "Traceback" not in done.stderr
