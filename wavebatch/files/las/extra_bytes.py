@@ -7,7 +7,7 @@ wrong description must never make a file unreadable, so its bytes become a colum
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,9 @@ RECORD_SIZE = 192
 EXTRA_BYTES_RECORD_ID = 4
 _TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 _NO_DATA, _MIN, _MAX, _SCALE, _OFFSET = 1, 2, 4, 8, 16
+TEXT_BYTES = 32
+"""Length of name and description in a record."""
+
 _AT_NAME, _AT_NO_DATA, _AT_MIN, _AT_MAX, _AT_SCALE, _AT_DESCRIPTION = 4, 40, 64, 88, 112, 160
 
 
@@ -33,8 +36,8 @@ class ExtraRecord:
     ) -> ExtraRecord:
         """Return a record for a new dimension; `no_data` is a stored value; name and description take 32 bytes each."""
         texts = name.encode("utf-8"), description.encode("utf-8")
-        if any(len(text) > 32 for text in texts):
-            raise ValueError(f"extra bytes {name!r}: name and description hold 32 bytes at most")
+        if any(len(text) > TEXT_BYTES for text in texts):
+            raise ValueError(f"extra bytes {name!r}: name and description hold {TEXT_BYTES} bytes at most")
         code = _TYPES.index(np.dtype(dtype).str[1:]) + 1
         options = 0 if scale is None else _SCALE | _OFFSET
         scales = (scale or 0.0, 0.0, 0.0)
@@ -124,18 +127,16 @@ class ExtraRecord:
         """
         data = bytearray(self.data)
         for at in (_AT_NAME, _AT_DESCRIPTION):
-            text = self.data[at : at + 32].split(b"\0")[0]
+            text = self.data[at : at + TEXT_BYTES].split(b"\0")[0]
             try:
                 text.decode()
             except UnicodeDecodeError:
-                whole = text.decode("latin-1").encode()[:32].decode(errors="ignore").encode()
-                data[at : at + 32] = whole.ljust(32, b"\0")
+                data[at : at + TEXT_BYTES] = _as_field(text.decode("latin-1"))
         return ExtraRecord(bytes(data))
 
     def with_name(self, name: str) -> ExtraRecord:
         """Return the record with another name, of which 32 bytes are kept."""
-        stored = name.encode()[:32].decode(errors="ignore").encode()
-        return ExtraRecord(self.data[:_AT_NAME] + stored.ljust(32, b"\0") + self.data[_AT_NAME + 32 :])
+        return ExtraRecord(self.data[:_AT_NAME] + _as_field(name) + self.data[_AT_NAME + TEXT_BYTES :])
 
     def with_no_data(self, numbers: np.ndarray | list) -> ExtraRecord:
         """Return the record with this stored no-data value per element."""
@@ -182,14 +183,30 @@ def tell_apart(records: Sequence[ExtraRecord], point_format: int) -> list[ExtraR
     taken = set(STANDARD_DTYPES[point_format].names)
     apart = []
     for record in records:
-        name, number = record.name, 1
-        while not name or name in taken:
-            number += 1
-            end = f" {number}"
-            name = record.name.encode()[: 32 - len(end)].decode(errors="ignore") + end
+        name = _free_name(record.name, taken, TEXT_BYTES)
         taken.add(name)
         apart.append(record if name == record.name else record.with_name(name))
     return apart
+
+
+def _free_name(name: str, taken: Container[str], most: int | None = None) -> str:
+    """The name, with " 2", " 3" ... at its end if it is empty or taken; most: bytes that it may then have."""
+    found, number = name, 1
+    while not found or found in taken:
+        number += 1
+        end = f" {number}"
+        found = (name if most is None else _cut(name, most - len(end))) + end
+    return found
+
+
+def _cut(text: str, most: int) -> str:
+    """As much of the text as so many bytes of UTF-8 hold."""
+    return text.encode()[:most].decode(errors="ignore")
+
+
+def _as_field(text: str) -> bytes:
+    """The text as a record holds it."""
+    return _cut(text, TEXT_BYTES).encode().ljust(TEXT_BYTES, b"\0")
 
 
 def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
@@ -200,11 +217,7 @@ def build_dtype(point_format: int, records: Sequence[ExtraRecord]) -> np.dtype:
     standard = STANDARD_DTYPES[point_format]
     fields = {name: standard[name] for name in standard.names}
     for record in records:
-        name, number = record.name, 1
-        while not name or name in fields:
-            number += 1
-            name = f"{record.name} {number}"
-        fields[name] = record.dtype
+        fields[_free_name(record.name, fields)] = record.dtype
     return np.dtype(list(fields.items()))
 
 
