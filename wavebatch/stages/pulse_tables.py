@@ -283,9 +283,9 @@ def _describe(
     sigma = table.half_width / FWHM_PER_SIGMA
     steep = np.interp(width, table.width, np.gradient(sigma, table.width))
     whole = [amplitude * peak, time + np.interp(width, table.width, table.delay), np.interp(width, table.width, sigma)]
+    by_self = np.stack([peak, np.ones_like(peak)])
     by_width = np.stack([amplitude * by_peak, by_delay])
-    variance = (errors[:, :2].T * [peak, np.ones_like(peak)]) ** 2 + (by_width * errors[:, 2]) ** 2
-    variance += 2 * by_width * [peak, np.ones_like(peak)] * np.nan_to_num(shared.T)
+    variance = (by_self * errors[:, :2].T) ** 2 + (by_width * errors[:, 2]) ** 2 + 2 * by_self * by_width * shared.T
     whole_errors = np.stack([*np.sqrt(np.maximum(variance, 0)), errors[:, 2] * np.abs(steep)], axis=1)
     return np.stack(whole, axis=1), whole_errors
 

@@ -46,7 +46,6 @@ one describes a tail, and would lift what comes before the pulse (by 1.7 DN on a
 LEAST_BIN = 5
 """Samples that a bin of the stack needs."""
 
-
 SCATTER = 1021.0, 0.5 * (np.sqrt(5.0) - 1.0)
 """Steps per sample of the time, and of the sample, whose fractions look like chance."""
 
@@ -102,7 +101,8 @@ def _dither(time: np.ndarray, length: int, std: float) -> np.ndarray:
     The median of whole counts is one of them, and so off by up to half a step: it gave pulses a tail of .5 %. From the
     times, so that the order of the echoes changes nothing.
     """
-    place = np.modf(time[:, None] * SCATTER[0] + np.arange(length) * SCATTER[1])[0]
+    place = time[:, None] * SCATTER[0] + np.arange(length) * SCATTER[1]
+    place -= np.floor(place)
     return ((place - 0.5) * (std * np.sqrt(12.0))).astype(np.float32)
 
 
@@ -118,9 +118,7 @@ class PulseFit(NamedTuple):
     """Delay of the strongest component (or the skewed pulse's peak) in the stack [samples]."""
 
 
-def fit_gaussians(
-    stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0
-) -> list[PulseFit]:
+def fit_gaussians(stack: Stack, width: float, most: int = MOST_COMPONENTS, goal: float = 0.0) -> list[PulseFit]:
     """Sums of 1, 2, ... `most` Gaussians fitted to the stack, one more while the misfit falls by a tenth or more.
 
     One that gains less is kept where the next one after it makes up for both. Where one Gaussian reaches the goal, a

@@ -395,7 +395,7 @@ def keep_longest(missing: np.ndarray) -> np.ndarray:
     recorded = ~missing
     begins = recorded.copy()
     begins[1:] &= missing[:-1]
-    number = np.cumsum(begins, axis=0) * recorded
+    number = accumulate(np.add, begins.astype(np.int32)) * recorded
     sizes = np.stack([np.count_nonzero(number == k, axis=0) for k in range(1, int(number.max(initial=1)) + 1)])
     return number != np.argmax(sizes, axis=0) + 1
 

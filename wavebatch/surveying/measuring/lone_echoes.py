@@ -28,9 +28,7 @@ STEPS = 4
 """Gauss-Newton steps of a fit."""
 
 
-def fit_lone(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, least: float, fraction: float = 0.2
-) -> EchoTable:
+def fit_lone(block: WaveformBlock, noise: Noise, system: SystemPulse, least: float, fraction: float = 0.2) -> EchoTable:
     """Fit Gaussians to the echoes that are the strongest by far of their waveform, not near an edge or clipped.
 
     By far is ten to one; but where hardly any echo is alone, after-pulses of every echo are what is seen, and they may
