@@ -11,6 +11,7 @@
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
+KERNELS := $(wildcard wavebatch/kernels/c/*) wavebatch/kernels/build_kernels.py
 VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := demo
@@ -27,19 +28,19 @@ $(BIN)/python:
 	  { echo "wavebatch needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.run: pyproject.toml | $(BIN)/python
+$(VENV)/.run: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/.test: pyproject.toml | $(BIN)/python
+$(VENV)/.test: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $@ $(VENV)/.run
 
-$(VENV)/.plot: pyproject.toml | $(BIN)/python
+$(VENV)/.plot: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
 	@touch $@ $(VENV)/.run
 
-$(VENV)/.docs: pyproject.toml | $(BIN)/python
+$(VENV)/.docs: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@ $(VENV)/.run
 
