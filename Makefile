@@ -22,6 +22,8 @@ SEED   ?= 1
 
 .PHONY: demo test test-all readers papers bench fuzz attack docs man lint clean
 .DELETE_ON_ERROR:
+# Without cached bytecode every process compiles all of its modules anew: a second each.
+unexport PYTHONDONTWRITEBYTECODE
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
