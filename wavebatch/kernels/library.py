@@ -16,7 +16,10 @@ from wavebatch.kernels.build_kernels import LIBRARY, compile_library, is_outdate
 
 _POINTER = ctypes.c_void_p
 
-FUNCTIONS = ("decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates")
+FUNCTIONS = (
+    "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
+    "logarithms", "solve_equations",
+)  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
 

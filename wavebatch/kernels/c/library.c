@@ -15,3 +15,4 @@
 #include "next_echo.h"
 #include "decompose.h"
 #include "signal.h"
+#include "elementary.h"
