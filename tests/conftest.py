@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from child_signals import give_children_default_signals
 
 from wavebatch.tools.simulate import simulate_strip
+
+give_children_default_signals()
 
 
 @pytest.fixture
