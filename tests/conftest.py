@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import kept_surveys
 import numpy as np
 import pytest
 from child_signals import give_children_default_signals
@@ -11,6 +12,18 @@ from child_signals import give_children_default_signals
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
+
+
+def pytest_configure(config):
+    """Only the fast tests share surveys."""
+    if config.option.markexpr == "not slow":
+        kept_surveys.install()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Tests of surveys make their own."""
+    kept_surveys.active = "surveying" not in item.path.parts
 
 
 @pytest.fixture
