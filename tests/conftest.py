@@ -1,5 +1,6 @@
 """What many tests need: a seeded generator, the real files, tiny strips."""
 
+import fnmatch
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,15 @@ def pytest_configure(config):
     """Only the fast tests share surveys."""
     if config.option.markexpr == "not slow":
         kept_surveys.install()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """All cases but those that `quick_cases` names are slow."""
+    for item in items:
+        quick = item.get_closest_marker("quick_cases")
+        if quick and not any(fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args):
+            item.add_marker("slow")
 
 
 @pytest.hookimpl(tryfirst=True)

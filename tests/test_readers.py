@@ -91,6 +91,7 @@ def _node(script, path, target, *packages):
     return json.loads(target.read_text())
 
 
+@pytest.mark.quick_cases("riegl wavebatch.laz", "leica asprs.laz", "leica riegl.laz", "colour*")
 @pytest.mark.parametrize("case", [case for case in CASES if "1.3" not in case])  # it refuses LAS 1.3
 def test_copc_js_reads_every_column(make_cloud, tmp_path, case):
     path = make_cloud(case)

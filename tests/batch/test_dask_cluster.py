@@ -238,6 +238,7 @@ def test_a_cluster_that_dies_is_one_line_and_the_rest_can_be_resumed(tmp_path, s
     assert contents(out) == contents(tmp_path / "local")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 def test_ctrl_c_is_130_and_leaves_nothing_half_written(dask, strips, tmp_path):
     command = [sys.executable, "-W", "error", "-m", "wavebatch", "run", str(strips), "--profile", "fast", "-q"]
@@ -259,6 +260,7 @@ def test_an_empty_address_is_wrong_usage(strips, tmp_path, address):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_peer_that_is_no_scheduler_is_one_line_within_seconds(strips, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
@@ -295,6 +297,7 @@ def _blind(part):
     worker_check._size = lambda file: -1 if part and part in file else worker_check.os.path.getsize(file)
 
 
+@pytest.mark.slow
 def test_a_worker_on_another_kind_of_processor_is_refused_by_name(tmp_path, strips, monkeypatch):
     """Other bits of sums give other surveys: 1,370, 1,371 and 1,366 echoes on one strip."""
     cluster = Dask(tmp_path)
@@ -308,6 +311,7 @@ def test_a_worker_on_another_kind_of_processor_is_refused_by_name(tmp_path, stri
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path, strips):
     from wavebatch.batch.workers.dask_cluster import Cluster
 
@@ -330,6 +334,7 @@ def test_a_worker_that_joins_later_and_does_not_fit_gets_no_work(tmp_path, strip
     assert event["warning"].endswith("it gets no work")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="makes a key")
 def test_a_cluster_with_tls_writes_the_same_bytes(tmp_path, strips):
     """With the keys in dask's variables, as the documentation has it."""
@@ -359,6 +364,7 @@ def test_a_cluster_with_tls_writes_the_same_bytes(tmp_path, strips):
     assert (tmp_path / "far" / "a.laz").read_bytes() == (tmp_path / "near" / "a.laz").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cancelled", "sent"), [(False, 2), (True, 1)])
 def test_a_call_that_nobody_waits_for_is_not_sent_again_from_a_worker_that_does_not_fit(cancelled, sent):
     remotes = []

@@ -114,6 +114,7 @@ def _is_tracker(pid):
         return False
 
 
+@pytest.mark.quick_cases("event1")
 @pytest.mark.parametrize("event", [REPORTED, DRAWN_UP])
 def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, event):
     out = tmp_path / "out"
@@ -230,6 +231,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(strips, undisturbed, tmp_path):
     script = tmp_path / "shot.py"
     out = tmp_path / "out"

@@ -50,6 +50,7 @@ def write_noise(path, n, s):
     return make_raw(n, n_samples=s, bits=16).write(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "s"), [(1, 65536), (1000, 2000)])
 def test_long_waveforms_of_noise_stay_within_the_memory_limit(tmp_path, n, s):
     """Tables of candidates by samples took 7 GB."""
@@ -75,6 +76,7 @@ def test_a_block_of_long_waveforms_has_fewer_of_them():
             assert batch_size(k, length) >= 1 and batch_size(k, length) * values <= max(LARGEST_BATCH, values)
 
 
+@pytest.mark.slow
 def test_simulated_waveforms_have_at_most_as_many_samples_as_are_read(tmp_path):
     peak, _ = measure("simulate", "flat", "-o", tmp_path / "a.las", "--pulses", "300", "--samples", "65536")
     assert peak < 500
@@ -83,6 +85,7 @@ def test_simulated_waveforms_have_at_most_as_many_samples_as_are_read(tmp_path):
     assert "n_samples must lie from 8 to 65536" in said
 
 
+@pytest.mark.slow
 def test_evlrs_of_a_hole_in_the_file_are_not_listed_for_ever(tmp_path):
     """A count of 4 billion over zeros, each of which is an empty record."""
     raw = make_raw(30, point_format=9, internal=False, minor=4)
@@ -101,6 +104,7 @@ def test_evlrs_of_a_hole_in_the_file_are_not_listed_for_ever(tmp_path):
     assert any("EVLRs" in line and str(MAX_EVLRS) in line for line in report["warnings"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [".".join(["a"] * 20_000) + " = 1", "[" + ".".join(['"a"'] * 20_000) + "]"])
 def test_keys_of_many_parts_are_refused_before_they_take_memory(tmp_path, text):
     chain = tmp_path / "a.toml"
@@ -109,6 +113,7 @@ def test_keys_of_many_parts_are_refused_before_they_take_memory(tmp_path, text):
     assert peak < 150
 
 
+@pytest.mark.slow
 def test_the_account_of_many_digitizers_fits_into_the_cloud(tmp_path):
     """180 digitizers with a pulse each: 75 kB, more than a VLR holds."""
     n, s, k = 4500, 64, 180

@@ -79,6 +79,7 @@ def test_angles_of_known_surfaces(clouds, scene, terrain):
     assert counts["NO_PLANE"] > 0 and "NO_RAY" not in counts
 
 
+@pytest.mark.slow
 def test_plants_are_no_surface(tmp_path):
     simulate_strip("forest", tmp_path / "s.las", pulses=16_000, seed=2)
     run_strip(tmp_path / "s.las", tmp_path / "out")
@@ -161,6 +162,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 @pytest.mark.parametrize("method", ["take", pytest.param("rows", marks=pytest.mark.slow)])
 def test_killed_in_the_second_pass_resume_gives_what_an_undisturbed_run_gives(strips, clouds, tmp_path, method):
@@ -246,6 +248,7 @@ def test_any_tiles_give_the_same_bits_on_any_points(layout, tmp_path, monkeypatc
     assert counts_again == counts and again.tobytes() == whole.tobytes()
 
 
+@pytest.mark.slow
 def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)

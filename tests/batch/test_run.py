@@ -48,6 +48,7 @@ def test_same_bytes_for_any_jobs_and_block_size(wide_strip, reference, tmp_path,
     assert _files(tmp_path) == ["wide.laz", "wide.report.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("profile", "points"), [("accurate", "echoes"), ("balanced", "returns")])
 def test_real_strips_give_the_same_bytes_for_any_block_size(riegl, leica, tmp_path, profile, points):
     for strip in (riegl, leica):

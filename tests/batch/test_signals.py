@@ -60,6 +60,7 @@ def _commands(strip, folder):
     }
 
 
+@pytest.mark.quick_cases("run", "run-2")
 @pytest.mark.parametrize("name", list(_commands(Path(), Path())))
 def test_a_signal_at_any_instant_of_any_command_gives_130_and_leaves_nothing(strip, tmp_path, name):
     for number, second in [(signal.SIGTERM, None), (signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]:

@@ -78,6 +78,7 @@ def folder(riegl, tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_reports(folder, riegl):
     _hold(json.loads((folder / "run.json").read_text()), "wavebatch.batch-report/1")
     _hold(json.loads((folder / f"{riegl.stem}.report.json").read_text()), "wavebatch.strip-report/1")
@@ -118,6 +119,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick_cases("[!b]*")
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)

@@ -41,6 +41,7 @@ def call(name, parameters, block, system):
     return STAGES[name].function(block, noise, system, *given, **parameters)
 
 
+@pytest.mark.quick_cases("1-gaussian-*", "2-short-*", "40-gaussian-detect*", "40-gaussian-decompose.[!r]*")
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
 @pytest.mark.parametrize("system", ["gaussian", "learned", "short"])
 @pytest.mark.parametrize("s", [1, 2, 40])

@@ -55,6 +55,7 @@ def flight(tmp_path_factory):
     return folder, done.stderr
 
 
+@pytest.mark.slow
 def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight):
     folder, _ = flight
     rows = {(row.strip[0], row.digitizer): row for row in load_calibration(folder / "cal.toml").strips}
@@ -187,6 +188,7 @@ def clouds(flight, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "ratio"), [("own", 0.0), ("mean", 1 / 1.08 - 1)])
 def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
     done = call("compare", clouds / kind / "a.laz", clouds / kind / "b.laz", "--overlap", "--json")

@@ -96,6 +96,7 @@ def test_the_page_of_a_flight_names_strips_that_do_not_belong(tiny_strip, tmp_pa
     assert "Strips" in shown.headings and shown.text.count("belongs to the others") == 2
 
 
+@pytest.mark.slow
 def test_the_page_of_a_benchmark(timed_here, tmp_path):
     found = _run("bench", "--scene", "open", "--waveforms", 600, "--pulses", 0, "--no-peers", "--no-stability",
                  "--repeat", 1, "--json", "--html", tmp_path / "b.html")  # fmt: skip
