@@ -3,7 +3,6 @@
 from collections import defaultdict
 
 import numpy as np
-from scipy.stats import kurtosis, skew
 
 
 def find_pulses(gps_time, longest=64):
@@ -41,7 +40,8 @@ def variety(u, v, directions=24):
     found = []
     for angle in np.pi * np.arange(directions) / directions:
         across = np.cos(angle) * u + np.sin(angle) * v
-        found.append(kurtosis(across, fisher=False) - skew(across) ** 2 - 1)
+        second, third, fourth = (np.mean((across - across.mean()) ** power) for power in (2, 3, 4))
+        found.append(fourth / second**2 - third**2 / second**3 - 1)
     return min(found)
 
 
