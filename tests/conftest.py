@@ -9,6 +9,7 @@ import kept_surveys
 import numpy as np
 import pytest
 from child_signals import give_children_default_signals
+from hypothesis import HealthCheck, settings
 
 from wavebatch.tools.simulate import simulate_strip
 
@@ -16,9 +17,15 @@ give_children_default_signals()
 
 
 def pytest_configure(config):
-    """Only the fast tests share surveys."""
-    if config.option.markexpr == "not slow":
+    """The fast tests share surveys and draw fewer examples; examples are the same in every run, however slow."""
+    fast = config.option.markexpr == "not slow"
+    if fast:
         kept_surveys.install()
+    unhurried = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    examples = 40 if fast else 200
+    settings.register_profile("wavebatch", derandomize=True, deadline=None, max_examples=examples,
+                              suppress_health_check=unhurried)  # fmt: skip
+    settings.load_profile("wavebatch")
 
 
 @pytest.hookimpl(tryfirst=True)

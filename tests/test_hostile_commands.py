@@ -48,6 +48,7 @@ def invoke(command, strip, out):
 COMMANDS = ["run", "info", "check", "survey", "compare", "stats", "slice", "synthesize"]
 
 
+@pytest.mark.quick_cases("4-return_point_wave_location", "9-gps_time")
 @pytest.mark.parametrize("field", ["return_point_wave_location", "x_t", "z_t", "gps_time"])
 @pytest.mark.parametrize("point_format", [4, 9])
 def test_signalling_nans_in_points_are_no_numbers_and_no_warnings(tmp_path, point_format, field):
@@ -257,6 +258,7 @@ def test_damaged_arrays_are_one_line(tmp_path):
         assert done.exit_code == 1 and "holds no cube" in done.stderr and done.stderr.count("\n") == 1, done.stderr
 
 
+@pytest.mark.quick_cases("<&- >&- 2>&-")
 @pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX systems")
 @pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_do_no_harm(tmp_path, closed):

@@ -91,6 +91,7 @@ def test_plants_are_no_surface(tmp_path):
     assert known[above > 1.0].mean() < 0.005
 
 
+@pytest.mark.quick_cases("batch1")
 @pytest.mark.parametrize("batch", [{"jobs": 2}, {"block_size": 700}])
 def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch):
     run_strip(strips / "urban.las", tmp_path, batch=batch)

@@ -160,7 +160,7 @@ def test_an_interrupt_at_any_line_of_a_wait_leaves_no_lock_taken():
             thread.daemon = True
             thread.start()
             seen = _interrupt_at(number, workers.wait, [future])
-            thread.join(5)
+            thread.join(100)
             assert not thread.is_alive(), f"line {number}"
             if not seen:
                 break

@@ -136,7 +136,7 @@ def test_a_terminal_completes_names_after_tab(shell, tmp_path):
             os.killpg(child.pid, signal.SIGKILL)
 
 
-def _talk(child, keys, wanted, seconds=40.0):
+def _talk(child, keys, wanted, seconds=100.0):
     """Types keys and waits until the terminal shows the text."""
     child.stdin.write(keys.encode())
     child.stdin.flush()

@@ -41,7 +41,7 @@ def test_masks_widened_to_one_side(rng, reach):
     np.testing.assert_array_equal(widen_after(mask, reach), naive_signal.widen_after(mask, reach))
 
 
-@pytest.mark.parametrize("recovery", [0, 2, 9])
+@pytest.mark.parametrize("recovery", [0, 2, 4, 9])
 def test_quiet_samples_keep_away_from_the_tails_of_strong_signal(rng, recovery):
     above = record(rng, amplitude=rng.uniform(2, 60, 40)) - 12
     quiet = find_quiet(above, 3.0, 2, recovery)

@@ -50,6 +50,7 @@ def known(cloud, name):
     return values[np.isfinite(values)]
 
 
+@pytest.mark.quick_cases("tail")
 @pytest.mark.parametrize("pulse", [RINGING, TAIL], ids=["after-pulses", "tail"])
 def test_a_strip_calibrates_and_runs_with_one_pulse_and_one_chain(tmp_path, pulse):
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(pulse=pulse), 6000)
@@ -116,6 +117,7 @@ def test_the_angle_of_a_tilted_target_is_that_of_its_plane(tmp_path, slope):
     assert off < 0.005 and off < 4 * stated < 0.03
 
 
+@pytest.mark.quick_cases("slope1")
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.2, 0.1)])
 def test_a_target_of_one_scan_line_is_refused_by_name_and_needs_its_incidence(tmp_path, slope):
     # Scan lines are 2.4 m apart: one of them crosses a target 2 m wide. Its plane was taken for 88 deg before.
@@ -246,6 +248,7 @@ def test_a_scanner_channel_that_was_not_calibrated_is_named(tmp_path):
     assert np.isfinite(wb.read_cloud(tmp_path / "out" / "0.laz")["reflectance"]).mean() == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.quick_cases("change0-*", "*was not calibrated, only*")
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -70,6 +70,7 @@ def town(tmp_path_factory):
     return fly(tmp_path_factory.mktemp("town"), planes, GREEN, 16_000)
 
 
+@pytest.mark.quick_cases("0", "4")
 @pytest.mark.parametrize("plane", range(5))
 def test_roofs_have_right_numbers_with_right_errors(town, plane):
     columns, true, _ = town
@@ -206,6 +207,7 @@ def flickering(tmp_path_factory):
     return folder, flight, truth
 
 
+@pytest.mark.quick_cases("shots.csv")
 @pytest.mark.parametrize("source", ["shot_energy", "shots.csv"])
 def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
     folder, flight, truth = flickering
@@ -221,6 +223,7 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
     assert told["mean"] == pytest.approx(7.5, rel=0.01) and told["share_known"] == 1.0
 
 
+@pytest.mark.quick_cases("<lambda>-knows 0 of 6000 pulses of the strip")
 @pytest.mark.parametrize(
     ("make", "message"),
     [

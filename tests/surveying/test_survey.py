@@ -32,6 +32,7 @@ def test_widths_are_in_ns_whatever_the_spacing(spacing):
     assert survey.system.sigma_ref == pytest.approx(2.0, rel=0.02) and survey.figures["spacing_ns"] == spacing
 
 
+@pytest.mark.quick_cases("gaussian-gaussian", "leica-learned")
 @pytest.mark.parametrize(
     ("pulse", "kind"), [("gaussian", "gaussian"), ("skewed", "skewed"), ("riegl", "learned"), ("leica", "learned")]
 )

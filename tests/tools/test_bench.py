@@ -305,7 +305,7 @@ def GaussianDecomposition(y, thres):
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 1.5)
+    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
