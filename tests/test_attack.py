@@ -37,7 +37,7 @@ def _plant(attacker, monkeypatch, code):
 
 def _begin(words, **how):
     """The process, once it does not die of the signal: on a busy machine that takes a while."""
-    process, deadline = _POPEN(words, **how), time.monotonic() + 60
+    process, deadline = _POPEN(words, **how), time.monotonic() + 300
     while process.poll() is None and not attacking._handles_signals(process.pid):
         assert time.monotonic() < deadline, "the program does not begin"
         time.sleep(0.01)

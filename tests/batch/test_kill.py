@@ -153,7 +153,7 @@ def test_workers_die_with_their_parent(strips, tmp_path, stopped):
 
 
 def _wait_until_gone(children):
-    deadline = time.monotonic() + 100
+    deadline = time.monotonic() + 300
     while any(_is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)
@@ -237,7 +237,7 @@ def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(s
     out = tmp_path / "out"
     places = {"strips": str(strips), "out": str(out), "once": str(tmp_path / "once")}
     script.write_text(_SHOT.format(tests=os.path.dirname(os.path.dirname(__file__)), **places))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=180)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     statuses, error = done.stdout.splitlines()
     assert statuses == "['written', 'failed', 'written']"

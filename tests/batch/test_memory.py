@@ -36,7 +36,7 @@ finally:
 def measure(*command, code=0):
     """Peak of the resident memory of a command [MB], and what it said."""
     done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, *map(str, command)], capture_output=True, text=True, timeout=120,
+        [sys.executable, "-c", _PROGRAM, *map(str, command)], capture_output=True, text=True, timeout=300,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == code, done.stderr
@@ -144,7 +144,7 @@ def test_too_little_memory_is_an_error_with_a_remedy(tmp_path):
               "    resource.setrlimit(resource.RLIMIT_AS, (now + (60 << 20),) * 2)\ntry:")  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-c", code.strip(), "run", str(strip), "-o", str(tmp_path / "out")], text=True,
-        capture_output=True, timeout=120, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True, timeout=300, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 4, done.stderr
     assert "not enough memory" in done.stderr and "fewer --jobs" in done.stderr and "bug" not in done.stderr

@@ -55,7 +55,7 @@ def stop_later():
 
 def wait_until_stopped(workers):
     """Until one of the processes is stopped."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not any(_is_stopped(worker.process.pid) for worker in workers._workers):
         assert time.monotonic() < deadline, "no process stops"
         time.sleep(0.01)
@@ -145,7 +145,7 @@ def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, ea
     """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""
     script = tmp_path / "interrupted.py"
     script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr
 
 
@@ -196,7 +196,7 @@ def _interrupt_at(number, function, *arguments):
 def test_a_process_that_the_system_refuses_is_one_line(tiny_strip, tmp_path):
     """It said to check disk and permissions. Root has no limit of processes, so that of open files must do."""
     words = f"ulimit -n 24; exec '{sys.executable}' -m wavebatch run '{tiny_strip}' -o '{tmp_path}/out' --jobs 40 -q"
-    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 4 and "of --jobs cannot be started (Too many open files); use fewer" in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
 
