@@ -78,7 +78,6 @@ def folder(riegl, tmp_path_factory):
     return place
 
 
-@pytest.mark.slow
 def test_reports(folder, riegl):
     _hold(json.loads((folder / "run.json").read_text()), "wavebatch.batch-report/1")
     _hold(json.loads((folder / f"{riegl.stem}.report.json").read_text()), "wavebatch.strip-report/1")
