@@ -178,6 +178,8 @@ def correlate_quiet(signal, quiet, std, lags):
         y = y - y[used].mean()
         for lag in range(lags + 1):
             products[lag] += [y[i] * y[i + lag] for i in range(len(y) - lag) if used[i] and used[i + lag]]
+    if not shares:
+        return np.empty(0)
     raw = np.array([np.mean(values) for values in products])
     share = np.mean(shares)
     # All lags lose the same, share (c0 + 2 c1 + 2 c2 ...): three rounds of it are nearly its solution.
@@ -281,3 +283,72 @@ def fit_height(profile, waveform, taps, support):
     """One profile scaled so that its sum of pulses has the energy of the waveform over the support."""
     made = (naive.pulse_matrix(len(waveform), taps) @ profile)[support].sum()
     return profile * (max(waveform[support].sum(), 0.0) / made if made > 0 else 0.0)
+
+
+def within_waveforms(signal, quiet):
+    """Standard deviation of quiet samples about the mean of their waveform, of waveforms with eight of them or more."""
+    parts = [y[used] for y, used in zip(signal.T.astype(float), quiet.T, strict=True) if used.sum() >= 8]
+    squares = sum(np.sum((part - part.mean()) ** 2) for part in parts)
+    return max(np.sqrt(squares / sum(len(part) - 1 for part in parts)), QUANTISATION_STD)
+
+
+def smoothed_within(signal, quiet):
+    """The same of smoothed samples whose neighbours are quiet too, as the standard deviation of white noise."""
+    squares = freedom = 0
+    for y, used in zip(signal.T.astype(float), quiet.T, strict=True):
+        smoothed = naive.smooth_121(y)
+        inside = [smoothed[i] for i in range(1, len(y) - 1) if used[i - 1 : i + 2].all()]
+        if inside:
+            squares += np.sum((np.array(inside) - np.mean(inside)) ** 2)
+            freedom += len(inside) - 1
+    return np.sqrt(squares / freedom) / (np.sqrt(6) / 4)
+
+
+def split_variance(signal, level, quiet, apart):
+    """Noise of a sample, and spread of levels by the products of quiet samples of a waveform far from each other."""
+    products = pairs = squares = number = 0
+    for y, used in zip(signal.T.astype(float) - level, quiet.T, strict=True):
+        count = used.sum()
+        if count < 2:
+            continue
+        squares, number = squares + np.sum(y[used] ** 2), number + count
+        for i in np.flatnonzero(used):
+            earlier = y[: max(i - apart, 0)][used[: max(i - apart, 0)]]
+            products, pairs = products + y[i] * earlier.sum() / count, pairs + len(earlier) / count
+    between = max(products / pairs, 0.0)
+    return max(np.sqrt(max(squares / number - between, 0.0)), QUANTISATION_STD), np.sqrt(between)
+
+
+def estimate_noise(signal, reach, limit=4.0, recovery=0, start=None):
+    """Level, std, std of smoothed samples, spread, share and correlation of quiet samples about one common level.
+
+    For levels that scatter by less than the noise, at least 50 waveforms, and none missing; `start`: (level, std,
+    spread) to begin with.
+    """
+    level, std, spread = start or (*first_level(signal), 0.0)
+    for _ in range(4):
+        width = limit * np.hypot(np.sqrt(6) / 4 * std, spread) + 0.25
+        quiet = find_quiet(signal - level, width, reach, recovery)
+        last = level, std, spread
+        level = signal[quiet].astype(float).mean()
+        std, spread = split_variance(signal, level, quiet, reach)
+        if max(abs(new - old) for new, old in zip((level, std, spread), last, strict=True)) < 0.001 * std:
+            break
+    smoothed = smoothed_within(signal, quiet) * std / within_waveforms(signal, quiet)
+    return level, std, smoothed, spread, quiet.mean(), correlate_quiet(signal.astype(float), quiet, std, 12)
+
+
+def estimate_drifting(signal, reach, limit=4.0):
+    """The same for levels that scatter by more than the noise: each waveform's level is found from itself."""
+    quartile = np.array([sorted(y)[len(y) // 4] for y in signal.T.astype(float)])
+    below = (signal - quartile)[signal < quartile]
+    std = max(np.sqrt(np.mean(below**2)) / 0.773, QUANTISATION_STD)
+    for _ in range(4):
+        found = [find_level(y, std, reach, limit) for y in signal.T.astype(float)]
+        levels, quiet = np.array([one for one, _ in found]), np.stack([used for _, used in found], axis=1)
+        std = within_waveforms(signal, quiet)
+    number = quiet.sum(axis=0)
+    known = levels[number >= 8]
+    scatter = np.var(known) - std**2 * np.mean(1 / number[number >= 8])
+    correlation = correlate_quiet(signal.astype(float), quiet, std, 12)
+    return known.mean(), std, smoothed_within(signal, quiet), np.sqrt(max(scatter, 0.0)), quiet.mean(), correlation

@@ -14,6 +14,7 @@ from wavebatch.kernels.signal.noise import (
     colour_factors,
     correlate_quiet,
     correlation_matrix,
+    estimate_noise,
     find_levels,
     first_level,
     keep_longest,
@@ -164,18 +165,57 @@ def test_the_longest_recording_is_kept(rng):
     np.testing.assert_array_equal(keep_longest(missing), naive_signal.keep_longest(missing))
 
 
-@pytest.mark.parametrize("tail", [0.0, 0.04])
-def test_the_recovery_is_that_of_a_loop(rng, tail):
-    n, s = 260, 90
+def record_tails(rng, tail, n=260, s=90):
+    """Waveforms (s, n) whose echoes have a tail of this share of their height."""
     time = rng.integers(12, 30, n)
     x = np.arange(s)[:, None]
     signal = 12 + rng.normal(0, 1, (s, n)) + 90 * np.exp(-0.5 * ((x - time) / 2.0) ** 2)
-    signal = (signal + 90 * tail * (x > time) * np.exp(-np.maximum(x - time, 0) / 15.0)).astype(np.float32)
+    return (signal + 90 * tail * (x > time) * np.exp(-np.maximum(x - time, 0) / 15.0)).astype(np.float32)
+
+
+@pytest.mark.parametrize("tail", [0.0, 0.04])
+def test_the_recovery_is_that_of_a_loop(rng, tail):
+    signal = record_tails(rng, tail)
     pooled = PooledNoise(12.0, 1.0, 1.0, 0.3, 0.7)
     found = measure_recovery(signal, pooled, 4, 4.0)
     assert found == naive_signal.measure_recovery(signal, pooled, 4, 4.0)
     assert (found > 0) == (tail > 0)
     assert measure_recovery(signal[:, :90], pooled, 4, 4.0) == 0
+
+
+def assert_same_noise(found, expected):
+    assert found[:5] == pytest.approx(expected[:5], rel=1e-3, abs=2e-4)
+    assert found.correlation == pytest.approx(expected[5], abs=2e-4)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_pooled_noise_is_that_of_a_loop(rng, monkeypatch, spread):
+    """Coloured, so that samples near each other share more than their level; some waveforms have few quiet samples."""
+    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
+    white = rng.standard_normal((65, 90))
+    colour = np.where(np.arange(90) < 5, 60.0 * (np.arange(64) % 60 > 3)[:, None], 0.0)
+    signal = record(rng, n=90, std=0.0, level=12 + spread * rng.standard_normal(90))
+    signal = (signal + white[1:] + 0.6 * white[:-1] + colour).astype(np.float32)
+    found = estimate_noise(signal, 3)
+    assert found.recovery == 0
+    assert_same_noise(found, naive_signal.estimate_noise(signal, 3))
+
+
+def test_drifting_noise_is_that_of_a_loop(rng, monkeypatch):
+    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
+    signal = record(rng, n=80, level=60 + 8 * rng.standard_normal(80))
+    assert_same_noise(estimate_noise(signal, 3), naive_signal.estimate_drifting(signal, 3))
+
+
+def test_tails_of_strong_echoes_are_left_out_of_pooled_noise(rng):
+    signal = record_tails(rng, 0.04, n=150)
+    found = estimate_noise(signal, 4)
+    level, std, smoothed, spread, share, _ = naive_signal.estimate_noise(signal, 4)
+    pooled = PooledNoise(level, std, smoothed, spread, share)
+    assert found.recovery == naive_signal.measure_recovery(signal, pooled, 4, 4.0) > 0
+    assert found.level < level - 0.05
+    again = naive_signal.estimate_noise(signal, 4, recovery=found.recovery, start=(level, std, spread))
+    assert_same_noise(found, again)
 
 
 def test_coloured_noise_widens_errors_as_its_covariance_says():
