@@ -118,6 +118,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick_cases("[!b]*")
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
