@@ -302,9 +302,14 @@ def floats_reader(form: str) -> Callable[[click.Context, click.Parameter, str | 
     return lambda context, parameter, text: None if text is None else parse_floats(text, form)
 
 
-def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
-    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
-    if len(paths) == 1:
+def for_each(
+    paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False, alone: bool = False
+) -> tuple[list[Any], int]:
+    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr.
+
+    alone: a single one that fails is such a line too.
+    """
+    if len(paths) == 1 and not alone:
         return [work(paths[0])], 0
     results, failed = [], 0
     for path in paths:
