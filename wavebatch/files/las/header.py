@@ -192,7 +192,7 @@ def _guess(path: Path, front: bytes) -> str:
     strip = next((one for one in beside if one.is_file()), None)
     if front.startswith(b"PulseWaves"):
         return f"; it is PulseWaves: `wavebatch import {path}` makes a strip of it" + f", or give {strip}" * bool(strip)
-    if path.suffix.lower() == ".wdp":
+    if path.suffix.lower() in (".wdp", ".wdz"):
         return f"; it has the packets of {strip or path.with_suffix('.las')}: give that file"
     text = path.suffix.lower() in (".txt", ".lst", ".list", ".csv") or not front
     if text and b"\0" not in front:

@@ -117,7 +117,7 @@ class StripReader(Closing):
         self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
-            self._packets = PacketFile(facts.packets)
+            self._packets = PacketFile(facts.packets, facts.compressed)
         except BaseException:
             self._points.close()
             raise
