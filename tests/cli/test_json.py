@@ -113,6 +113,7 @@ CASES = {
     "stages": "stages/1",
     "simulate slope -o s.las --pulses 300 -q": "simulate/1",
     "import PULSES -o i.las -q": "import/1",
+    "export STRIP -o e.npz -q": "export/1",
     "synthesize SIM -o y.las -q": "synthesize/1",
     "slice STRIP -o s.csv -q": "slice/1",
     "voxelize STRIP --size 3 -o v.npz -q": "voxelize/1",

@@ -3,44 +3,12 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from naive_wdz import compress
-from strips import descriptor
+from naive_wdz import pack_strip
 
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import InputError
-from wavebatch.files.las.header import EVLR_HEADER_SIZE, read_header
 from wavebatch.files.strip.reader import StripReader
-
-
-def pack_strip(source, target, mixed=False):
-    """The strip with its packets as LAStools compresses them; mixed: descriptor 1 stays as it is."""
-    data, header = bytearray(source.read_bytes()), read_header(source)
-    with StripReader(source) as reader:
-        points = reader.read_points(0, header.point_count).copy()
-        digitizers = reader.facts.digitizers
-    old = source.with_suffix(".wdp").read_bytes()
-    out, moved = bytearray(old[:EVLR_HEADER_SIZE]) + b"LAStools waveform 260101" + b"\0\0", {}
-    for row in range(len(points)):
-        index, at = int(points["wavepacket_index"][row]), int(points["wavepacket_offset"][row])
-        if index and (index, at) not in moved:
-            bits, size = digitizers[index].bits, int(points["wavepacket_size"][row])
-            samples = np.frombuffer(old, f"<u{bits // 8}", size // (bits // 8), at)
-            packet = old[at : at + size] if mixed and index == 1 else compress(samples, bits)
-            moved[index, at] = len(out), len(packet)
-            out += packet
-        if index:
-            points["wavepacket_offset"][row], points["wavepacket_size"][row] = moved[index, at]
-    for digitizer in digitizers.values():
-        if digitizer.n_samples and not (mixed and digitizer.index == 1):
-            plain = descriptor(digitizer.index)[:20]  # its user id and number
-            at = bytes(data).index(plain[2:]) - 2
-            data[at + 54 + 1] = 1
-    start = header.offset_to_points
-    data[start : start + points.nbytes] = points.tobytes()
-    target.write_bytes(data)
-    target.with_suffix(".wdz").write_bytes(out)
-    return target
 
 
 @pytest.fixture

@@ -31,9 +31,6 @@ MOST_SEGMENTS = 255
 MOST_PULSE_BYTES = 4096
 """Longest pulse record: 48 bytes and attributes."""
 
-NO_CENTRE = (-1879048193, -32768)
-"""Values of the anchor's distance from the optical centre that mean that it is not constant."""
-
 _HEADER_SIZE, _SPEC, _PROJ = 352, "PulseWaves_Spec", "PulseWaves_Proj"
 _END = 0xFFFFFFFF
 _NUMBERS = struct.Struct("<HHBBHqqIIIIqIi2d2q6d")
@@ -78,8 +75,6 @@ class Sampling:
 class Descriptor:
     """How the waves of a pulse are stored."""
 
-    centre: int
-    """Sampling units from the optical centre to the anchor; one of NO_CENTRE where that is not constant."""
     extra: int
     """Bytes before the first sampling."""
     unit: float
@@ -231,9 +226,8 @@ def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
     """The descriptor of a record; raises InputError for one that no waves can be read with."""
     if len(payload) < _COMPOSITION.size:
         raise damaged(path, f"descriptor {index} has {len(payload)} bytes")
-    size, _, centre, extra, count, unit, scanner, compression = _COMPOSITION.unpack_from(payload)
-    # Some writers set the fields from compression on to text or to the index; only samples say that they are packed.
-    del compression
+    # Writers fill what follows the scanner with text; only the samplings say whether samples are compressed.
+    size, _, _, extra, count, unit, scanner, _ = _COMPOSITION.unpack_from(payload)
     if not 0 < unit <= MAX_SPACING or not count:
         raise damaged(path, f"descriptor {index} has {count} samplings and units of {unit:g} ns")
     samplings, at = [], max(size, _COMPOSITION.size)
@@ -242,7 +236,7 @@ def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
             raise damaged(path, f"descriptor {index} ends before sampling {number + 1} of {count}")
         samplings.append(_read_sampling(path, index, payload, at))
         at += max(struct.unpack_from("<I", payload, at)[0], _SAMPLING.size)
-    return Descriptor(centre, extra, float(unit), scanner, tuple(samplings))
+    return Descriptor(extra, float(unit), scanner, tuple(samplings))
 
 
 def _read_sampling(path: Path, index: int, payload: bytes, at: int) -> Sampling:
