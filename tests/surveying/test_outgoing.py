@@ -13,7 +13,7 @@ from wavebatch.files.strip.writer import FullwaveWriter
 from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
 from wavebatch.surveying import Survey
 from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
-from wavebatch.surveying.system_file import format_survey
+from wavebatch.surveying.system_file import SavedSurvey, format_survey
 from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
 
 
@@ -80,7 +80,10 @@ def test_the_pulse_that_is_taken_and_why(sent, ratio, learned, same, taken, reas
     width = fwhm if taken else ratio * fwhm
     assert found.system.sigma_ref * FWHM_PER_SIGMA == pytest.approx(width)
     assert (found.system.components == before.system.components) != taken
-    assert found.figures["outgoing_fwhm_ns"] == pytest.approx(fwhm)
+    assert found.figures["sent_fwhm_ns"] == pytest.approx(fwhm)
+    # A survey that is saved under the same name is not taken for outgoing pulses.
+    strip.with_suffix(".system.toml").write_text(format_survey(SavedSurvey(found)))
+    assert compare_outgoing(before, strip) is before
 
 
 def test_without_a_file_of_outgoing_pulses_nothing_changes(tmp_path, sent):

@@ -223,7 +223,8 @@ def compare_outgoing(found: Survey, strip: Path) -> Survey:
         why = "targets widened the echoes" if take else "their receiver is slower than that of the outgoing pulses"
     rings = f"after-pulses {100 * found.system.ringing:.1f} and {100 * sent.system.ringing:.1f} %"
     text = f"echoes {ours:.3f} ns wide at half maximum, outgoing pulses {theirs:.3f} ns, {rings}: {why}"
-    figures = {**found.figures, **{key: value for key, value in sent.figures.items() if key.startswith("outgoing_")}}
+    # Not the name of the figure itself: a survey that is saved beside the strip is no file of outgoing pulses.
+    figures = {**found.figures, "sent_fwhm_ns": theirs}
     shape = ("sigma_ref", "components", "kappa", "ringing")
     pulse = {name: getattr(sent.system, name) for name in shape} if take else {}
     system = replace(found.system, **pulse)

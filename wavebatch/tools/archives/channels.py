@@ -121,10 +121,14 @@ def group_rows(segments: Segments, *rows: np.ndarray) -> list[tuple[np.ndarray, 
     """Return the rows in groups of one kind of samples: equal bits, spacing and length, in each of the columns."""
     if not len(rows[0]):
         return []
-    codes = np.stack([code_segments(segments, column) for column in rows])
-    _, group = np.unique(codes, axis=1, return_inverse=True)
-    group = group.reshape(-1)
-    order = np.argsort(group, kind="stable")
+    group = np.zeros(len(rows[0]), np.int64)
+    for column in rows:
+        kinds, of_row = np.unique(code_segments(segments, column), return_inverse=True)
+        group = group * len(kinds) + of_row
+    if not group.any():
+        return [rows]
+    # NumPy sorts numbers of two bytes in one pass.
+    order = np.argsort(group.astype(np.uint16) if group.max() < 1 << 16 else group, kind="stable")
     cuts = np.flatnonzero(np.diff(group[order])) + 1
     return [tuple(column[part] for column in rows) for part in np.split(order, cuts)]
 
