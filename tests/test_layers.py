@@ -23,7 +23,7 @@ INSIDE = {
     "batch/workers": [{"futures", "serve", "worker_check"}, {"processes", "dask_client"}, {"dask_cluster"}],
     "surveying": [
         {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
-        {"system_file", "auto_chain", "predict_error"},
+        {"system_file", "auto_chain", "predict_error"}, {"outgoing"},
         {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"},
     ],
 }

@@ -16,3 +16,4 @@
 #include "decompose.h"
 #include "signal.h"
 #include "elementary.h"
+#include "wdz.h"

@@ -270,7 +270,8 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     n = len(block)
     if block.pulse_energy is None:
         return np.ones(n), np.full(n, system.shot_error)
-    return block.pulse_energy, np.zeros(n)
+    error = np.zeros(n) if block.pulse_energy_err is None else block.pulse_energy_err / block.pulse_energy
+    return block.pulse_energy, error
 
 
 def without_calibration(system: SystemPulse) -> SystemPulse:
