@@ -97,7 +97,7 @@ def test_the_page_of_a_flight_names_strips_that_do_not_belong(tiny_strip, tmp_pa
 
 
 def test_the_page_of_a_benchmark(timed_here, tmp_path):
-    found = _run("bench", "--scene", "open", "--waveforms", 600, "--pulses", 0, "--no-peers", "--no-stability",
+    found = _run("bench", "--scene", "open", "--waveforms", 600, "--pulses", 0,
                  "--repeat", 1, "--json", "--html", tmp_path / "b.html")  # fmt: skip
     shown, document = Page(tmp_path / "b.html").check(), json.loads(found.stdout)
     for row in document["scenes"][0]["rows"]:
