@@ -120,7 +120,7 @@ def test_nothing_to_measure():
 
 
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "can_plot", lambda: False)
+    monkeypatch.setattr(report, "has_matplotlib", lambda: False)
     options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
     chain = tmp_path / "mine.toml"
     chain.write_text(

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
+from wavebatch.files.figure_file import has_matplotlib
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
+from wavebatch.tools.bench.plot import NO_PLOT, plot_scene
 
 Column = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -132,7 +133,7 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
     """
     texts = {"bench.json": json.dumps(document, indent=1, sort_keys=True), "bench.txt": text}
     written = write_texts(folder, texts)
-    if not can_plot():
+    if not has_matplotlib():
         return [written, NO_PLOT]
     for section in document["scenes"]:
         name = f"bench-{Path(section['scene']).stem}.png"

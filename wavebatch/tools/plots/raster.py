@@ -210,9 +210,13 @@ def check_crs(paths: Sequence[Path]) -> tuple[str, str]:
 
 
 def choose_grid(
-    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool
-) -> Grid:
-    """Cells for points of which `sample` has positions; size: None to choose it; fixed: the box is the user's."""
+    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool,
+    most: int = CHOSEN_SIDE,
+) -> Grid:  # fmt: skip
+    """Cells for points of which `sample` has positions.
+
+    size: None to choose it, for at most `most` cells along a side. fixed: the box is the user's.
+    """
     places = sample.read()["place"]
     west, south, east, north = box
     if not fixed:
@@ -222,7 +226,7 @@ def choose_grid(
     if not extent <= LARGEST_EXTENT:
         raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bounds to draw a part")
     if size is None:
-        size = _choose_size(places, sample.seen, (west, south), extent)
+        size = _choose_size(places, sample.seen, (west, south), extent, most)
     grid = Grid.cover((west, south, east, north), size)
     if grid.columns * grid.rows > MOST_CELLS:
         least = _nice(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
@@ -233,7 +237,7 @@ def choose_grid(
     return grid
 
 
-def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float) -> float:
+def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float, most: int) -> float:
     """Side of a cell [m], from the area that holds points: the filled cells of a coarse grid."""
     if not extent:
         return 1.0
@@ -242,7 +246,7 @@ def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], ext
     inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
     filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
     area = filled * side**2
-    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / CHOSEN_SIDE))
+    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / most))
 
 
 def _nice(size: float) -> float:

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.bench.plot import NO_PLOT, can_plot
+from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
+from wavebatch.tools.bench.plot import NO_PLOT
 from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
 from wavebatch.tools.bench.report import align, write_texts
 
@@ -125,7 +125,7 @@ def write_report(report: RealReport, folder: Path) -> str:
     stem = f"real-{Path(report.strip).stem}"
     document = json.dumps(without_nan(asdict(report)), indent=1, sort_keys=True, allow_nan=False)
     written = write_texts(folder, {f"{stem}.json": document, f"{stem}.txt": format_report(report)})
-    if not can_plot():
+    if not has_matplotlib():
         return f"{written}; {NO_PLOT}"
     draw_report(report, folder / f"{stem}.png")
     return f"{written}, {stem}.png"
