@@ -53,9 +53,8 @@ demo: $(VENV)/.run
 	$(BIN)/wavebatch info $(DEMO)/forest.laz
 	$(BIN)/wavebatch run $(DEMO)/forest.laz -o $(DEMO)/out --profile accurate --overwrite -v
 	$(BIN)/wavebatch compare $(DEMO)/out/forest.laz --truth $(DEMO)/truth.npz
-	@echo
-	@echo "cloud:  $(DEMO)/out/forest.laz"
-	@echo "report: $(DEMO)/out/forest.report.json"
+	@$(BIN)/wavebatch compare $(DEMO)/out/forest.laz --truth $(DEMO)/truth.npz --json > $(DEMO)/compare.json
+	@$(BIN)/python examples/demo.py $(DEMO)
 
 readers: $(VENV)/.test
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: copclib
@@ -76,6 +75,7 @@ bench: $(VENV)/.test
 ifdef BASE
 	git archive $(BASE) | tar -x -C $(BENCH)/source
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target $(BENCH)/base $(BENCH)/source
+	@rm -rf $(BENCH)/source
 	PYTHONPATH=tests $(BIN)/python -m bench.against $(BENCH)/base -o $(BENCH) $(BENCH_OPTIONS)
 else
 	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
