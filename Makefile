@@ -90,7 +90,7 @@ attack: $(VENV)/.test
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "site: site/index.html"
+	@echo "site: site/index.html; with its search: $(BIN)/python -m http.server --directory site"
 
 man: $(VENV)/.test
 	$(BIN)/wavebatch --man-pages build/man

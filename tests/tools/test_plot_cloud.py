@@ -38,7 +38,7 @@ def cloud(tmp_path_factory):
     return write_cloud(
         path,
         amplitude=(amplitude, np.array([-9999.0]), None, "peak above the baseline [DN]"),
-        echo_flags=(flags, None, None, "see the table of flags [bits]"),
+        echo_flags=(flags, None, None, "flags: docs/columns.md [bits]"),
         **{"Pulse width": (width, None, 0.1, "Full width at half maximum [ns]")},
         comment=(rng.normal(size=POINTS).astype("f8"), None, None, "no unit here"),
     )

@@ -114,6 +114,7 @@ def _style(target: str, more: Mapping[str, Any] | None = None) -> Iterator[None]
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         import matplotlib
+        import matplotlib.backends.backend_agg  # also where a half of an installation is missing
     except ImportError as error:
         raise ConfigError(f"{target}: matplotlib cannot be imported; install it again: {error}") from error
     kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}

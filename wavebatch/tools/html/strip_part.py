@@ -34,7 +34,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     parts = [
         warnings,
         markup.section("Counts", count_tables(report["counts"], report["options"]["points"]), level=3),
-        markup.section("Survey", markup.paragraph(f"Source of the survey: {survey['from']}."),
+        markup.section("Survey", markup.paragraph(_name_source(survey["from"])),
                        draw_survey(system, survey["figures"], survey["waveforms"]), level=3),
         markup.section("Decisions", markup.paragraph(f"Chain: {choice['chain']}, chosen by: {choice['by']}."),
                        list_decisions(choice["decisions"]), level=3),
@@ -46,6 +46,12 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
         markup.section("Provenance", *_list_provenance(strip, report), level=3),
     ]  # fmt: skip
     return "\n".join(filter(None, parts))
+
+
+def _name_source(source: str) -> str:
+    return {"strip": "This strip was surveyed.", "flight": "The flight was surveyed, all strips together."}.get(
+        source, "The survey comes from a file (--system)."
+    )
 
 
 def count_tables(counts: Mapping[str, Any], points: str) -> str:
