@@ -13,7 +13,7 @@ import numpy as np
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.cloud.columns_reader import ColumnsReader
-from wavebatch.files.las.crs_name import describe_crs
+from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.html.charts import draw_histogram, draw_map
 from wavebatch.tools.plots.raster import Raster, choose_grid, find_shown
 from wavebatch.tools.plots.values import Tally, robust_limits
