@@ -143,7 +143,7 @@ def run_batch(
 
 
 def _drop_flight(folder: Path) -> None:
-    """Remove the survey of a flight of which no cloud came: the next run, perhaps of other strips, would use it."""
+    """Remove the survey of a flight if no cloud was written: the next run, perhaps of other strips, would use it."""
     if not any(folder.glob("*.report.json")):
         with contextlib.suppress(OSError):
             flight_path(folder).unlink(missing_ok=True)
