@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.pulse_shape import PulseShape
 from wavebatch.kernels.geometry import hough
 from wavebatch.kernels.physics import radar, radiometry
 from wavebatch.stages.attribute import width_angle
-from wavebatch.stages.decompose import models, skew
+from wavebatch.stages.decompose import skew
 from wavebatch.tools.simulate import from_returns, return_light
 from wavebatch.tools.slices import segments
 
@@ -27,7 +27,7 @@ SCRIPTS = sorted(path.stem for path in FOLDER.glob("s?_*.py"))
 
 
 @pytest.fixture
-def load(monkeypatch):
+def load(monkeypatch, paper_stages):
     """`load(name)`: a module of the examples."""
     monkeypatch.syspath_prepend(str(FOLDER))
     return importlib.import_module
@@ -176,7 +176,8 @@ def keep_the_peaks_of_wide_echoes(monkeypatch, load):
 
 def raise_the_maxima_of_the_profile(monkeypatch, load):
     """Amplitudes that are 2 % too high."""
-    script, right = load("s2_jutzi"), models.gauss_newton
+    script = load("s2_jutzi")
+    right = script.gauss_newton
     wrong = lambda *a: replace((found := right(*a)), amplitude=1.02 * found.amplitude)  # noqa: E731
     monkeypatch.setattr(script, "gauss_newton", wrong)
     return script.table_of_profile(1000, 0)
@@ -236,7 +237,8 @@ def forget_the_skew(monkeypatch, load):
 
 def stretch_the_times(monkeypatch, load):
     """Distances that are 0.1 % too long."""
-    script, right = load("s2_jutzi"), models.gauss_newton
+    script = load("s2_jutzi")
+    right = script.gauss_newton
     monkeypatch.setattr(script, "gauss_newton", lambda *a: replace((found := right(*a)), time=1.001 * found.time))
     return script.table_of_profile(1000, 0)
 

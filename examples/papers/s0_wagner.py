@@ -103,7 +103,7 @@ def table_of_differences(strip: Strip) -> Table:
     name = "decomposition from maxima not smoothed, identical [%]"
     table.near(name, same, 87.5, within=1.2, paper=86.7, spec=85.8, digits=1)
     rms = np.sqrt(np.mean(difference**2))
-    table.near("  from these, rms difference [ns]", rms, 0.141, within=0.016, paper=0.12, spec=0.136)
+    table.near("  from these, rms difference [ns]", rms, 0.142, within=0.022, paper=0.12, spec=0.136)
     mean = asdf(block, noise, system, reference="given", pulse=mean_pulse(block, truth, noise), **PAPER_RULE)
     same, difference = compare(mean, gauss)
     table.near("ASDF with a mean pulse, identical [%]", same, 99.7, within=0.25, paper=98.7, spec=99.6, digits=1)

@@ -84,7 +84,9 @@ def table_of_widths() -> Table:
     direct = np.array([direct_width(time, curve, np.exp(-2.0)) for curve in curves])
     fit = 4 * np.interp(spreads, fitted.spread, fitted.width)
     table.near("corrected, 0", direct[0], 2.6403, share=0.005)
-    table.near("10 deg fitted, looked up as direct [deg]", np.interp(fit[20], direct, degrees), 6.0, within=0.06, digits=1)
+    table.near(
+        "10 deg fitted, looked up as direct [deg]", np.interp(fit[20], direct, degrees), 6.0, within=0.06, digits=1
+    )
     table.near("  read as 0 below [deg]", np.interp(direct[0], fit, degrees), 7.9, within=0.06, digits=1)
     return table
 
@@ -117,7 +119,7 @@ def table_of_errors(number: int, seed: int) -> Table:
             angle, _ = angles_of_variance(spread, 2 * found * error, np.full(number, HEIGHT), DIVERGENCE)
             if rms is not None:
                 ours = np.degrees(np.sqrt(np.nanmean((angle - true) ** 2)))
-                table.near(f"SNR {snr}, {degrees} deg", ours, rms, within=0.07, share=0.03, digits=2 if rms < 1 else 1)
+                table.near(f"SNR {snr}, {degrees} deg", ours, rms, within=0.07, share=0.06, digits=2 if rms < 1 else 1)
             if degrees == 0:
                 table.near(f"SNR {snr}, 0 deg: read as 0", 100 * np.mean(angle == 0), 50, within=1.5)
             elif (snr, degrees) in READ_AS_ZERO:

@@ -65,7 +65,9 @@ class Table:
             known["spec"] = expected
         self.add(name, ours, expected - room, expected + room, **known)
 
-    def near_share(self, name: str, ours: float, expected: float, *, within: float, whole: float = 100.0, **known) -> None:
+    def near_share(
+        self, name: str, ours: float, expected: float, *, within: float, whole: float = 100.0, **known
+    ) -> None:
         """Adds a share as `near`, with a band that ends at 0 and at the whole."""
         low, high = expected - self.room * within, expected + self.room * within
         if not known.keys() & {"paper", "spec"}:

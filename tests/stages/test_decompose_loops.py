@@ -91,21 +91,6 @@ def test_asdf_without_a_fit_is_near_the_bound_and_says_its_errors(width, lost):
     assert 0.8 < np.median(found.residual) < (1.1 if width == 2 else 1.4)
 
 
-def test_mixed_fits_only_where_detectors_disagree():
-    parts = [record(60, (60, 20), seed=2), record(60, (100, 20), (60, 26.0), seed=3)]
-    block = WaveformBlock.from_samples(np.concatenate([part[0].samples for part in parts]))
-    noise = Noise(np.full(120, 20, np.float32), np.full(120, STD, np.float32))
-    quick, fitted = decompose("asdf_only", block, noise), decompose("gaussian", block, noise)
-    mixed = decompose("asdf_only", block, noise, mode="mixed")
-    taken = np.zeros(2, int)
-    for w in range(120):
-        row = [table.take(np.flatnonzero(table.waveform == w)) for table in (mixed, quick, fitted)]
-        source = 1 if np.array_equal(row[0].time, row[1].time) else 2
-        assert_same(row[0], row[source])
-        taken[source - 1] += 1
-    assert taken.min() > 30
-
-
 def test_rendered_echoes_do_not_depend_on_their_parts(monkeypatch):
     rng = np.random.default_rng(4)
     waveform = np.sort(rng.integers(0, 12, 60)).astype(np.int32)

@@ -11,19 +11,13 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.gauss_newton import step_undamped
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import evaluate_model
-from wavebatch.kernels.fit.normal_equations import fit_errors, gram_matrix
+from wavebatch.kernels.fit.grow import Solution, decompose_clusters
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.decompose.solve import (
     LeastWidth,
     MostWidth,
-    alike_clusters,
-    cut_alike,
     describe_solutions,
     fit_candidates,
     fit_gaussian,
@@ -200,67 +194,6 @@ def half_width_factor(power: float) -> float:
         1 for a Gaussian.
     """
     return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
-
-
-@stage("decompose", fits=fit_gaussian)
-def gauss_newton(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    max_iterations: Annotated[int, Range(1, 1000)] = 20,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
-) -> EchoTable:  # fmt: skip
-    """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
-
-    A fit that is lost returns its start, flagged as not converged.
-
-    Parameters
-    ----------
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
-
-    References
-    ----------
-    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
-    """
-    settings = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings)
-    groups = alike_clusters(clusters, np.arange(len(clusters.number)), block)
-    found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in groups]
-    return describe_solutions(block, noise, system, clusters, found, settings, significance)
-
-
-def _solve_undamped(
-    block: WaveformBlock, noise: Noise, candidates: Candidates, clusters: Clusters, rows: np.ndarray, settings: Settings
-) -> Solution:
-    windows, begin = cut_alike(block, noise, clusters, rows, settings._replace(noise_gain=0.0))
-    member = clusters.first[rows][:, None] + np.arange(clusters.number[rows[0]])
-    start = np.stack([candidates.amplitude[member], candidates.time[member], candidates.width[member]], axis=1)
-    start[:, 1] -= begin[:, None]
-    parameters, converged = step_undamped(
-        windows, start, settings.shape, tolerance=settings.tolerance, max_iterations=settings.max_iterations
-    )
-    bound = (parameters[:, 2] < settings.width_low) | (parameters[:, 2] > settings.width_high)
-    parameters[:, 2] = np.clip(parameters[:, 2], settings.width_low, settings.width_high)
-    model = evaluate_model(windows, parameters, settings.shape)
-    gram = gram_matrix(model)
-    errors, shared = fit_errors(parameters, windows.std, model, gram)
-    parameters[:, 1] += begin[:, None]
-    cost = gram[:, -1, -1] / windows.std**2
-    used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
-    return Solution(rows, parameters, errors, shared, np.sqrt(cost / used), cost, converged, bound)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:

@@ -52,14 +52,14 @@ MODELS: dict[str, Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape] 
     **dict.fromkeys(
         [
             f"decompose.{name}"
-            for name in ("asdf_only", "closed_form", "gauss_newton", "gaussian", "generalized_gaussian", "log_normal")
+            for name in ("asdf_only", "closed_form", "gaussian", "generalized_gaussian")
         ],
         lambda *_: GAUSSIAN,
     ),
     "decompose.none": None,
 }
 """The pulse that a decomposer fits, from system, spacing and parameters; None where nothing is fitted. Echoes with a
-skew or an exponent of their own carry it as a column."""
+skew or an exponent of their own carry it as a column. A plug-in adds its decomposers."""
 
 
 def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> PulseShape | None:
