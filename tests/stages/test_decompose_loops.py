@@ -13,7 +13,7 @@ from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import Recording, known_noise, known_system, simulate_echoes
 
@@ -183,6 +183,20 @@ def test_the_loop_knows_other_pulses_than_gaussians(model):
     loop = STAGES["decompose.residual_loop"].function
     counted = {one: loop(block, noise, system, candidates, model=one).count(n) for one in ("gaussian", model)}
     assert (counted["gaussian"] > 1).mean() > 0.5 and (counted[model] == 1).mean() > 0.95
+
+
+@pytest.mark.parametrize(("given", "model"), [
+    ({}, "gaussian"), ({"kappa": 0.3}, "skewed"), ({"components": ((1.0, 0.0, 2.0), (0.15, 7.0, 2.0))}, "learned"),
+])  # fmt: skip
+def test_the_loop_fits_the_pulse_of_the_survey_unless_told_otherwise(given, model):
+    block, noise, _ = record(60, (100, 28), (60, 33))
+    system = replace(SYSTEM, **given)
+    candidates = STAGES["detect.maximum"].function(block, noise, system)
+    stage = STAGES["decompose.residual_loop"]
+    assert_same(stage.function(block, noise, system, candidates),
+                stage.function(block, noise, system, candidates, model=model))  # fmt: skip
+    step = Step(stage)
+    assert stage.fits(system, step.effective()) == stage.fits(system, {**step.effective(), "model": model})
 
 
 def test_the_unit_of_the_loops_threshold():

@@ -18,7 +18,7 @@ from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
-from wavebatch.stages.decompose.rebuild import loop_shape, render_table
+from wavebatch.stages.decompose.rebuild import loop_model, loop_shape, render_table
 from wavebatch.stages.decompose.skew import skewed, system_skew
 from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
@@ -28,7 +28,7 @@ from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH
 
 def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
     """The system with the pulse that `residual_loop` fits."""
-    model = parameters["model"]
+    model = loop_model(system, parameters["model"])
     if model == "learned":
         return system
     return replace(system, components=(), kappa=system_skew(system)) if model == "skewed" else fit_gaussian(system, {})
@@ -37,7 +37,7 @@ def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse
 @stage("decompose", fits=_fit_loop)
 def residual_loop(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    model: Literal["gaussian", "skewed", "generalized", "learned"] = "gaussian",
+    model: Literal["auto", "gaussian", "skewed", "generalized", "learned"] = "auto",
     t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
     t_unit: Literal["noise", "count", "amplitude"] = "noise",
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
@@ -49,12 +49,14 @@ def residual_loop(
     """Pulses of a model, with one more at the largest residual of the waveform while that exceeds a threshold.
 
     Only their residual supports the added echoes: on pulses that are not those of the model there are many. On a real
-    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2).
+    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2); so
+    the model is that of the survey unless another one is given.
 
     Parameters
     ----------
-    model : {"gaussian", "skewed", "generalized", "learned"}
-        Gaussians, skewed pulses with the skew of the survey, generalized Gaussians, or the pulse of the survey.
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
+        The pulse that the survey chose (auto: learned, skewed or Gaussian); Gaussians, as in the paper; skewed pulses
+        with the skew of the survey; generalized Gaussians; or the learned pulse.
     t_diff : float
         Largest residual that adds no echo, T_diff of the paper, in the unit below.
     t_unit : {"noise", "count", "amplitude"}
@@ -75,6 +77,7 @@ def residual_loop(
     ----------
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
+    model = loop_model(system, model)
     shape = loop_shape(system, block.spacing, model)
     options = {"max_iterations": max_iterations, "tolerance": 0.1, "significance": significance}
     options |= {"least_width": least_width, "most_width": most_width}

@@ -18,6 +18,26 @@ from wavebatch.stages.decompose.skew import skewed_shape
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
 
+def loop_model(system: SystemPulse, model: str) -> str:
+    """Return the model that a residual loop fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
+        As for `decompose.residual_loop`.
+
+    Returns
+    -------
+    str
+        The model; for `auto` the pulse that the survey chose.
+    """
+    if model != "auto":
+        return model
+    return "learned" if system.components else "skewed" if system.kappa else "gaussian"
+
+
 def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
     """Return the pulse that a residual loop fits.
 
@@ -27,7 +47,7 @@ def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
         Result of the survey.
     spacing : float
         Time between two samples [ns].
-    model : {"gaussian", "skewed", "generalized", "learned"}
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
         As for `decompose.residual_loop`.
 
     Returns
@@ -35,6 +55,7 @@ def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
     PulseShape
         Pulse in samples; of the generalized model echoes carry their exponents.
     """
+    model = loop_model(system, model)
     if model == "learned":
         return pulse_shape(system, spacing)
     return skewed_shape(system, 0.0) if model == "skewed" else GAUSSIAN
