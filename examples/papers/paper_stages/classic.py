@@ -12,9 +12,8 @@ import numpy as np
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import curvature_taps, filter_energy, filter_symmetric
-from wavebatch.kernels.signal.runs import highest_samples, list_samples, walk_down
+from wavebatch.kernels.signal.runs import find_runs, highest_samples, list_samples, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range
 from wavebatch.stages.detect.candidates import candidate_table, signal_above

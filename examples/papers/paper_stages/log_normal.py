@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from wavebatch import EchoTable, Noise, SystemPulse, WaveformBlock, stage
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.stages.decompose.skew import fit_each
@@ -56,10 +56,10 @@ def log_normal(
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
     settings = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
+        block, system, PulseShape(origin=origin), widths=(least_width, most_width), tolerance=tolerance,
         max_iterations=max_iterations, grow=False,
     )  # fmt: skip
-    return fit_each(block, noise, system, echoes, settings, significance, origin=origin)
+    return fit_each(block, noise, system, echoes, settings, significance)
 
 
 # Echoes carry their skews, with which they are drawn.

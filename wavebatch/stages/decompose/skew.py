@@ -11,22 +11,19 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Clusters
-from wavebatch.kernels.fit.free_skew import MOST_SKEW, SkewFit, SkewPrior, fit_skews
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import Limits
+from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.decompose.solve import (
     LeastWidth,
     MostWidth,
-    alike_clusters,
-    cut_alike,
-    describe_solutions,
+    describe_solution,
     fit_candidates,
     make_settings,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape
 
 UNKNOWN_SPREAD = 0.15
@@ -127,8 +124,8 @@ def skewed(
     )  # fmt: skip
     if kappa != "free":
         return fit_candidates(block, noise, system, echoes, settings, significance=significance)
-    prior = SkewPrior(shape.kappa, system.skew_spread or UNKNOWN_SPREAD)
-    return fit_each(block, noise, system, echoes, settings, significance, prior=prior)
+    free = settings._replace(skew_mean=shape.kappa, skew_spread=system.skew_spread or UNKNOWN_SPREAD)
+    return fit_each(block, noise, system, echoes, free, significance)
 
 
 def fit_each(
@@ -138,22 +135,15 @@ def fit_each(
     echoes: EchoTable,
     settings: Settings,
     significance: float,
-    *,
-    prior: SkewPrior | None = None,
-    origin: str = "",
 ) -> EchoTable:
-    """Fit one shape for all echoes first, then from there a skew per echo, which becomes a column.
+    """Fit with a skew per echo, which becomes a column with its error.
 
     Parameters
     ----------
     block, noise, system, echoes, significance
         As for a stage.
     settings : Settings
-        Pulse, limits and options of the first fit.
-    prior : SkewPrior, optional
-        Of free skews.
-    origin : {"", "segment", "waveform"}
-        Where the samples of a log-normal begin that fixes its skew; empty for free skews.
+        Pulse, limits and options of the fit.
 
     Returns
     -------
@@ -161,64 +151,13 @@ def fit_each(
         Fitted echoes with the columns skew and skew_err.
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings)
-    solutions: list[Solution] = []
-    columns = {name: [np.empty(0, np.float32)] for name in ("skew", "skew_err")}
-    for solution in decompose_clusters(
-        block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
-    ):
-        number = _with_number(clusters, solution)
-        for part in alike_clusters(number, solution.cluster, block):
-            one = solution.take(part)
-            fit, begin = _refit(block, noise, clusters, one, settings, prior, origin)
-            parameters = fit.parameters[:, :3].copy()
-            parameters[:, 1] += begin[:, None]
-            errors = fit.errors[:, :3]
-            # The skew takes part in the area: its error is not that of amplitude and width alone.
-            unknown = np.full_like(errors[:, :2], np.nan)
-            found = (fit.misfit, fit.cost, fit.converged, fit.at_bound)
-            solutions.append(Solution(one.cluster, parameters, errors, unknown, *found))
-            columns["skew"].append(fit.parameters[:, 3].reshape(-1).astype(np.float32))
-            columns["skew_err"].append(fit.errors[:, 3].reshape(-1).astype(np.float32))
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
+    columns = {
+        "skew": solution.parameters[:, 3].astype(np.float32),
+        "skew_err": solution.errors[:, 3].astype(np.float32),
+    }
+    # The skew takes part in the area: its error is not that of amplitude and width alone.
+    solution = solution._replace(shared=np.full_like(solution.shared, np.nan))
     # Widths and times are of the skewed pulse, which has no further components to be described.
     plain = settings._replace(shape=GAUSSIAN)
-    return describe_solutions(block, noise, system, clusters, solutions, plain, significance, joined)
-
-
-def _with_number(clusters: Clusters, solution: Solution) -> Clusters:
-    """The clusters with the number of echoes that a solution has: fits may have left some out."""
-    number = clusters.number.copy()
-    number[solution.cluster] = solution.parameters.shape[2]
-    return clusters._replace(number=number)
-
-
-def _refit(
-    block: WaveformBlock,
-    noise: Noise,
-    clusters: Clusters,
-    solution: Solution,
-    settings: Settings,
-    prior: SkewPrior | None,
-    origin: str,
-) -> tuple[SkewFit, np.ndarray]:
-    """Fits from a solution, in samples of their windows, and where each window begins."""
-    rows = solution.cluster
-    windows, begin = cut_alike(block, noise, clusters, rows, settings)
-    skew = np.full_like(solution.parameters[:, :1], settings.shape.kappa)
-    start = np.concatenate([solution.parameters, skew], axis=1)
-    start[:, 1] -= begin[:, None]
-    low = np.zeros((len(rows), 4, 1))
-    high = np.zeros_like(low)
-    low[:, 0], high[:, 0] = 0.0, 1e9
-    low[:, 1, 0], high[:, 1, 0] = clusters.low[rows] - begin - 3.0, clusters.high[rows] - begin + 2.0
-    low[:, 2], high[:, 2] = settings.width_low, settings.width_high
-    low[:, 3], high[:, 3] = -MOST_SKEW, MOST_SKEW
-    first = None
-    if origin:
-        low[:, 3], high[:, 3] = -np.inf, np.inf
-        first = (clusters.low[rows] if origin == "segment" else np.zeros(len(rows))) - begin - 1.0
-    fit = fit_skews(
-        windows, start, Limits(low, high), prior=prior, origin=first, tolerance=settings.tolerance,
-        max_iterations=settings.max_iterations,
-    )  # fmt: skip
-    return fit, begin
+    return describe_solution(block, noise, system, clusters, solution, plain, significance, columns)

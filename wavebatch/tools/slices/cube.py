@@ -187,12 +187,12 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
         wanted = {"x": values.shape[1] // 2, "y": int(number[len(number) // 2]), "t": float(time[peak])}
     x_edges, y_edges = (-0.5, values.shape[1] - 0.5), (-0.5, len(number) - 0.5)
     t_edges = (float(time[0]) - 0.5 * spacing, float(time[-1]) + 0.5 * spacing)
-    x_label, y_label, t_label = "pulse, aligned by scan angle [-]", "scan line, in the order of the cube [-]", "time [ns]"
+    x_label, y_label = "pulse, aligned by scan angle [-]", "scan line, in the order of the cube [-]"
+    t_label = "time [ns]"
     found = []
     if wanted["x"] is not None:
         place = _check("--x", wanted["x"], values.shape[1])
-        image = values[:, place].T
-        found.append(CubeSlice(image, (*y_edges, *t_edges), y_label, t_label, f"x = {place}", True))
+        found.append(CubeSlice(values[:, place].T, (*y_edges, *t_edges), y_label, t_label, f"x = {place}", True))
     if wanted["y"] is not None:
         row = np.flatnonzero(number == int(wanted["y"]))
         if not len(row):
