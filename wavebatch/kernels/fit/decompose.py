@@ -123,12 +123,16 @@ def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tupl
         raise ValueError(f"level, noise or gaps do not have the shape of {n} waveforms of {s} samples")
     waveform, low, high, first, number = clusters
     m = len(candidates.time)
+    if {len(column) for column in clusters} != {len(number)} or {len(column) for column in candidates[1:]} != {m}:
+        raise ValueError("the columns of clusters or candidates differ in length")
     inside = (waveform >= 0) & (waveform < n) & (low >= 0) & (low < high) & (high <= s)
     if not (inside & (number > 0) & (first >= 0) & (first + number <= m)).all():
         raise ValueError("a window lies outside of its waveform, or its candidates outside of their table")
     finite = all(np.isfinite(column).all() for column in (baseline, std, *candidates[1:]))
     if not (finite and (std > 0).all()):
         raise ValueError("levels, noise and candidates must be finite, and the noise above 0")
+    if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
+        raise ValueError("samples must be finite where they are not missing")
     flat = [np.ascontiguousarray(field) for field in (counts, baseline, std)]
     return (
         Samples(flat[0], flat[1].astype(np.float32, copy=False), flat[2].astype(np.float32, copy=False),
@@ -143,6 +147,8 @@ def _as_structure(settings: Settings) -> tuple[library.Settings, tuple[np.ndarra
     shape = settings.shape
     components = np.array(shape.components, np.float64).reshape(-1, 3)
     rows = (np.zeros(2, np.float32),) * 2 if shape.table is None else (shape.table.value, shape.table.slope)
+    if not 0 < settings.width_ref < np.inf or not 2 <= len(rows[0]) == len(rows[1]):
+        raise ValueError("the width of the pulse must be above 0, and its table have a slope for each of its rows")
     first, step = (0.0, 1.0) if shape.table is None else shape.table[:2]
     pulse = library.Pulse(
         _kind(shape), shape.kappa, shape.power, len(components), place(components, np.float64),
