@@ -220,6 +220,18 @@ def test_the_energy_from_shot_to_shot_is_measured(tmp_path):
     assert found.channels[0].spread > found.channels[0].shot_energy
 
 
+def test_energies_that_are_known_are_no_scatter(tmp_path):
+    sensor = Sensor(energy_spread=0.04, store_energy=True)
+    strip = write_strip(tmp_path / "s.las", [Facet(0.3)], sensor, 6000)
+    target = [Target("t", 0.3, outline(40, -15, 70, 15))]
+    known, ignored = (
+        calibrate_strip(strip, target, CalibrationOptions(divergence=0.5, energy=energy)).channels[0]
+        for energy in (None, "none")
+    )
+    assert known.shot_energy < 0.01 < 0.03 < ignored.shot_energy
+    assert known.constant == pytest.approx(ignored.constant, rel=0.01)
+
+
 def run_with(folder, strip, cal, *options):
     return call("run", strip, "-o", folder / "out", "--calibration", cal, "--overwrite", *options)
 

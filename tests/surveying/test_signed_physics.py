@@ -213,7 +213,7 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
     folder, flight, truth = flickering
     calibration = write_calibration(tmp_path / "cal.toml", flight, shot_energy=0.08)
     given = folder / source if source.endswith(".csv") else source
-    options = ("--calibration", calibration, "--pulse-energy", given)
+    options = ("--calibration", calibration, "--energy", given)
     call("run", folder / "strip.las", "-o", tmp_path / "out", "-q", *options)
     columns, true, report = read(tmp_path / "out", truth)
     check(columns, "backscatter_coefficient", true["gamma"], np.ones(len(true["plane"]), bool))
@@ -235,7 +235,7 @@ def test_the_energy_of_each_shot_is_divided_out(tmp_path, flickering, source):
 )
 def test_energies_that_cannot_be_used_are_refused_in_one_line(tmp_path, flickering, make, message):
     folder, flight, _ = flickering
-    options = ["--columns", "+amplitude_normalized", "--pulse-energy", str(make(tmp_path / "e.csv"))]
+    options = ["--columns", "+amplitude_normalized", "--energy", str(make(tmp_path / "e.csv"))]
     done = CliRunner().invoke(main, ["run", str(folder / "strip.las"), "-o", str(tmp_path / "out"), *options])
     assert done.exit_code == 4 and message in done.stderr and "Traceback" not in done.stderr
 
