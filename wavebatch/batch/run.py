@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -311,4 +311,5 @@ class _Batch:
             if strip.prepared is not None:
                 lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
                 more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
+                more["decisions"] = [asdict(decision) for decision in strip.prepared.choice.decisions]
             self._tell({**event, **more})
