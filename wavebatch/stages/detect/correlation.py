@@ -12,6 +12,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.elementary import exp
+from wavebatch.kernels.elementary import log as logarithm
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.kernels.signal.square_differences import (
