@@ -150,6 +150,14 @@ def test_the_insensitive_channel_stands_for_saturated_segments(tmp_path, rng):
     assert np.allclose([tops[k] for k in range(60)], heights + 2, rtol=0.06, atol=3)
 
 
+def test_channels_of_unknown_gain_are_all_kept(tmp_path):
+    others = [replace(ECHO, channel=k) for k in (1, 2)]
+    pulses = [Pulse([[(2000, bell(50, 12, 90, 2))] for _ in range(3)]) for _ in range(9)]
+    found = import_file(_make(tmp_path, pulses, (ECHO, *others)), tmp_path / "o.las", ImportOptions())
+    assert found.points == found.packets == 27 and found.covered == found.replaced == 0 and found.descriptors == 3
+    assert any("all of its segments are kept" in note for note in found.notes)
+
+
 def test_lengths_beyond_the_descriptors_of_las_are_padded(tmp_path, rng):
     pulses = [Pulse([[(2000, bell(20 + k, 9, 90, 2, level=3))]]) for k in range(300)]
     found = import_file(_make(tmp_path, pulses, (ECHO,)), tmp_path / "o.las", ImportOptions())
