@@ -136,6 +136,7 @@ def test_where_sees_the_numbers_without_dropped_echoes(riegl, full, tmp_path):
     assert sizes[np.isin(times, _whole_times(full[0]))].max() == 1
 
 
+@pytest.mark.quick_cases("options1")
 @pytest.mark.parametrize("options", [{"jobs": 2}, {"block_size": 77}])
 def test_the_same_bytes_for_any_jobs_and_blocks(wide_strip, tmp_path, options):
     chosen = {"where": "amplitude > 60", "drop_flags": "WEAK", "chain": "fast"}

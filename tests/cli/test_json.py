@@ -95,11 +95,9 @@ CASES = {
     "plot cube CUBE -o c.png -q": "plot-cube/1",
     "grid CLOUD --statistic density --size 5 -o d.tif -q": "grid/1",
     "grid CLOUD --column z --column echo_width --no-data nan --where z>0 -o w.tif -q": "grid/1",
-    "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --no-peers --hazard H5 --tolerance 2cm": "bench/1",
-    "bench --scene empty --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability": "bench/1",
-    "bench --real STRIP --no-stability": "bench-real/1",
-    "bench --against ROOT --scene flat --pulses 300 --repeat 1": "bench-against/1",
-    "bench --jobs-model --scene flat --pulses 300 --repeat 1": "bench-jobs/1",
+    "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --tolerance 2cm": "bench/1",
+    "bench --scene empty --waveforms 800 --pulses 0 --repeat 1": "bench/1",
+    "bench --real STRIP": "bench-real/1",
     "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
@@ -120,6 +118,7 @@ CASES = {
 }
 
 
+@pytest.mark.quick_cases("[!b]*")
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)

@@ -88,8 +88,8 @@ def _read_classes(context: click.Context, parameter: click.Parameter, text: str 
               "e.g. 0.02m.")
 @system_option
 @click.option("--survey", type=click.Choice(["each", "flight"]), default="each", show_default=True,
-              help="Survey each strip by itself, or all strips once: kept as DIR/flight.system.toml, used again with "
-              "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.")
+              help="Survey each strip alone, or all strips once: kept as DIR/flight.system.toml, used again with "
+              "--resume and for later strips; a strip that does not fit it is named and surveyed alone.")
 @sensor_options
 @calibration_option
 @air_options

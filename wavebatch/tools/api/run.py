@@ -93,7 +93,7 @@ def run(
     force : bool
         Use the survey of `system` also for strips that contradict it.
     survey : {"each", "flight"}
-        Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
+        Survey each strip alone, or all of them once; that survey is kept as flight.system.toml in `out`, and used
         again by later runs into it. A strip that does not fit it gets one of its own.
     sensor : SensorRequest, optional
         Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
