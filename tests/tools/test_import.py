@@ -182,6 +182,18 @@ def test_degrees_become_utm_and_standard_time_that_of_las(tmp_path):
     assert "32732" in facts.crs
 
 
+def test_geocentric_coordinates_stay_so(tmp_path):
+    keys = struct.pack("<8H", 1, 1, 0, 1, 1024, 0, 1, 3)
+    place = (4_201_000_000, 168_000_000, 1_780_000_000)
+    pulse = Pulse([[(2000, bell(40, 10, 90, 2))]], anchor=tuple(v - 2**31 + 1000 for v in place),
+                  target=tuple(v - 2**31 + 1000 - 100_000 for v in place))  # fmt: skip
+    path = _make(tmp_path, [pulse], (ECHO,), offsets=(2_147_482.648,) * 3,
+                 records=[("PulseWaves_Proj", 34735, keys)])  # fmt: skip
+    found = import_file(path, tmp_path / "o.las", ImportOptions())
+    assert "geocentric and stay so" in found.notes[0]
+    assert np.allclose(_points(tmp_path / "o.las")[2][0], [v / 1000 - 101.0 for v in place], atol=0.01)
+
+
 def test_utm_agrees_with_a_published_point():
     # Paris, Eiffel Tower: 48.8583 N, 2.2945 E is 31N 448251.9 m E, 5411943.8 m N (WGS 84, public converters).
     east, north = project_utm(np.array([2.2945]), np.array([48.8583]), find_zone(2.2945), south=False)
