@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bench import against, peers
+from bench import jobs_model as jobs
 from bench.against import compare_runs, format_paired, simulate_strips
 from bench.cases import CASES, list_cases, make_scene
 from bench.jobs_model import Parts
@@ -19,8 +21,6 @@ from bench.stability import FAILURES, count_changes, count_failures
 from click.testing import CliRunner
 
 import wavebatch
-from bench import against, peers
-from bench import jobs_model as jobs
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
@@ -56,6 +56,7 @@ def find_row(document, name):
     return next(row for row in document["scenes"][0]["rows"] if row["name"] == name)
 
 
+@pytest.mark.slow
 def test_document_has_a_row_per_chain_and_peer(document):
     assert document["schema"] == command.SCHEMA
     names = [row["name"] for row in document["scenes"][0]["rows"]]
@@ -100,6 +101,7 @@ def test_stiff_cases_count_failures_by_kind(document):
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
 
 
+@pytest.mark.slow
 def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(timed_here):
     small = replace(SMALL, pulses=0, waveforms=1200)
     rows = [run_bench(replace(small, seed=seed))["scenes"][0]["rows"] for seed in (5, 5, 6)]
@@ -301,10 +303,11 @@ def GaussianDecomposition(y, thres):
 """
 
 
+@pytest.mark.slow
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 1.5)
+    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
@@ -326,6 +329,7 @@ def checkout(tmp_path):
     return root
 
 
+@pytest.mark.slow
 def test_two_checkouts_take_turns(tmp_path, checkout):
     options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "-o", str(tmp_path / "out")]
     with pytest.raises(InputError, match="holds no wavebatch that Python can import"):
@@ -338,6 +342,7 @@ def test_two_checkouts_take_turns(tmp_path, checkout):
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "UNIT_POINTS", 1000)
     jobs.main(["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")])
@@ -352,6 +357,7 @@ def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     assert parts["work"] >= 0 and parts["single"] >= 0
 
 
+@pytest.mark.slow
 def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
     """Of a strip that two jobs cannot share, what a waveform costs is no-data; no cost is negative."""
     monkeypatch.setattr(jobs.Worker, "call", _call_slow_starter)
@@ -427,6 +433,7 @@ def test_the_slowest_part_bounds_many_jobs():
     assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 1 + 5 + 0.2)
 
 
+@pytest.mark.slow
 def test_the_slower_one_of_two_checkouts_is_seen(tmp_path, checkout):
     start = checkout / "wavebatch" / "__init__.py"
     start.write_text(start.read_text() + "\nimport time\nwhile time.process_time() < 5:\n    pass\n")

@@ -206,7 +206,7 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str
 
 
 _PASSED_ON = (
-    "pulse_energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
+    "energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
     "direction", "headerless", "scheduler", "memory", "block_size", "overwrite", "resume", "where", "drop_flags",
     "classes", "bbox", "polygon",
 )  # fmt: skip

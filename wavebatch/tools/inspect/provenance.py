@@ -72,7 +72,7 @@ def _name_inputs(request: Mapping[str, Any]) -> Iterator[str]:
         names = ("--attenuation", "--attenuation-error")
         yield " ".join(f"{name} {number}" for name, number in zip(names, numbers, strict=False))
     if energy:
-        yield f"--pulse-energy {'FILE' if isinstance(energy, dict) else _quote(energy)}"
+        yield f"--energy {'FILE' if isinstance(energy, dict) else _quote(energy)}"
 
 
 def _name_selection(selection: Mapping[str, Any]) -> Iterator[str]:
