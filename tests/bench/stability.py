@@ -133,7 +133,7 @@ def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:
 
 def _is_useful(name: str) -> bool:
     """Lengths and reported errors mean little where echoes are hard on purpose."""
-    return not name.startswith("rmse") and "calibration" not in name
+    return not name.startswith("rmse") and "calibration" not in name and name != "hidden"
 
 
 def count_failures(found: EchoTable, system: SystemPulse) -> dict[str, int]:

@@ -22,7 +22,7 @@ from click.testing import CliRunner
 
 import wavebatch
 from wavebatch.cli import main
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
@@ -223,6 +223,20 @@ def test_tally_measures_what_was_put_in():
     gross = Tally()
     gross.add(group, replace(group.truth, time=group.truth.time + 20 * group.bounds[:, 0]))
     assert gross.figures()["gross_isolated"].value == 1
+
+
+def test_reported_errors_are_measured_with_and_without_flags():
+    """Every second echo is flagged and off by three of its errors, the others by one."""
+    group, tally = known_group(), Tally()
+    flagged = np.arange(len(group.truth)) % 2 == 1
+    error = np.full(len(group.truth), 0.01)
+    found = replace(group.truth, time=group.truth.time + np.where(flagged, 0.03, 0.01), time_err=error.astype("f4"))
+    tally.add(group, found.with_flags(EchoFlag.OVERLAPPED, flagged))
+    figures = tally.figures()
+    assert figures["time_calibration_flagged"].value == pytest.approx(3, rel=1e-3)
+    assert figures["time_calibration_not_flagged"].value == pytest.approx(1, rel=1e-3)
+    assert figures["hidden"].value == 0 and np.isnan(figures["time_calibration_hidden"].value)
+    assert figures["time_calibration_not_hidden"].value == pytest.approx(np.sqrt(5), rel=1e-2)
 
 
 def make_found(**columns) -> EchoTable:

@@ -30,13 +30,13 @@ def test_all_methods_stand_in_one_table(timed_here):
     assert result.exit_code == 0, result.output
     rows = {row["name"]: row for row in json.loads(result.stdout)["scenes"][0]["rows"]}
     assert set(list_methods()) | {"fast", "balanced", "accurate"} <= set(rows)
-    for name in ("detect.maximum", "detect.asdf", "decompose.gauss_newton", "decompose.reference"):
+    for name in ("detect.maximum", "detect.asdf", "decompose.gaussian", "decompose.reference"):
         assert rows[name]["figures"]["completeness"]["value"] > 0.98, name
 
 
 def test_every_method_goes_through_the_stiff_cases(monkeypatch):
     monkeypatch.setattr("bench.stability.GROUPS", 1)
-    few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.gauss_newton")
+    few = ("detect.asdf", "detect.wavelet", "decompose.residual_loop", "decompose.reference")
     methods = {name: list_methods()[name] for name in few}
     shown = {"accurate": load_profile("accurate"), **methods}
     rows = measure_stability(lambda survey: shown, 50, 300, 3, cases=list_cases(["H10", "H2"]), methods=methods)

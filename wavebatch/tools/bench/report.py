@@ -34,6 +34,15 @@ LENGTHS: tuple[Column, ...] = (
     ("overlapped cm", "rmse_overlapped_cm", 1, 2),
 )
 
+REPORTED: tuple[Column, ...] = (
+    ("no flag", "time_calibration_not_flagged", 1.0, 2),
+    ("flag", "time_calibration_flagged", 1.0, 2),
+    ("neighbours found", "time_calibration_not_hidden", 1.0, 2),
+    ("one not found", "time_calibration_hidden", 1.0, 2),
+    ("share of these %", "hidden", 100, 2),
+)
+"""Errors of times over the reported ones: echoes without and with a flag of UNCLEAN, and by what was found around."""
+
 
 def _ratios(kind: str) -> tuple[Column, ...]:
     columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
@@ -63,6 +72,7 @@ def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str
     parts.append(_figure_table("rms error of the range", rows, LENGTHS))
     for kind in ("isolated", "overlapped"):
         parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
+    parts.append(_figure_table("rms error of the time / its error column, SNR >= 10", rows, REPORTED))
     if tolerance_cm is not None:
         parts.append([_format_cheapest(section, tolerance_cm)])
     return "\n\n".join(map("\n".join, parts))
