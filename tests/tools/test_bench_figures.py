@@ -5,6 +5,7 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
+from bench.promises import format_promises, judge
 
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoTable
@@ -20,7 +21,6 @@ from wavebatch.tools.bench.figures import (
     root_mean_square,
     share,
 )
-from wavebatch.tools.bench.promises import format_promises, judge
 from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.tools.simulate.render import paint_echoes

@@ -153,7 +153,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
-            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
+            energy = find_pulse_energy(reader, scan, job.pulse_energy) if needs_sensor(job.chain) else None
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()
             units = reader.unit_count()

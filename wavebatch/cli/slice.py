@@ -210,7 +210,7 @@ def _find(
 
 def _draw_overview(segments: list[Segment], target: Path, reader: StripReader, lines: int, overwrite: bool) -> None:
     """Draws the segments of all lines; InputError without any."""
-    from wavebatch.files.las.crs_name import describe_crs
+    from wavebatch.files.las.crs import describe_crs
     from wavebatch.tools.slices.draw import draw_segments
 
     if not segments:

@@ -11,6 +11,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
@@ -183,7 +184,7 @@ def half_width_factor(power: float) -> float:
     float
         1 for a Gaussian.
     """
-    return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
+    return float(2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:

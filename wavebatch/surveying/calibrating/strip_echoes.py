@@ -18,6 +18,7 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.header import decode_text
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
@@ -60,6 +61,7 @@ class EchoSource:
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse
     sensor: SensorSource
+    energy: PulseEnergy | None = None
 
     @property
     def path(self) -> Path:
@@ -71,7 +73,7 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in self.reader.all_blocks(self.scan, _BLOCK):
+        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
             near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
             if len(near):
                 part = self.sensor.fill(block.rows(near))
@@ -87,6 +89,7 @@ def open_source(
     request: Request,
     attenuation: float,
     direction: str,
+    energy: str | None,
 ) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
@@ -101,6 +104,8 @@ def open_source(
         Of the air, one way [dB/km].
     direction : str
         Where packet vectors point: auto, toward or away.
+    energy : str or None
+        Of each emitted pulse; see `find_pulse_energy`.
 
     Yields
     ------
@@ -119,7 +124,8 @@ def open_source(
         choice = make_choice(reader, scan, chain or widest_chain(), request)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
-        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source)
+        sent = find_pulse_energy(reader, scan, energy)
+        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, sent)
 
 
 def with_energy(chain: Chain) -> Chain:

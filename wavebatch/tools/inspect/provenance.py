@@ -1,6 +1,6 @@
-"""What made a cloud, from the account of the run in it, and the command that makes it again.
+"""What made a cloud, from its provenance, and the command that makes it again.
 
-`file_facts` shows it. Before you change it: the account may come from any program, so nothing in it is certain.
+`file_facts` shows it. Before you change it: it may come from any program, so nothing in it is certain.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Any
 from wavebatch.batch.job import RunOptions
 
 
-def describe_account(account: Mapping[str, Any]) -> dict[str, Any]:
-    """What made a cloud: version, command, chain, input; what the account does not hold is None."""
-    options, request, source = (_table(account.get(name)) for name in ("options", "request", "input"))
+def describe_provenance(run: Mapping[str, Any]) -> dict[str, Any]:
+    """What made a cloud: version, command, chain, input; what the provenance does not hold is None."""
+    options, request, source = (_table(run.get(name)) for name in ("options", "request", "input"))
     return {
-        "version": account.get("wavebatch"),
+        "version": run.get("wavebatch"),
         "command": _name_command(options, request, source),
         "input": source.get("file"),
-        "chain": account.get("chain"),
-        "chosen_by": _table(account.get("choice")).get("by"),
-        "columns": _table(account.get("columns")),
+        "chain": run.get("chain"),
+        "chosen_by": _table(run.get("choice")).get("by"),
+        "columns": _table(run.get("columns")),
     }
 
 
@@ -72,7 +72,7 @@ def _name_inputs(request: Mapping[str, Any]) -> Iterator[str]:
         names = ("--attenuation", "--attenuation-error")
         yield " ".join(f"{name} {number}" for name, number in zip(names, numbers, strict=False))
     if energy:
-        yield f"--pulse-energy {'FILE' if isinstance(energy, dict) else _quote(energy)}"
+        yield f"--energy {'FILE' if isinstance(energy, dict) else _quote(energy)}"
 
 
 def _name_selection(selection: Mapping[str, Any]) -> Iterator[str]:
