@@ -222,7 +222,8 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     low, high = np.nanmin(np.concatenate(lines)), np.nanmax(np.concatenate(lines))
     span = float(high - low) or 1.0
     # Room above for the rule, which must not lie on the line.
-    axes.set_ylim(low - 0.08 * span, high + ((0.4 if small else 0.3) + (0.36 if small else 0.22) * wrapped.count("\n")) * span)
+    first, more = (0.4, 0.36) if small else (0.3, 0.22)
+    axes.set_ylim(low - 0.08 * span, high + (first + more * wrapped.count("\n")) * span)
     axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
 
 
