@@ -50,8 +50,13 @@ def fly(stand: str, dead_zone: float, number: int, seed: int) -> ReturnStats:
     """The result of `wavebatch stats` for `wavebatch simulate canopy.STAND --sensor discrete --dead-zone METRES`."""
     with TemporaryDirectory() as folder:
         cloud = Path(folder) / "cloud.las"
-        simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))
+        fly_cloud(stand, cloud, dead_zone, number, seed)
         return count_returns([cloud])[1]
+
+
+def fly_cloud(stand: str, cloud: Path, dead_zone: float, number: int, seed: int) -> None:
+    """The cloud of that command."""
+    simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))
 
 
 def table_of_numbers(number: int, seed: int) -> Table:
