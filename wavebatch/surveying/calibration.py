@@ -145,6 +145,8 @@ class Calibration:
     """Channels that have a constant of their own."""
     strips: tuple[StripConstant, ...] = ()
     """Constants of single strips, where several were calibrated together."""
+    swath: tuple[float, ...] = ()
+    """How the constant grows with the scan angle, as `SystemPulse.swath`; empty where it was not fitted."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, one line each; not kept in the file."""
 
@@ -163,6 +165,7 @@ class Calibration:
             calibration_err=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             shot_error=max((row.shot_energy for row in self.channels), default=0.0),
+            swath=self.swath,
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -175,6 +178,7 @@ class Calibration:
             "attenuation_db_km": self.attenuation,
             "divergence_mrad": self.divergence,
             "section_constant": self.section_constant,
+            **({"scan_angle_terms": list(self.swath)} if self.swath else {}),
             **{name: getattr(self, name) for name in _REPORTED},
             "channels": [asdict(row) for row in self.channels],
             "strips": self._describe_strips(),

@@ -70,25 +70,6 @@ def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return echoes.count(len(block))[echoes.waveform] == 1
 
 
-def level_angle(block: WaveformBlock) -> np.ndarray:
-    """Compute the angle at which each ray strikes level ground.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        n waveforms with directions.
-
-    Returns
-    -------
-    float64 array, shape (n,)
-        Angle [rad].
-    """
-    x, y, z = block.direction.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        down = -z / np.sqrt(x * x + y * y + z * z)
-    return np.arccos(np.clip(down, -1.0, 1.0))
-
-
 def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Measure the energy of each echo as the amplitude times sigma of a Gaussian.
 
@@ -274,7 +255,7 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
 
 def without_calibration(system: SystemPulse) -> SystemPulse:
     """Replace the calibration by a constant of exactly 1, for quantities in units of the strip."""
-    return replace(system, calibration=1.0, calibration_err=0.0, channels={})
+    return replace(system, calibration=1.0, calibration_err=0.0, channels={}, swath=())
 
 
 def add_column(

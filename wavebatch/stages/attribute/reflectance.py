@@ -13,14 +13,13 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.no_data import NoData
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.attribute.light import (
     POSITION,
     Light,
     add_column,
     is_alone,
-    level_angle,
     measure_light,
     without_calibration,
 )
@@ -124,7 +123,7 @@ def level_reflectance(
     ----------
     docs/algorithms.md 5.
     """
-    light, angle = measure_light(block, system, echoes, 2), level_angle(block)[echoes.waveform]
+    light, angle = measure_light(block, system, echoes, 2), angle_to_vertical(block.direction)[echoes.waveform]
     relative = np.hypot(light.relative_error, radiometry.slope_error(angle, np.radians(slope)))
     return _divide(block, echoes, "level_reflectance", light, angle, relative)
 

@@ -7,16 +7,17 @@ to a target has no constant, and a constant never goes from one channel to anoth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import angle_to_vertical, swath_columns
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.calibrating.adjust_flight import Adjustment, adjust_constants
+from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
 from wavebatch.surveying.calibrating.target_file import Target
@@ -28,7 +29,8 @@ from wavebatch.surveying.calibrating.targets import (
     measure_ranging,
     open_strip_source,
 )
-from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
+from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, hash_squares, measure_ties
+from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
 
 MOST_TIES = 200_000
@@ -64,6 +66,8 @@ class _Strip:
     """Relative error of a constant from the error of the sensor's position."""
     ties: np.ndarray
     """Array of TIE, with channels as sources."""
+    seen: Mapping[int, np.void]
+    """How the targets were seen by each channel, as VIEW."""
 
 
 def calibrate_flight(
@@ -101,16 +105,45 @@ def calibrate_flight(
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
     sources = [(i, channel) for i, strip in enumerate(strips) for channel in strip.channels]
-    if len(sources) == 1:
+    if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].found)
     ties = _tie(strips, sources, origin)
-    given, given_error = _list_given(strips, sources, options)
-    adjusted = adjust_constants(ties, given, given_error)
-    calibration = _assemble(strips, sources, adjusted, options)
+    anchors, seen = _list_given(strips, sources, options)
+    swath: tuple[float, ...] = ()
+    if options.scan_angle:
+        adjusted, swath = fit_swath(ties, anchors, seen)
+        ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
+        anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
+    else:
+        adjusted = adjust_constants(ties, anchors)
+    calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
     names = [_name(strips, source) for source in sources]
     pairs = tuple(compare_pairs(ties, adjusted, names))
     notes = [*calibration.notes, *find_doubts(names, adjusted, calibration.strips, pairs)]
-    return FlightCalibration(replace(calibration, notes=tuple(notes)), pairs, ties.size)
+    calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
+    return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
+
+
+def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) -> tuple[Calibration, list[str]]:
+    """The calibration with what the overlaps leave unexplained in its errors where these do not hold it, and the
+    sentence about it."""
+    spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
+    stated = max(row.relative_error for row in (*calibration.channels, *calibration.strips))
+    if spread < max(stated, LEAST_SPREAD):
+        return calibration, []
+    reason = (
+        "the strips' light from one place differs by more than their constants explain: check targets, trajectory "
+        "and whether the overlaps are wet, rough or planted"
+        if trend is None
+        else trend.describe()
+    )
+    note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
+    channels, strips = (
+        tuple(replace(row, relative_error=math.hypot(row.relative_error, spread)) for row in rows)
+        for rows in (calibration.channels, calibration.strips)
+    )
+    whole = math.hypot(calibration.relative_error, spread)
+    return replace(calibration, relative_error=whole, channels=channels, strips=strips), [note]
 
 
 def _find_box(path: Path) -> _Box:
@@ -155,7 +188,24 @@ def _read_strip(
             described=tuple(describe_channel(row, source) for row in blank),
             ranging=measure_ranging(source.sensor, distance, options.attenuation),
             ties=ties,
+            seen=_see_targets(on_targets, found),
         )
+
+
+def _see_targets(on_targets: Sequence[np.ndarray], found: Calibration | None) -> dict[int, np.void]:
+    """How each channel saw the targets that gave a constant, in the middle, as VIEW."""
+    used = [] if found is None else zip(on_targets, found.targets, strict=True)
+    rows = [(some, target.incidence_deg) for some, target in used if target.constant is not None]
+    seen = {}
+    for channel in {int(one) for some, _ in rows for one in np.unique(some["channel"])}:
+        parts = [(some[some["channel"] == channel], angle) for some, angle in rows]
+        mine = np.concatenate([some for some, _ in parts])
+        view = np.zeros(1, VIEW)[0]
+        view["angle"] = np.median(angle_to_vertical(mine["ray"]))
+        view["incidence"] = np.radians(np.median([angle for some, angle in parts if len(some)]))
+        view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
+        seen[channel] = view
+    return seen
 
 
 class _TieArea:
@@ -199,7 +249,9 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
 def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:
     short = np.empty(len(rows), TIE)
     short["xyz"] = rows["xyz"] - [*origin, 0.0]
-    short["ray"], short["light"], short["source"] = rows["ray"], rows["light"], rows["channel"]
+    short["source"] = rows["channel"]
+    for name in ("ray", "light", "distance", "time"):
+        short[name] = rows[name]
     return short
 
 
@@ -216,17 +268,19 @@ def _tie(strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], origin: n
 
 def _list_given(
     strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], options: CalibrationOptions
-) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of the constants by targets, f8 (n,), NaN without, and their errors without that of the reflectance,
-    which strips that see the same targets share."""
+) -> tuple[Anchors, np.ndarray]:
+    """Constants by targets with their errors without that of the reflectance, which strips that see the same targets
+    share; and how each source saw its targets, array of VIEW (n,), NaN without."""
     value, error = np.full((2, len(sources)), np.nan)
+    seen = np.full(len(sources), np.nan, VIEW)
     for number, (i, channel) in enumerate(sources):
         found = strips[i].found
         for row in found.channels if found else ():
             if SCANNERS * row.digitizer + row.scanner == channel:
                 rest = row.relative_error**2 - _reflectance_error([found], options) ** 2
                 value[number], error[number] = math.log(row.constant), math.sqrt(max(rest, 1e-6))
-    return value, error
+                seen[number] = strips[i].seen[channel]
+    return Anchors(value, error), seen
 
 
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:

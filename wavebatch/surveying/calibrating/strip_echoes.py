@@ -32,9 +32,10 @@ SCANNERS = 4
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"),
+    ("channel", "<i4"), ("time", "<f8"),
 ])  # fmt: skip
-"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel."""
+"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
+time [s]."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
@@ -144,6 +145,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["light"] = echoes.attributes[_LIGHT]
     rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
+    rows["time"] = block.gps_time[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]

@@ -59,6 +59,8 @@ class CalibrationOptions:
     """Standard deviation of the targets' reflectances, relative."""
     direction: str = "auto"
     """Where packet vectors point: auto, toward or away."""
+    scan_angle: bool = False
+    """Fit how the light depends on the scan angle, where strips overlap."""
 
 
 def open_strip_source(path: Path, options: CalibrationOptions):
