@@ -1,4 +1,7 @@
-"""What contradicts a calibration shows: brightness over the swath, other settings, options that do not fit the strip."""
+"""What contradicts a calibration shows: brightness over the swath, other settings, contradicting options."""
+
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,7 +39,7 @@ def write_targets(path, more=""):
 
 @pytest.fixture(scope="module")
 def dim_edges(tmp_path_factory):
-    """Two strips that overlap by two thirds, whose light falls by 25 % to the edge of the swath; a target near a's nadir."""
+    """Two strips that overlap by two thirds; their light falls by 25 % to the edge of the swath."""
     folder = tmp_path_factory.mktemp("edges")
     write_strip(folder / "a.las", GROUND, Sensor(**BASE, light=LIGHT, falloff=0.25), 18_000, seed=11)
     other = Sensor(**BASE, light=LIGHT, falloff=0.25, start=(128, 100), heading=270.0, time=START + 600)
@@ -101,3 +104,61 @@ def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
     done = call("calibrate", dim_edges / "a.las", "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml",
                 "--scan-angle")  # fmt: skip
     assert done.exit_code == 1 and "the overlaps do not show it at the edge of the swath" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A strip, its targets and its calibration."""
+    folder = tmp_path_factory.mktemp("setting")
+    write_strip(folder / "a.las", GROUND, SENSOR, 10_000, seed=1)
+    write_targets(folder / "t.csv")
+    calibrate(folder, "--divergence", 0.5, strips=["a.las"])
+    return folder
+
+
+SENSOR = Sensor(**BASE, light=LIGHT)
+
+
+def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibrated):
+    other = replace(SENSOR, start=(-30.0, 20.0), time=START + 600)
+    write_strip(tmp_path / "b.las", GROUND, other, 6000, seed=2)
+    assert "warning" not in run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    found = load_calibration(calibrated / "cal.toml")
+    assert found.rate == pytest.approx(10_000.0, rel=1e-3)
+    assert found.channels[0].noise_dn == pytest.approx(0.65, abs=0.1) and found.channels[0].brightest > 1e7
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "growth"),
+    [
+        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "at 20 kHz, those of the calibration", 0.69),
+        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is 0.", 0.5),
+        ({"light": 0.5 * LIGHT}, "times as bright as the calibration's", 0.45),
+    ],
+)
+def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_path, calibrated, change, said, growth):
+    write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, **change), 6000, seed=3)
+    line = run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    assert said in line and "the error of the constant grows by" in line
+    cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
+    stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
+    assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
+
+
+def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
+    wrong = write_targets(tmp_path / "t.csv")
+    wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))
+    assert call("calibrate", calibrated / "a.las", "--targets", wrong, "-o", tmp_path / "cal.toml").exit_code == 0
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml", "-q")
+    assert done.exit_code == 0 and "of the reflectances exceed 1, that of a white matt surface" in done.stderr
+    report = json.loads((tmp_path / "a.report.json").read_text())
+    assert 0.1 < report["quality"]["reflectance_above_one"] / report["counts"]["echoes"] < 1
+    assert "exceed 1" not in run(calibrated, tmp_path / "right", "a.las")
+
+
+def test_a_constant_without_an_error_is_named(tmp_path, calibrated):
+    text = (calibrated / "cal.toml").read_text()
+    error = load_calibration(calibrated / "cal.toml").relative_error
+    (tmp_path / "cal.toml").write_text(text.replace(f"relative_error = {error!r}", "relative_error = 0.0"))
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml")
+    assert "its relative_error is 0, but no constant is known exactly" in done.stderr

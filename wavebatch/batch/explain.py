@@ -42,6 +42,9 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 FASTEST = 120.0
 """Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
 
+MOST_ABOVE_ONE = 0.03
+"""Share of the reflectances above 1 from which a warning is printed."""
+
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
@@ -106,6 +109,7 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _miss_all(prepared, report)
     lines += _find_nothing(prepared, report)
     lines += _doubt_pulse(prepared, report)
+    lines += _doubt_reflectance(report)
     if not choice.doubted or not echoes:
         return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
@@ -150,6 +154,16 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
             f"the survey found too few isolated echoes, {int(alone)} where {FEW} are needed: the system pulse is a "
             f"guess, a Gaussian of {FWHM_PER_SIGMA * system.sigma_ref:.3g} ns, and widths, errors and the number of "
             "echoes depend on it; give --system, a survey of a longer strip of this sensor"
+        )
+
+
+def _doubt_reflectance(report: RunReport) -> Iterator[str]:
+    """More reflectances above 1 than metal, signs and wet roofs explain."""
+    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
+    if report.above_one > MOST_ABOVE_ONE * known > 0:
+        yield (
+            f"{100 * report.above_one / known:.0f} % of the reflectances exceed 1, that of a white matt surface: "
+            "the calibration is of another sensor or setting, a target's reflectance is wrong, or coordinates are not in metres"
         )
 
 

@@ -84,6 +84,10 @@ class ChannelConstant:
     """Volts per count, as the descriptor has it."""
     pulse_ns: float | None = None
     """Full width at half maximum of the system pulse [ns]."""
+    noise_dn: float | None = None
+    """Standard deviation of the noise of a sample [DN]."""
+    brightest: float | None = None
+    """Light of its strongest echoes, R^2 A / eta [DN m2]: see `setting.BRIGHT`."""
 
     @property
     def is_described(self) -> bool:
@@ -138,6 +142,10 @@ class Calibration:
     """Median height of the sensor above the targets [m]."""
     distance: float | None = None
     """Median distance from the sensor to the targets [m]."""
+    rate: float | None = None
+    """Pulses per second by GPS times; None where they do not show it."""
+    software: str = ""
+    """Generating software of the strip's header."""
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     """Of the strip that was measured."""
     targets: tuple[TargetResult, ...] = ()

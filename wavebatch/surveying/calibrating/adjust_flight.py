@@ -40,7 +40,7 @@ class Adjustment:
     value: np.ndarray
     """Logarithm of the constant, f8 (n,)."""
     error: np.ndarray
-    """Standard deviation without that of the targets' reflectance, f8 (n,); of the terms too, over the source's ties."""
+    """Standard deviation without that of the targets' reflectance, f8 (n,); with the terms, over its ties."""
     trials: np.ndarray
     """The values of the resamples, f8 (TRIALS, n): for errors of differences."""
     ties: np.ndarray

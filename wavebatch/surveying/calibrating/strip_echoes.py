@@ -23,6 +23,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.setting import Setting, measure_setting
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
@@ -61,6 +62,7 @@ class EchoSource:
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse
     sensor: SensorSource
+    setting: Setting
 
     @property
     def path(self) -> Path:
@@ -120,7 +122,8 @@ def open_source(
         choice = make_choice(reader, scan, chain or widest_chain(), request)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
-        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source)
+        setting = measure_setting(reader, scan, source, attenuation)
+        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, setting)
 
 
 def with_energy(chain: Chain) -> Chain:

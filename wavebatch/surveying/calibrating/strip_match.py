@@ -19,9 +19,10 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.files.strip.facts import StripFacts
+from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.surveying.calibrating.setting import measure_setting
 from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
@@ -42,6 +43,13 @@ AIR_DOUBT = 0.5
 
 FAR = 1.3
 """Ratio of distances from which the strip's and the targets' are named."""
+
+SAME_RATE = 0.02
+"""Relative difference up to which pulse rates are equal."""
+
+OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
+"""Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
+one, other surfaces the other."""
 
 _CHAIN_SAMPLE = 2048
 """Waveforms on which two chains are compared."""
@@ -102,6 +110,15 @@ def match_strip(
         )
         return StripMatch(calibration, tuple(warnings))
     growth, reasons = _find_growth(calibration, reader, sensor)
+    own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
+    if all(row.sha256 != own_strip for row in calibration.strips):
+        more, lines = _compare_setting(calibration, reader, scan, system, sensor)
+        growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+    if not calibration.relative_error:
+        reasons.append(
+            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
+            "the file"
+        )
     warnings += [*reasons, *_compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
@@ -127,7 +144,7 @@ def match_strip(
     ]
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
-        rows = list(_take_strip_constants(calibration.strips, rows, reader.facts))
+        rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
     return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
 
@@ -224,7 +241,39 @@ def _find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSo
             f"calibration: measured with sensor {calibration.sensor!r}, the header of this strip names {name!r}; "
             "bits, spacing, gain and pulse agree"
         )
+    software = decode_text(reader.facts.header.generating_software).strip()
+    if calibration.software and software and software != calibration.software:
+        lines.append(f"calibration: measured on a file of {calibration.software!r}, this one is of {software!r}")
     return float(np.sqrt(np.sum(np.square(parts)))), lines
+
+
+def _compare_setting(
+    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
+) -> tuple[float, list[str]]:
+    """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
+    found = measure_setting(reader, scan, sensor, calibration.attenuation)
+    parts, lines = [], []
+    if found.rate and calibration.rate and abs(math.log(found.rate / calibration.rate)) > SAME_RATE:
+        parts.append(abs(math.log(found.rate / calibration.rate)))
+        lines.append(
+            f"pulses come at {found.rate / 1e3:.4g} kHz, those of the calibration at {calibration.rate / 1e3:.4g} kHz: "
+            "a laser's energy falls with the rate"
+        )
+    for row in calibration.channels:
+        noise, light = system.digitizers.get(row.digitizer, system).noise_std, found.brightest.get(row.digitizer)
+        louder = abs(math.log(noise / row.noise_dn)) if noise and row.noise_dn else 0.0
+        brighter = abs(math.log(light / row.brightest)) if light and row.brightest else 0.0
+        if louder > math.log(OTHER_NOISE):
+            parts.append(louder)
+            lines.append(f"noise of digitizer {row.digitizer} is {noise:.3g} DN, the calibration's {row.noise_dn:.3g}: "
+                         "another gain, or other sunlight")  # fmt: skip
+        if brighter > math.log(OTHER_LIGHT):
+            # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
+            parts.append(brighter / math.sqrt(2.0))
+            lines.append(f"the strongest echoes of digitizer {row.digitizer} are {light / row.brightest:.2f} times as "
+                         "bright as the calibration's: another gain, or other surfaces")  # fmt: skip
+    growth = max(parts, default=0.0)
+    return growth, [f"calibration: {line}; the error of the constant grows by {100 * growth:.0f} %" for line in lines]
 
 
 def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
@@ -279,10 +328,9 @@ def _compare_energies(block: WaveformBlock, system: SystemPulse, pair: tuple[Cha
 
 
 def _take_strip_constants(
-    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], facts: StripFacts
+    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], key: str
 ) -> Iterator[ChannelConstant]:
-    """The rows; where the strip itself was calibrated, with the constants of the strip."""
-    key = take_fingerprint(facts.path, facts.packets.file)["sha256_sampled"]
+    """The rows; where the strip itself, known by its fingerprint, was calibrated, with the constants of the strip."""
     own = {(row.digitizer, row.scanner): row for row in strips if row.sha256 == key}
     for row in rows:
         found = own.get((row.digitizer, row.scanner))

@@ -44,7 +44,8 @@ class Trend:
 
     def describe(self) -> str:
         """Return what it is and what to do."""
-        return f"brightness changes with the {self.name} by {100 * self.whole:.0f} % in the overlaps: {_REMEDY[self.name]}"
+        share = f"{100 * self.whole:.0f} %"
+        return f"brightness changes with the {self.name} by {share} in the overlaps: {_REMEDY[self.name]}"
 
 
 def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, float, float]]:
@@ -77,8 +78,8 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     if not 0 < edge <= MOST_EDGE_ERROR:
         found = "do not show it" if not np.isfinite(edge) or not edge else f"leave it uncertain by {100 * edge:.0f} %"
         raise InputError(
-            f"--scan-angle: the overlaps {found} at the edge of the swath; give strips that overlap by a third or more, "
-            "or leave --scan-angle out"
+            f"--scan-angle: the overlaps {found} at the edge of the swath; give strips that overlap by a third "
+            "or more, or leave --scan-angle out"
         )
     return adjusted, (most, *map(float, adjusted.terms))
 
