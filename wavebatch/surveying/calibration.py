@@ -87,7 +87,7 @@ class ChannelConstant:
     noise_dn: float | None = None
     """Standard deviation of the noise of a sample [DN]."""
     brightest: float | None = None
-    """Light of its strongest echoes, R^2 A / eta [DN m2]: see `setting.BRIGHT`."""
+    """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
 
     @property
     def is_described(self) -> bool:

@@ -16,10 +16,10 @@ from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.sensor import SensorSource
 
 SAMPLE = 2048
-"""Waveforms whose highest samples are taken."""
+"""Waveforms whose light is summed."""
 
 BRIGHT = 0.95
-"""Quantile of the light of the highest samples: above it lie few metal roofs and signs."""
+"""Quantile of the light of waveforms: above it lie few metal roofs and signs."""
 
 SLICES, SLICE_POINTS = 8, 2048
 """Places of the strip at which GPS times are read, and points at each."""
@@ -35,7 +35,8 @@ class Setting:
     rate: float | None
     """Pulses per second; None where the times do not show it."""
     brightest: dict[int, float]
-    """R^2 A /eta of the strongest waveforms of each digitizer [DN m2]."""
+    """R^2 / eta times the sum of the samples of the strongest waveforms of each digitizer [DN m2]: slopes do not change
+    it."""
 
 
 def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float) -> Setting:
@@ -48,11 +49,12 @@ def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, 
         samples = block.samples.astype(np.float32)
         if block.missing is not None:
             samples[block.missing] = np.nan
-        height = np.nanmax(samples, axis=1) - np.nanmedian(samples, axis=1)
-        time = block.spacing * np.nanargmax(samples, axis=1)
+        above = samples - np.nanmedian(samples, axis=1)[:, None]
+        time = block.spacing * np.nanargmax(above, axis=1)
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
-        light.setdefault(block.digitizer.index, []).append(height * distance**2 / transmit(distance, attenuation))
+        whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation)
+        light.setdefault(block.digitizer.index, []).append(whole)
     joined = {index: np.concatenate(parts) for index, parts in light.items()}
     known = {index: rows[np.isfinite(rows)] for index, rows in joined.items()}
     brightest = {index: float(np.quantile(rows, BRIGHT)) for index, rows in known.items() if len(rows)}

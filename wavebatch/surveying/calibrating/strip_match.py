@@ -22,6 +22,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
+from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibrating.setting import measure_setting
 from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
@@ -122,9 +123,9 @@ def match_strip(
     warnings += [*reasons, *_compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
+    pulses = _find_pulses(calibration, reader, scan, system, sensor)
     for index in sorted(scan.by_descriptor):
-        own = system.digitizers.get(index, system)
-        pulse = own.sigma_ref * FWHM_PER_SIGMA
+        pulse = pulses.get(index, pulses[0])
         found, reasons[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
         rows += found
     have, seen = {(row.digitizer, row.scanner) for row in rows}, see_channels(reader, scan)
@@ -149,6 +150,29 @@ def match_strip(
     return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
 
 
+def _find_pulses(
+    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
+) -> dict[int, float]:
+    """Widths at half maximum of the pulses of all digitizers that have one of their own, and of the others as 0 [ns].
+
+    A hillside widens every echo, so that the survey of its strip finds a wider pulse than the sensor has: where a pulse
+    is wider than the calibration's, what the slopes of the strip's surfaces add to it is taken off.
+    """
+    systems = {0: system, **system.digitizers}
+    known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
+    divergence = system.divergence or calibration.divergence
+    widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
+    if known and divergence and widest > NEAR_PULSE * min(known):
+        main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
+        spacing = reader.facts.digitizers[main].spacing
+        seen = sample_reference(reader, scan, sensor, replace(system, divergence=divergence), spacing).system
+        systems = {0: seen, **seen.digitizers}
+    return {
+        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.level_variance, 0.0))
+        for index, one in systems.items()
+    }
+
+
 def _match_digitizer(
     calibration: Calibration, digitizer: Digitizer, pulse: float, warnings: list[str]
 ) -> tuple[list[ChannelConstant], str]:
@@ -157,7 +181,7 @@ def _match_digitizer(
     reason = ""
     fitting = []
     for row in known:
-        contradiction = _contradict(row, digitizer, pulse)
+        contradiction = _contradict(row, digitizer, pulse, calibration.divergence is not None)
         if not contradiction:
             fitting.append(row)
         elif not reason or row.digitizer == digitizer.index:
@@ -179,7 +203,7 @@ def _match_digitizer(
     return found, ""
 
 
-def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str:
+def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float, known_beam: bool) -> str:
     """Why a channel's constant cannot hold for a digitizer; empty where it can. What is not known is not checked."""
     if row.bits is not None and row.bits != digitizer.bits:
         return f"digitizer {digitizer.index} has {digitizer.bits} bits, the calibration {row.bits}"
@@ -191,7 +215,10 @@ def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str
             return f"digitizer {digitizer.index} has a {name} of {own:g} {unit}, the calibration {other:g}"
     ratio = pulse / (row.pulse_ns or pulse)
     if max(ratio, 1 / ratio) > OTHER_PULSE:
-        return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns"
+        slopes = ""
+        if ratio > 1 and not known_beam:
+            slopes = " (slopes may widen it: put divergence_mrad of the data sheet into CAL.toml)"
+        return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns{slopes}"
     return ""
 
 
