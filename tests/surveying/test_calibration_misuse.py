@@ -1,15 +1,23 @@
 """What contradicts a calibration shows: brightness over the swath, other settings, contradicting options."""
 
 import json
+import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import wavebatch as wb
-from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
+from tests import footprints
+from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
+from tests.footprints import Flight, Plane
 from wavebatch.cli import main
+from wavebatch.core.errors import InputError
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.surveying import sensor
 from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
 
 LIGHT = 1.2e8
@@ -162,3 +170,92 @@ def test_a_constant_without_an_error_is_named(tmp_path, calibrated):
     (tmp_path / "cal.toml").write_text(text.replace(f"relative_error = {error!r}", "relative_error = 0.0"))
     done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml")
     assert "its relative_error is 0, but no constant is known exactly" in done.stderr
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_a_trajectory_that_is_late_is_named_and_in_the_error(tmp_path, calibrated, late):
+    moved = replace(SENSOR, time=SENSOR.time + late)
+    trajectory = write_trajectory(tmp_path / "t.csv", moved, 1.0)
+    options = ("--trajectory", trajectory, "--columns", "range,range_error", "-v")
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", calibrated / "cal.toml", *options)
+    assert done.exit_code == 0, done.output
+    assert ("the trajectory is 9.0 m behind the packets' vectors" in done.output) == bool(late)
+    cloud = wb.read_cloud(tmp_path / "a.laz")
+    true = np.linalg.norm(np.stack([cloud[name] for name in "xyz"], 1) - sensor_of(cloud["gps_time"]), axis=1)
+    off = np.abs(cloud["range"] - true)
+    assert np.mean(off < cloud["range_error"]) > 0.5 and np.nanmedian(cloud["range_error"]) < (1.0 if late else 0.1)
+
+
+def sensor_of(time):
+    return path_of(SENSOR, time - SENSOR.time) + [EAST, NORTH, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [(0.8, "--attenuation 0.8 dB/km contradicts the 0.22 dB/km"), (0.3, "light changes by +3 %"), (0.22, "")],
+)
+def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_path, calibrated, given, said):
+    columns = "backscatter_coefficient,backscatter_coefficient_err"
+    line = run(calibrated, tmp_path, "a.las", "--attenuation", given, "--columns", columns)
+    assert said in line and ("contradicts" in line) == bool(said)
+    cloud = wb.read_cloud(tmp_path / "a.laz")
+    stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+    assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
+
+
+def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", calibrated / "cal.toml",
+                "--attenuation", 0.0003)  # fmt: skip
+    assert done.exit_code == 2 and "less than any air has near the ground; is it per metre?" in done.stderr
+    done = call("calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o", tmp_path / "c.toml",
+                "--attenuation", 0.0003)  # fmt: skip
+    assert done.exit_code == 2 and "is it per metre?" in done.stderr
+
+
+def test_an_incidence_that_contradicts_the_plane_of_the_target_is_refused(tmp_path, calibrated):
+    targets = write_targets(tmp_path / "t.csv", "incidence=50")
+    done = call("calibrate", calibrated / "a.las", "--targets", targets, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1 and "its incidence of 50 deg contradicts the plane of its echoes" in done.stderr
+    right = write_targets(tmp_path / "r.csv", "incidence=3")
+    assert call("calibrate", calibrated / "a.las", "--targets", right, "-o", tmp_path / "cal.toml").exit_code == 0
+
+
+@pytest.mark.parametrize("scatter", [0.02, 0.08])
+def test_energies_of_other_pulses_are_noticed(rng, scatter):
+    ground = np.where(np.arange(4000) // 40 % 2, 0.1, 0.5)
+    energy = 1 + scatter * rng.standard_normal(4000)
+    light = ground * energy * (1 + 0.02 * rng.standard_normal(4000))
+    assert judge_energies(light, 7.5 * energy) == ""
+    assert "one pulse too late" in judge_energies(light, np.roll(energy, 1))
+    assert "one pulse too early" in judge_energies(light, np.roll(energy, -1))
+    assert "they are of other pulses" in judge_energies(light, rng.permutation(energy))
+    assert judge_energies(light, np.ones(4000)) == judge_energies(light, np.full(4000, np.nan)) == ""
+
+
+def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
+    truth = footprints.write_strip(tmp_path / "s.las", [Plane()], Flight(energy_spread=0.05), 2000)
+    shuffled = zip(truth.gps_time, rng.permutation(truth.energy), strict=True)
+    (tmp_path / "e.csv").write_text("time,energy\n" + "\n".join(f"{time:.9f},{one:.6f}" for time, one in shuffled))
+    options = ("--columns", "+amplitude_normalized", "--pulse-energy", tmp_path / "e.csv")
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", *options)
+    assert done.exit_code == 4 and "--pulse-energy e.csv contradicts the strip" in done.stderr
+
+
+def test_degrees_without_a_crs_are_named(tmp_path):
+    write_strip(tmp_path / "s.las", GROUND, SENSOR, 400)
+    content = bytearray((tmp_path / "s.las").read_bytes())
+    struct.pack_into("<3d", content, 131, 1e-8, 1e-8, 1e-3)
+    struct.pack_into("<3d", content, 155, 11.0, 48.0, 0.0)
+    struct.pack_into("<6d", content, 179, 11.003, 10.999, 48.004, 47.996, 1.0, -1.0)
+    (tmp_path / "s.las").write_bytes(content)
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "range")
+    assert done.exit_code == 4 and "coordinates look like degrees" in done.stderr
+
+
+def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, calibrated, monkeypatch):
+    monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: 3.281)
+    metres = SimpleNamespace(is_metric=True, horizontal=1.0)
+    with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
+        facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header)
+        with pytest.raises(InputError, match="coordinates are in feet, packet vectors in metres"):
+            sensor.refuse_units(SimpleNamespace(facts=facts), scan)

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 
@@ -23,9 +24,19 @@ NEEDS_SENSOR = (
 )  # fmt: skip
 """Columns that need the sensor's position."""
 
+LEAST_ATTENUATION = 0.01
+"""Of air near the ground [dB/km]: what molecules alone scatter at 1064 nm is 0.004, and haze is never absent."""
+
 _REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
 _MOST_DESCRIBED = 8
 """Strips that a description lists one by one."""
+
+
+def check_attenuation(value: float) -> None:
+    """Raise ConfigError for an attenuation [dB/km] that no air has, as of a value per metre; 0 is no air at all."""
+    if 0.0 < value < LEAST_ATTENUATION:
+        problem = f"attenuation: {value:g} dB/km is less than any air has near the ground"
+        raise ConfigError(f"{problem}; is it per metre? Clear air has 0.1 to 0.5 dB/km")
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,7 +149,10 @@ def _divide(
 ) -> EchoTable:
     """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
     alone = is_alone(block, echoes)
-    rho = np.where(alone, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
+    rho = np.where(alone & ~light.bound, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
     steep = angle >= radiometry.STEEPEST
-    more = (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)), (NoData.TOO_STEEP, steep)
+    more = (
+        (NoData.UNSETTLED, light.bound), (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)),
+        (NoData.TOO_STEEP, steep),
+    )  # fmt: skip
     return add_column(echoes, name, rho, relative, *light.cases, *more)

@@ -8,7 +8,6 @@ resampling blocks of the overlap, since neighbouring cells share roads, fields a
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array, hstack
@@ -67,7 +66,9 @@ class Anchors:
     """The fitted columns at the targets, f8 (n, m)."""
 
 
-def adjust_constants(ties: Ties, anchors: Anchors, columns: np.ndarray | None = None) -> Adjustment:
+def adjust_constants(
+    ties: Ties, anchors: Anchors, columns: np.ndarray | None = None, trials: int = TRIALS
+) -> Adjustment:
     """Adjust the constants of sources.
 
     Parameters
@@ -76,6 +77,8 @@ def adjust_constants(ties: Ties, anchors: Anchors, columns: np.ndarray | None = 
     anchors : Anchors
     columns : float64 (k, m), optional
         Of each row of the ties, functions of how it was seen: their coefficients are fitted too.
+    trials : int
+        Resamples for the errors; 0 leaves them unknown.
 
     Returns
     -------
@@ -86,37 +89,6 @@ def adjust_constants(ties: Ties, anchors: Anchors, columns: np.ndarray | None = 
     value_ks = r_k - c_s - columns_ks . terms, by least squares with weights 1 / (error^2 + scatter^2), where the
     scatter between cells comes from the residuals; Huber's weights in eight rounds. docs/algorithms.md 5.3.
     """
-    fit = fit_terms(ties, anchors, columns)
-    n, use = len(anchors.value), fit.use
-    rows = fit.design, ties.cell[use], ties.value[use]
-    trials = _resample(ties.centre[use], *rows, fit.weight, anchors, fit.reached)
-    source = ties.source[use]
-    residual = np.full(len(ties.cell), np.nan)
-    residual[use] = fit.rest
-    return Adjustment(
-        fit.found[:n], _errors(fit.design, source, trials, n), trials[:, :n], np.bincount(source, minlength=n),
-        residual, fit.scatter, fit.found[n:], trials[:, n:],
-    )  # fmt: skip
-
-
-class Fit(NamedTuple):
-    """One least-squares solution."""
-
-    found: np.ndarray
-    """Logarithms of the constants, then the coefficients of the columns, f8 (n + m,)."""
-    scatter: float
-    """As in `Adjustment`."""
-    rest: np.ndarray
-    """Residuals of the rows that are used."""
-    weight: np.ndarray
-    use: np.ndarray
-    """Which rows of the ties are used, bool (k,)."""
-    reached: np.ndarray
-    design: csr_array
-
-
-def fit_terms(ties: Ties, anchors: Anchors, columns: np.ndarray | None = None) -> Fit:
-    """Solve once, without errors; arguments as for `adjust_constants`."""
     n = len(anchors.value)
     columns = np.empty((len(ties.cell), 0)) if columns is None else columns
     reached = _reach(ties, np.flatnonzero(np.isfinite(anchors.value)), n)
@@ -134,7 +106,14 @@ def fit_terms(ties: Ties, anchors: Anchors, columns: np.ndarray | None = None) -
         # Errors of fits are in the residuals already: the larger of the two is what a row is known to.
         spread = np.maximum(error, scatter)
         weight = spread**-2.0 * np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(rest), 1e-12))
-    return Fit(found, _excess(rest, cell, error), rest, weight, use, reached, design)
+    again = _resample(ties.centre[use], design, cell, value, weight, anchors, reached, trials)
+    residual = np.full(len(ties.cell), np.nan)
+    residual[use] = rest
+    errors = _errors(design, source, again, n) if trials else np.full(n, np.nan)
+    number = np.bincount(source, minlength=n)
+    return Adjustment(
+        found[:n], errors, again[:, :n], number, residual, _excess(rest, cell, error), found[n:], again[:, n:]
+    )
 
 
 def _errors(design: csr_array, source: np.ndarray, trials: np.ndarray, n: int) -> np.ndarray:
@@ -203,17 +182,17 @@ def _residuals(
 
 def _resample(
     centre: np.ndarray, design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray,
-    anchors: Anchors, reached: np.ndarray,
+    anchors: Anchors, reached: np.ndarray, trials: int,
 ) -> np.ndarray:  # fmt: skip
-    """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (TRIALS, n + m)."""
+    """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (trials, n + m)."""
     rng = np.random.default_rng(0)
     _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
     blocks = int(block.max(initial=-1)) + 1
-    trials = []
-    for _ in range(TRIALS):
+    found = np.empty((trials, design.shape[1]))
+    for row in found:
         drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
         # A little of every block stays: without it a source that few blocks tie could be lost.
         part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
         moved = replace(anchors, value=anchors.value + anchors.error * rng.standard_normal(len(anchors.value)))
-        trials.append(_solve(design, cell, value, part, moved, reached))
-    return np.array(trials)
+        row[:] = _solve(design, cell, value, part, moved, reached)
+    return found

@@ -31,7 +31,7 @@ from wavebatch.surveying.calibrating.targets import (
 )
 from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, hash_squares, measure_ties
 from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
 
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
@@ -98,6 +98,7 @@ def calibrate_flight(
     docs/algorithms.md 5.3.
     """
     options = options or CalibrationOptions()
+    check_attenuation(options.attenuation)
     boxes = [_find_box(path) for path in paths]
     origin = boxes[0][0]
     strips = [_read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]

@@ -10,8 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.pulse_energy import PulseEnergy
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.kernels.physics.pulse_energies import judge_energies
 from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.sensor import SensorSource
 
@@ -20,6 +24,9 @@ SAMPLE = 2048
 
 BRIGHT = 0.95
 """Quantile of the light of waveforms: above it lie few metal roofs and signs."""
+
+ENERGIES = 4096
+"""Neighbouring pulses whose light is compared with their energies."""
 
 SLICES, SLICE_POINTS = 8, 2048
 """Places of the strip at which GPS times are read, and points at each."""
@@ -46,10 +53,7 @@ def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, 
         block = sensor.fill(block)
         if block.sensor is None:
             continue
-        samples = block.samples.astype(np.float32)
-        if block.missing is not None:
-            samples[block.missing] = np.nan
-        above = samples - np.nanmedian(samples, axis=1)[:, None]
+        above = _take_off_level(block)
         time = block.spacing * np.nanargmax(above, axis=1)
         away = block.origin + block.direction * time[:, None] - block.sensor
         distance = np.sqrt((away * away).sum(axis=1))
@@ -59,6 +63,33 @@ def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, 
     known = {index: rows[np.isfinite(rows)] for index, rows in joined.items()}
     brightest = {index: float(np.quantile(rows, BRIGHT)) for index, rows in known.items() if len(rows)}
     return Setting(_measure_rate(reader), brightest)
+
+
+def check_energies(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> None:
+    """Raise InputError where the light of neighbouring pulses in the middle of a strip contradicts their energies."""
+    if not reader.unit_count():
+        return
+    unit = reader.read_unit(reader.unit_count() // 2, scan)
+    rows = np.flatnonzero(unit.packets.owned)[:ENERGIES]
+    blocks = [energy.fill(block, unit) for block, _ in reader.read_rows(unit, rows, ENERGIES)]
+    if not blocks:
+        return
+    light = np.concatenate([np.nansum(_take_off_level(block), axis=1) for block in blocks])
+    order = np.argsort(np.concatenate([block.gps_time for block in blocks]), kind="stable")
+    doubt = judge_energies(light[order], np.concatenate([block.pulse_energy for block in blocks])[order])
+    if doubt:
+        raise InputError(
+            f"{reader.facts.path}: --pulse-energy {energy.source} contradicts the strip: {doubt}; check its times, or "
+            "leave it out"
+        )
+
+
+def _take_off_level(block: WaveformBlock) -> np.ndarray:
+    """Samples f4 (n, s) over the median of their waveform; NaN where they are missing."""
+    samples = block.samples.astype(np.float32)
+    if block.missing is not None:
+        samples[block.missing] = np.nan
+    return samples - np.nanmedian(samples, axis=1)[:, None]
 
 
 def _measure_rate(reader: StripReader) -> float | None:

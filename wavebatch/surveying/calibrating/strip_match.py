@@ -42,6 +42,9 @@ are assumptions; `wavebatch calibrate` of several strips measures the drift of a
 AIR_DOUBT = 0.5
 """Relative error of the attenuation of the air, for strips at other distances than the targets."""
 
+LEAST_AIR = 0.005
+"""Relative change of the light from which other air on the same day is named."""
+
 FAR = 1.3
 """Ratio of distances from which the strip's and the targets' are named."""
 
@@ -76,6 +79,7 @@ def match_strip(
     system: SystemPulse,
     sensor: SensorSource,
     chain: Chain | None = None,
+    attenuation: float | None = None,
 ) -> StripMatch:
     """Fit a calibration to a strip.
 
@@ -89,6 +93,8 @@ def match_strip(
     sensor : SensorSource
     chain : Chain, optional
         That the strip runs with.
+    attenuation : float, optional
+        Of the air [dB/km], where it is not that of the calibration.
 
     Returns
     -------
@@ -146,6 +152,8 @@ def match_strip(
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
+    air = _compare_air(calibration, reader, sensor, attenuation, warnings)
+    rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
     return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
 
@@ -272,6 +280,24 @@ def _find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSo
     if calibration.software and software and software != calibration.software:
         lines.append(f"calibration: measured on a file of {calibration.software!r}, this one is of {software!r}")
     return float(np.sqrt(np.sum(np.square(parts)))), lines
+
+
+def _compare_air(
+    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None, warnings: list[str]
+) -> float:
+    """Relative error of a strip of the calibration's day that is given other air than the calibration had."""
+    day = read_day(reader)
+    if attenuation is None or not sensor.distance or (day and calibration.flight and day != calibration.flight):
+        return 0.0
+    off = 2.0e-4 * math.log(10.0) * sensor.distance * (attenuation - calibration.attenuation)
+    if abs(off) < LEAST_AIR:
+        return 0.0
+    warnings.append(
+        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:g} dB/km with "
+        f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
+        "in the error; give `wavebatch calibrate` the same --attenuation"
+    )
+    return abs(off)
 
 
 def _compare_setting(

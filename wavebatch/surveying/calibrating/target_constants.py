@@ -26,6 +26,9 @@ MOST_FACING_ERROR = 0.05
 GIVEN_ANGLE_ERROR = np.radians(1.0)
 """Error of an incidence that the target file gives."""
 
+MOST_OFF = 4.0
+"""A given incidence contradicts the plane of the echoes by so many standard errors."""
+
 INSET = 1.5
 """Echoes count this many 1/e2 radii inside the outline: 0.13 % of a footprint's light lies beyond a straight edge."""
 
@@ -71,6 +74,13 @@ def measure_target(
     if len(rows) < LEAST_ECHOES:
         return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed"), *nothing
     facet = fit_facet(rows["xyz"], rows["ray"])
+    seen, seen_err = float(np.median(facet.angles(rows["ray"]))), float(np.hypot(facet.angle_error, GIVEN_ANGLE_ERROR))
+    if target.incidence is not None and abs(np.radians(target.incidence) - seen) > MOST_OFF * seen_err:
+        reason = (
+            f"its incidence of {target.incidence:g} deg contradicts the plane of its echoes, which rays strike at "
+            f"{np.degrees(seen):.1f} +- {np.degrees(seen_err):.1f} deg: correct incidence, or leave it out"
+        )
+        return replace(blank, refused=reason), *nothing
     if target.incidence is None:
         angle, angle_err, facing_err = facet.angles(rows["ray"]), facet.angle_error, facet.facing_error
     else:

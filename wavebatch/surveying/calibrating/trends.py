@@ -12,7 +12,7 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import swath_columns
-from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants, fit_terms
+from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.tie_cells import Ties
 
 LEAST_SPREAD = 0.01
@@ -100,11 +100,11 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
         return None
     for name, columns, at_targets in _list_columns(ties, seen):
         known = np.isfinite(at_targets).all(axis=1)
-        fit = fit_terms(ties, replace(anchors, columns=np.where(known[:, None], at_targets, 0.0)), columns)
+        fit = adjust_constants(ties, replace(anchors, columns=np.where(known[:, None], at_targets, 0.0)), columns, 0)
         if fit.scatter >= least:
             continue
-        terms = fit.found[len(seen) :]
-        effect = (columns @ terms)[fit.use] - float(np.mean(at_targets[known] @ terms))
+        used = np.isfinite(fit.residual)
+        effect = columns[used] @ fit.terms - float(np.mean(at_targets[known] @ fit.terms))
         low, high = np.quantile(effect, [0.02, 0.98])
         best, least = Trend(name, float(np.sqrt(np.mean(effect**2))), float(np.expm1(high - low))), fit.scatter
     return best
