@@ -49,7 +49,7 @@ def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
 
 
 LEAST_SKEW = 0.25
-"""Skew of the strip's pulse from which the pulse t^2 exp(-t) of mode `pulse` describes it; that pulse itself has 0.48."""
+"""Skew of the strip's pulse from which the pulse t^2 exp(-t) of mode `pulse` describes it: it has 0.48 itself."""
 
 
 def _other_pulse(system: SystemPulse, mode: str) -> bool:
