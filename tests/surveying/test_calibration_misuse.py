@@ -111,7 +111,7 @@ def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path,
 def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
     done = call("calibrate", dim_edges / "a.las", "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml",
                 "--scan-angle")  # fmt: skip
-    assert done.exit_code == 1 and "the overlaps do not show it at the edge of the swath" in done.stderr
+    assert done.exit_code == 1 and "the overlaps do not show the light at the edge of the swath to 5%" in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +139,9 @@ def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibra
 @pytest.mark.parametrize(
     ("change", "said", "growth"),
     [
-        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "at 20 kHz, those of the calibration", 0.69),
-        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is 0.", 0.5),
-        ({"light": 0.5 * LIGHT}, "times as bright as the calibration's", 0.45),
+        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "so another energy: 2e+04", 0.69),
+        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is [DN] 0.", 0.5),
+        ({"light": 0.5 * LIGHT}, "another gain, or other surfaces: light of digitizer 1", 0.45),
     ],
 )
 def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_path, calibrated, change, said, growth):

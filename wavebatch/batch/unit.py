@@ -156,7 +156,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
-            job = replace(job, chain=_set_slope(reader, scan, _set_radius(reader, scan, job.chain)))
+            job = replace(job, chain=_set_parameters(reader, scan, job.chain))
             energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
             if energy is not None:
                 check_energies(reader, scan, energy)
@@ -173,24 +173,16 @@ def prepare_strip(job: StripJob) -> Prepared:
     return replace(prepared, forced=forced)
 
 
-def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
-    """The chain with a radius in place of one of 0, which means that the distance between the points decides."""
-    steps = [
-        replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
-        if step.stage.second_pass is not None and step.effective()["radius"] == 0
-        else step
-        for step in chain.steps
-    ]
-    return replace(chain, steps=tuple(steps))
-
-
-def _set_slope(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
-    """The chain with the slopes of the strip in the error of level reflectances, where no slope is given."""
+def _set_parameters(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
+    """The chain with what the strip decides: a radius in place of one of 0, by the distance between the points; and in
+    the error of level reflectances, where no slope is given, the strip's slopes."""
     steps = []
     for step in chain.steps:
-        if step.stage.name == "attribute.level_reflectance" and not step.parameters:
-            slope = min(max(step.effective()["slope"], round(measure_slope(reader, scan), 1)), STEEP)
-            step = replace(step, parameters={"slope": slope})
+        if step.stage.second_pass is not None and step.effective()["radius"] == 0:
+            step = replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+        elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
+            slope = max(step.effective()["slope"], round(measure_slope(reader, scan), 1))
+            step = replace(step, parameters={"slope": min(slope, STEEP)})
         steps.append(step)
     return replace(chain, steps=tuple(steps))
 

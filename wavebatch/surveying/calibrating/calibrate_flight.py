@@ -36,6 +36,11 @@ from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripC
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
 
+_UNEXPLAINED = (
+    "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
+    "whether the overlaps are wet, rough or planted"
+)
+
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""
 
@@ -132,12 +137,7 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
     stated = max(row.relative_error for row in (*calibration.channels, *calibration.strips))
     if spread < max(stated, LEAST_SPREAD):
         return calibration, []
-    reason = (
-        "the strips' light from one place differs by more than their constants explain: check targets, trajectory "
-        "and whether the overlaps are wet, rough or planted"
-        if trend is None
-        else trend.describe()
-    )
+    reason = _UNEXPLAINED if trend is None else trend.doubt
     note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
     channels, strips = (
         tuple(replace(row, relative_error=math.hypot(row.relative_error, spread)) for row in rows)
@@ -189,21 +189,16 @@ def _read_strip(
             described=tuple(describe_channel(row, source) for row in blank),
             ranging=measure_ranging(source.sensor, distance, options.attenuation),
             ties=ties,
-            seen=_see_targets(on_targets, found),
+            seen=_see_targets(on_targets),
         )
 
 
-def _see_targets(on_targets: Sequence[np.ndarray], found: Calibration | None) -> dict[int, np.void]:
-    """How each channel saw the targets that gave a constant, in the middle, as VIEW."""
-    used = [] if found is None else zip(on_targets, found.targets, strict=True)
-    rows = [(some, target.incidence_deg) for some, target in used if target.constant is not None]
-    seen = {}
-    for channel in {int(one) for some, _ in rows for one in np.unique(some["channel"])}:
-        parts = [(some[some["channel"] == channel], angle) for some, angle in rows]
-        mine = np.concatenate([some for some, _ in parts])
-        view = np.zeros(1, VIEW)[0]
-        view["angle"] = np.median(angle_to_vertical(mine["ray"]))
-        view["incidence"] = np.radians(np.median([angle for some, angle in parts if len(some)]))
+def _see_targets(on_targets: Sequence[np.ndarray]) -> dict[int, np.void]:
+    """How each channel saw the targets in the middle, as VIEW; good targets are level."""
+    rows, seen = np.concatenate(on_targets), {}
+    for channel in np.unique(rows["channel"]).tolist():
+        mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
+        view["angle"] = view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
         view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
         seen[channel] = view
     return seen

@@ -6,7 +6,7 @@ makes another sensor of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,7 @@ LEAST_IN_ORDER = 0.8
 """Share of neighbouring points whose times must not fall: points in another order show no pulse rate."""
 
 
-@dataclass(frozen=True, slots=True)
-class Setting:
+class Setting(NamedTuple):
     """A strip's setting by its data."""
 
     rate: float | None

@@ -48,8 +48,8 @@ LEAST_AIR = 0.005
 FAR = 1.3
 """Ratio of distances from which the strip's and the targets' are named."""
 
-SAME_RATE = 0.02
-"""Relative difference up to which pulse rates are equal."""
+SAME_RATE = 1.02
+"""Ratio up to which pulse rates are equal."""
 
 OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
 """Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
@@ -189,7 +189,7 @@ def _match_digitizer(
     reason = ""
     fitting = []
     for row in known:
-        contradiction = _contradict(row, digitizer, pulse, calibration.divergence is not None)
+        contradiction = _contradict(row, digitizer, pulse)
         if not contradiction:
             fitting.append(row)
         elif not reason or row.digitizer == digitizer.index:
@@ -211,7 +211,7 @@ def _match_digitizer(
     return found, ""
 
 
-def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float, known_beam: bool) -> str:
+def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str:
     """Why a channel's constant cannot hold for a digitizer; empty where it can. What is not known is not checked."""
     if row.bits is not None and row.bits != digitizer.bits:
         return f"digitizer {digitizer.index} has {digitizer.bits} bits, the calibration {row.bits}"
@@ -223,9 +223,7 @@ def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float, known_
             return f"digitizer {digitizer.index} has a {name} of {own:g} {unit}, the calibration {other:g}"
     ratio = pulse / (row.pulse_ns or pulse)
     if max(ratio, 1 / ratio) > OTHER_PULSE:
-        slopes = ""
-        if ratio > 1 and not known_beam:
-            slopes = " (slopes may widen it: put divergence_mrad of the data sheet into CAL.toml)"
+        slopes = " (if slopes widen it, put divergence_mrad of the data sheet into CAL.toml)" if ratio > 1 else ""
         return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns{slopes}"
     return ""
 
@@ -304,29 +302,23 @@ def _compare_setting(
     calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
 ) -> tuple[float, list[str]]:
     """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    found = measure_setting(reader, scan, sensor, calibration.attenuation)
-    parts, lines = [], []
-    if found.rate and calibration.rate and abs(math.log(found.rate / calibration.rate)) > SAME_RATE:
-        parts.append(abs(math.log(found.rate / calibration.rate)))
-        lines.append(
-            f"pulses come at {found.rate / 1e3:.4g} kHz, those of the calibration at {calibration.rate / 1e3:.4g} kHz: "
-            "a laser's energy falls with the rate"
-        )
+    found, growth, lines = measure_setting(reader, scan, sensor, calibration.attenuation), 0.0, []
+
+    def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
+        nonlocal growth
+        off = abs(math.log(value / known)) if value and known else 0.0
+        if off > math.log(most):
+            growth = max(growth, share * off)
+            lines.append(f"calibration: {line} {value:.4g}, where the calibration has {known:.4g}")
+
+    compare(found.rate, calibration.rate, SAME_RATE, 1.0, "another rate of pulses [1/s], so another energy:")
     for row in calibration.channels:
-        noise, light = system.digitizers.get(row.digitizer, system).noise_std, found.brightest.get(row.digitizer)
-        louder = abs(math.log(noise / row.noise_dn)) if noise and row.noise_dn else 0.0
-        brighter = abs(math.log(light / row.brightest)) if light and row.brightest else 0.0
-        if louder > math.log(OTHER_NOISE):
-            parts.append(louder)
-            lines.append(f"noise of digitizer {row.digitizer} is {noise:.3g} DN, the calibration's {row.noise_dn:.3g}: "
-                         "another gain, or other sunlight")  # fmt: skip
-        if brighter > math.log(OTHER_LIGHT):
-            # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
-            parts.append(brighter / math.sqrt(2.0))
-            lines.append(f"the strongest echoes of digitizer {row.digitizer} are {light / row.brightest:.2f} times as "
-                         "bright as the calibration's: another gain, or other surfaces")  # fmt: skip
-    growth = max(parts, default=0.0)
-    return growth, [f"calibration: {line}; the error of the constant grows by {100 * growth:.0f} %" for line in lines]
+        noise, which = system.digitizers.get(row.digitizer, system).noise_std, f"of digitizer {row.digitizer}"
+        compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
+        # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
+        light = found.brightest.get(row.digitizer)
+        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+    return growth, [f"{line}: the error of the constant grows by {growth:.0%}" for line in lines]
 
 
 def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,20 +33,13 @@ _REMEDY = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Trend:
+class Trend(NamedTuple):
     """What the brightness of the tie cells depends on most."""
 
-    name: str
+    doubt: str
+    """A sentence with what to do."""
     spread: float
     """Root mean square of what it changes against the places of the targets, relative."""
-    whole: float
-    """Difference of its largest and least effect, relative."""
-
-    def describe(self) -> str:
-        """Return what it is and what to do."""
-        share = f"{100 * self.whole:.0f} %"
-        return f"brightness changes with the {self.name} by {share} in the overlaps: {_REMEDY[self.name]}"
 
 
 def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustment, tuple[float, float, float]]:
@@ -76,10 +70,9 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     adjusted = adjust_constants(ties, anchors, columns)
     edge = float(np.std(adjusted.term_trials.sum(axis=1), ddof=1)) if len(ties.cell) else np.inf
     if not 0 < edge <= MOST_EDGE_ERROR:
-        found = "do not show it" if not np.isfinite(edge) or not edge else f"leave it uncertain by {100 * edge:.0f} %"
         raise InputError(
-            f"--scan-angle: the overlaps {found} at the edge of the swath; give strips that overlap by a third "
-            "or more, or leave --scan-angle out"
+            f"--scan-angle: the overlaps do not show the light at the edge of the swath to {MOST_EDGE_ERROR:.0%}; give "
+            "strips that overlap by a third or more, or leave --scan-angle out"
         )
     return adjusted, (most, *map(float, adjusted.terms))
 
@@ -106,7 +99,8 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
         used = np.isfinite(fit.residual)
         effect = columns[used] @ fit.terms - float(np.mean(at_targets[known] @ fit.terms))
         low, high = np.quantile(effect, [0.02, 0.98])
-        best, least = Trend(name, float(np.sqrt(np.mean(effect**2))), float(np.expm1(high - low))), fit.scatter
+        doubt = f"brightness changes with the {name} by {np.expm1(high - low):.0%} in the overlaps: {_REMEDY[name]}"
+        best, least = Trend(doubt, float(np.sqrt(np.mean(effect**2)))), fit.scatter
     return best
 
 
