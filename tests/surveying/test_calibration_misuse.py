@@ -259,3 +259,20 @@ def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, ca
         facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header)
         with pytest.raises(InputError, match="coordinates are in feet, packet vectors in metres"):
             sensor.refuse_units(SimpleNamespace(facts=facts), scan)
+
+
+def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, calibrated):
+    plain = load_calibration(calibrated / "cal.toml").channels[0]
+    found = {}
+    for more in ("geometry=backscatter", "geometry=hemispherical"):
+        targets = write_targets(tmp_path / "t.csv", more)
+        options = ("--targets", targets, "-o", tmp_path / "c.toml", "--divergence", 0.5, "--overwrite")
+        assert call("calibrate", calibrated / "a.las", *options).exit_code == 0
+        found[more] = load_calibration(tmp_path / "c.toml").channels[0]
+    aside = found["geometry=hemispherical"]
+    assert found["geometry=backscatter"].constant == plain.constant
+    assert aside.constant / plain.constant == pytest.approx(1 + 0.25 * 0.3 / 0.5)
+    assert aside.relative_error == pytest.approx(np.hypot(plain.relative_error, 0.5 * 0.15 / 1.15), rel=0.01)
+    done = call("calibrate", calibrated / "a.las", "--targets", write_targets(tmp_path / "t.csv", "geometry=8/d"),
+                "-o", tmp_path / "d.toml")  # fmt: skip
+    assert done.exit_code == 2 and "geometry must be backscatter or directional or hemispherical" in done.stderr

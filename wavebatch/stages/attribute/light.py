@@ -146,6 +146,9 @@ def light_error(echoes: EchoTable) -> np.ndarray:
     return np.where(np.isnan(fitted), lone, fitted)
 
 
+AIR_DOUBT = 0.5
+"""Relative error of the attenuation of the air where none is given: clear air has 0.1 to 0.5 dB/km."""
+
 BOUND_ERROR = 0.5
 """Least relative error of the light of an echo whose fit ended at a bound: what it lacks its neighbours have, so that
 sums over a pulse stay right."""
@@ -237,7 +240,8 @@ def normalize_amplitude(
     away = np.hypot(system.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
-    beyond = 2.0e-4 * np.log(10.0) * system.attenuation_error * np.abs(distance - reference)
+    air_error = system.attenuation_error or AIR_DOUBT * system.attenuation
+    beyond = 2.0e-4 * np.log(10.0) * air_error * np.abs(distance - reference)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),

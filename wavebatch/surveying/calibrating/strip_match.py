@@ -21,6 +21,7 @@ from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
 from wavebatch.surveying.calibrating.setting import measure_setting
@@ -38,9 +39,6 @@ SAME = 1e-3
 OTHER_DAY, OTHER_MONTH = 0.02, 0.05
 """Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
 are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
-
-AIR_DOUBT = 0.5
-"""Relative error of the attenuation of the air, for strips at other distances than the targets."""
 
 LEAST_AIR = 0.005
 """Relative change of the light from which other air on the same day is named."""

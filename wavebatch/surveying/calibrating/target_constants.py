@@ -104,7 +104,8 @@ def measure_target(
             f"{inset:.2f} m inside its outline, {LEAST_ECHOES} are needed"
         )
         return replace(blank, refused=reason, inset_m=round(inset, 3)), *nothing
-    constant = 4.0 * target.reflectance * np.cos(angle[used]) / rows["light"][used]
+    bright = target.reflectance * (1.0 + target.hot_spot)
+    constant = 4.0 * bright * np.cos(angle[used]) / rows["light"][used]
     relative = _by_channel(constant, rows["channel"][used])
     edge, edge_err = _compare_edge(relative, depth[used])
     result = replace(
@@ -116,7 +117,8 @@ def measure_target(
         strange=_share_strange(relative),
     )
     inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
-    error = float(np.sqrt(reflectance_error**2 + facing_err**2 + inner**2 + edge_err**2))
+    hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
+    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2))
     return replace(result, relative_error=error), rows[used], constant
 
 
