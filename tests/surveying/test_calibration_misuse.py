@@ -111,7 +111,7 @@ def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path,
 def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
     done = call("calibrate", dim_edges / "a.las", "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml",
                 "--scan-angle")  # fmt: skip
-    assert done.exit_code == 1 and "the overlaps do not show the light at the edge of the swath to 5%" in done.stderr
+    assert done.exit_code == 1 and "the overlaps do not show the light at the edge of the swath to 5 %" in done.stderr
 
 
 @pytest.fixture(scope="module")

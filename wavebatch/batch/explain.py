@@ -164,7 +164,7 @@ def _doubt_reflectance(report: RunReport) -> Iterator[str]:
     """More reflectances above 1 than metal, signs and wet roofs explain."""
     known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
     if report.above_one > MOST_ABOVE_ONE * known > 0:
-        share = f"{report.above_one / known:.0%}"
+        share = f"{100 * report.above_one / known:.0f} %"
         yield (
             f"{share} of the reflectances exceed 1, that of a white matt surface: the calibration is of another sensor "
             "or setting, a target's reflectance is wrong, or coordinates are not in metres"

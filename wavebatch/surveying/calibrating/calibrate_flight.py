@@ -131,12 +131,12 @@ def calibrate_flight(
 
 
 def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) -> tuple[Calibration, list[str]]:
-    """The calibration with what the overlaps leave unexplained in its errors where these do not hold it, and the
-    sentence about it."""
+    """The calibration with what the overlaps leave unexplained in its errors, and the sentence about it where it is
+    more than these."""
     spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
-    stated = max(row.relative_error for row in (*calibration.channels, *calibration.strips))
-    if spread < max(stated, LEAST_SPREAD):
+    if spread < LEAST_SPREAD:
         return calibration, []
+    stated = max(row.relative_error for row in calibration.strips)
     reason = _UNEXPLAINED if trend is None else trend.doubt
     note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
     channels, strips = (
@@ -144,7 +144,8 @@ def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) 
         for rows in (calibration.channels, calibration.strips)
     )
     whole = math.hypot(calibration.relative_error, spread)
-    return replace(calibration, relative_error=whole, channels=channels, strips=strips), [note]
+    notes = [note] if spread > stated else []
+    return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
 
 
 def _find_box(path: Path) -> _Box:

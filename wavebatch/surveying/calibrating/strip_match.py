@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import date
 
 import numpy as np
 
@@ -19,13 +18,16 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.files.las.header import decode_text
 from wavebatch.files.strip.reader import StripReader, StripScan
-from wavebatch.stages.attribute.light import AIR_DOUBT
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.angle_limits import sample_reference
-from wavebatch.surveying.calibrating.setting import measure_setting
-from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
+from wavebatch.surveying.calibrating.strip_conditions import (
+    compare_air,
+    compare_divergence,
+    compare_setting,
+    find_growth,
+)
+from wavebatch.surveying.calibrating.strip_echoes import see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 
@@ -35,23 +37,6 @@ one, and the error grows by the difference. Surveys of a sensor's strips agree w
 
 SAME = 1e-3
 """Relative difference up to which spacings and gains are equal: headers round them."""
-
-OTHER_DAY, OTHER_MONTH = 0.02, 0.05
-"""Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
-are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
-
-LEAST_AIR = 0.005
-"""Relative change of the light from which other air on the same day is named."""
-
-FAR = 1.3
-"""Ratio of distances from which the strip's and the targets' are named."""
-
-SAME_RATE = 1.02
-"""Ratio up to which pulse rates are equal."""
-
-OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
-"""Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
-one, other surfaces the other."""
 
 _CHAIN_SAMPLE = 2048
 """Waveforms on which two chains are compared."""
@@ -114,17 +99,17 @@ def match_strip(
             "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
         )
         return StripMatch(calibration, tuple(warnings))
-    growth, reasons = _find_growth(calibration, reader, sensor)
+    growth, reasons = find_growth(calibration, reader, sensor)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     if all(row.sha256 != own_strip for row in calibration.strips):
-        more, lines = _compare_setting(calibration, reader, scan, system, sensor)
+        more, lines = compare_setting(calibration, reader, scan, system, sensor)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
     if not calibration.relative_error:
         reasons.append(
             "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
             "the file"
         )
-    warnings += [*reasons, *_compare_divergence(calibration, system)]
+    warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
     pulses = _find_pulses(calibration, reader, scan, system, sensor)
@@ -150,7 +135,7 @@ def match_strip(
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
         rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
-    air = _compare_air(calibration, reader, sensor, attenuation, warnings)
+    air = compare_air(calibration, reader, sensor, attenuation, warnings)
     rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
     return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
@@ -244,88 +229,6 @@ def _pool_lengths(rows: list[ChannelConstant], digitizer: Digitizer) -> list[Cha
             replace(some[0], digitizer=digitizer.index, constant=float(constants.mean()), relative_error=error)
         )
     return pooled
-
-
-def _find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSource) -> tuple[float, list[str]]:
-    """Error that day, distance and sensor add to the constant, relative, and the warnings."""
-    parts, lines = [], []
-    day = read_day(reader)
-    if day and calibration.flight and day != calibration.flight:
-        apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
-        parts.append(OTHER_MONTH if apart > 30 else OTHER_DAY)
-        lines.append(
-            f"calibration: measured on {calibration.flight}, this strip was flown on {day}: the error of the constant "
-            f"grows by {100 * parts[-1]:.0f} %"
-        )
-    if calibration.distance and sensor.distance:
-        slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
-        parts.append(slope * abs(sensor.distance - calibration.distance))
-        ratio = sensor.distance / calibration.distance
-        if max(ratio, 1 / ratio) > FAR:
-            lines.append(
-                f"calibration: measured at {calibration.distance:.0f} m, this strip is {sensor.distance:.0f} m away: "
-                f"the air between adds {100 * parts[-1]:.1f} % to the error of the constant"
-            )
-    name = read_sensor_name(reader.facts)
-    if calibration.sensor and name and name != calibration.sensor:
-        lines.append(
-            f"calibration: measured with sensor {calibration.sensor!r}, the header of this strip names {name!r}; "
-            "bits, spacing, gain and pulse agree"
-        )
-    software = decode_text(reader.facts.header.generating_software).strip()
-    if calibration.software and software and software != calibration.software:
-        lines.append(f"calibration: measured on a file of {calibration.software!r}, this one is of {software!r}")
-    return float(np.sqrt(np.sum(np.square(parts)))), lines
-
-
-def _compare_air(
-    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None, warnings: list[str]
-) -> float:
-    """Relative error of a strip of the calibration's day that is given other air than the calibration had."""
-    day = read_day(reader)
-    if attenuation is None or not sensor.distance or (day and calibration.flight and day != calibration.flight):
-        return 0.0
-    off = 2.0e-4 * math.log(10.0) * sensor.distance * (attenuation - calibration.attenuation)
-    if abs(off) < LEAST_AIR:
-        return 0.0
-    warnings.append(
-        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:g} dB/km with "
-        f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
-        "in the error; give `wavebatch calibrate` the same --attenuation"
-    )
-    return abs(off)
-
-
-def _compare_setting(
-    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
-) -> tuple[float, list[str]]:
-    """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
-    found, growth, lines = measure_setting(reader, scan, sensor, calibration.attenuation), 0.0, []
-
-    def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
-        nonlocal growth
-        off = abs(math.log(value / known)) if value and known else 0.0
-        if off > math.log(most):
-            growth = max(growth, share * off)
-            lines.append(f"calibration: {line} {value:.4g}, where the calibration has {known:.4g}")
-
-    compare(found.rate, calibration.rate, SAME_RATE, 1.0, "another rate of pulses [1/s], so another energy:")
-    for row in calibration.channels:
-        noise, which = system.digitizers.get(row.digitizer, system).noise_std, f"of digitizer {row.digitizer}"
-        compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
-        # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
-        light = found.brightest.get(row.digitizer)
-        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
-    return growth, [f"{line}: the error of the constant grows by {growth:.0%}" for line in lines]
-
-
-def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
-    own, other = system.divergence, calibration.divergence
-    if own is not None and other is not None and abs(own / other - 1.0) > NEAR_PULSE - 1.0:
-        yield (
-            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "
-            f"one of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
-        )
 
 
 def _compare_decomposers(

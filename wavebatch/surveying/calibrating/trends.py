@@ -71,8 +71,8 @@ def fit_swath(ties: Ties, anchors: Anchors, seen: np.ndarray) -> tuple[Adjustmen
     edge = float(np.std(adjusted.term_trials.sum(axis=1), ddof=1)) if len(ties.cell) else np.inf
     if not 0 < edge <= MOST_EDGE_ERROR:
         raise InputError(
-            f"--scan-angle: the overlaps do not show the light at the edge of the swath to {MOST_EDGE_ERROR:.0%}; give "
-            "strips that overlap by a third or more, or leave --scan-angle out"
+            f"--scan-angle: the overlaps do not show the light at the edge of the swath to {100 * MOST_EDGE_ERROR:.0f} "
+            "%; give strips that overlap by a third or more, or leave --scan-angle out"
         )
     return adjusted, (most, *map(float, adjusted.terms))
 
@@ -99,7 +99,8 @@ def find_trend(ties: Ties, anchors: Anchors, seen: np.ndarray, adjusted: Adjustm
         used = np.isfinite(fit.residual)
         effect = columns[used] @ fit.terms - float(np.mean(at_targets[known] @ fit.terms))
         low, high = np.quantile(effect, [0.02, 0.98])
-        doubt = f"brightness changes with the {name} by {np.expm1(high - low):.0%} in the overlaps: {_REMEDY[name]}"
+        share = f"{100 * np.expm1(high - low):.0f} %"
+        doubt = f"brightness changes with the {name} by {share} in the overlaps: {_REMEDY[name]}"
         best, least = Trend(doubt, float(np.sqrt(np.mean(effect**2)))), fit.scatter
     return best
 
