@@ -94,7 +94,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Reading": ("direction", "headerless", "recursive"),
     "Position of the sensor": ("trajectory", "lever_arm", "crs", "flight_height"),
     "Air and light": (
-        "attenuation", "attenuation_error", "visibility", "wavelength", "pulse_energy", "reflectance_error",
+        "attenuation", "attenuation_error", "visibility", "wavelength", "pulse_energy", "reflectance_error", "scan_angle",
     ),
     "Which points": (
         "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",

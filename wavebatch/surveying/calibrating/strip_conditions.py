@@ -41,6 +41,20 @@ OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
 one, other surfaces the other."""
 
 
+def doubt_calibration(calibration: Calibration) -> Iterator[str]:
+    """Yield what makes a calibration doubtful for any strip."""
+    if not any(row.is_described for row in calibration.channels):
+        yield (
+            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
+            "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
+        )
+    if not min(row.relative_error for row in (calibration, *calibration.channels)):
+        yield (
+            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
+            "the file"
+        )
+
+
 def find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSource) -> tuple[float, list[str]]:
     """Error that day, distance and sensor add to the constant, relative, and the warnings."""
     parts, lines = [], []

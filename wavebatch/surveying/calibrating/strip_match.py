@@ -25,6 +25,7 @@ from wavebatch.surveying.calibrating.strip_conditions import (
     compare_air,
     compare_divergence,
     compare_setting,
+    doubt_calibration,
     find_growth,
 )
 from wavebatch.surveying.calibrating.strip_echoes import see_channels
@@ -92,23 +93,14 @@ def match_strip(
     -----
     docs/algorithms.md 5.2.
     """
-    warnings: list[str] = []
+    warnings = list(doubt_calibration(calibration))
     if not any(row.is_described for row in calibration.channels):
-        warnings.append(
-            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
-            "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
-        )
         return StripMatch(calibration, tuple(warnings))
     growth, reasons = find_growth(calibration, reader, sensor)
     own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
     if all(row.sha256 != own_strip for row in calibration.strips):
         more, lines = compare_setting(calibration, reader, scan, system, sensor)
         growth, reasons = math.hypot(growth, more), [*reasons, *lines]
-    if not calibration.relative_error:
-        reasons.append(
-            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
-            "the file"
-        )
     warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
