@@ -4,7 +4,6 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
@@ -12,6 +11,7 @@ from wavebatch.kernels.signal.filters import (
     gaussian_taps,
     refine_peaks,
 )
+from wavebatch.kernels.signal.runs import find_runs
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     find_peaks,

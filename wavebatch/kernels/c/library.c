@@ -14,3 +14,4 @@
 #include "fit.h"
 #include "next_echo.h"
 #include "decompose.h"
+#include "signal.h"

@@ -23,8 +23,8 @@ from wavebatch.stages.decompose.solve import (
     fit_candidates,
     fit_gaussian,
     make_settings,
-    samples_of,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 

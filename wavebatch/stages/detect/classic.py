@@ -11,7 +11,6 @@ from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_antisymmetric,
@@ -19,7 +18,7 @@ from wavebatch.kernels.signal.filters import (
     filter_symmetric,
     slope_taps,
 )
-from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
+from wavebatch.kernels.signal.runs import find_runs, highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
