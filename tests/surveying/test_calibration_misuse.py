@@ -63,9 +63,9 @@ def calibrate(folder, *options, strips=("a.las", "b.las")):
     return load_calibration(folder / "cal.toml"), done.stderr
 
 
-def offsets(folder, out):
-    """Reflectance of level ground in both strips over the truth, less 1, and the error that gamma states; f8 (2, n)."""
-    columns = "level_reflectance,backscatter_coefficient,backscatter_coefficient_err"
+def offsets(folder, out, column="level_reflectance"):
+    """Reflectance of the ground in both strips over the truth, less 1, and the error that gamma states; f8 (2, n)."""
+    columns = f"{column},backscatter_coefficient,backscatter_coefficient_err"
     run(folder, out, "a.las", "b.las", "--columns", columns)
     parts = []
     for name in "ab":
@@ -73,7 +73,7 @@ def offsets(folder, out):
         x, y = cloud["x"] - EAST, cloud["y"] - NORTH
         inside = (np.abs(x % 20 - 10) < 9) & (np.abs(y % 20 - 10) < 9)
         target = (x >= 40) & (x < 60) & (y >= 0) & (y < 20)
-        off = cloud["level_reflectance"] / np.where(target, 0.3, fields(x, y)) - 1
+        off = cloud[column] / np.where(target, 0.3, fields(x, y)) - 1
         stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
         parts.append(np.stack([off, stated])[:, inside & np.isfinite(off)])
     return np.concatenate(parts, axis=1)
@@ -106,6 +106,27 @@ def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path,
     assert found.channels[0].relative_error < 0.04
     off, _ = offsets(dim_edges, tmp_path)
     assert abs(np.median(off)) < 0.01 and np.quantile(np.abs(off), 0.9) < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("falloff", "slope", "seed"), [(0.1, (0.0, 0.2), 21), (0.2, (0.35, 0.1), 22), (0.0, (0.1, 0.1), 23)]
+)
+def test_hillsides_under_dim_edges_have_errors_that_hold_and_a_term_that_is_right(tmp_path, falloff, slope, seed):
+    ground = [replace(facet, slope=slope) for facet in GROUND]
+    a = Sensor(**BASE, light=LIGHT, falloff=falloff)
+    write_strip(tmp_path / "a.las", ground, a, 20_000, seed=seed)
+    b = replace(a, start=(128, 100), heading=270.0, time=START + 600)
+    write_strip(tmp_path / "b.las", ground, b, 20_000, seed=seed + 10)
+    write_targets(tmp_path / "t.csv")
+    _, said = calibrate(tmp_path)
+    assert ("brightness changes with the scan angle" in said) == (falloff > 0)
+    off, stated = offsets(tmp_path, tmp_path / "plain", "reflectance")
+    assert np.mean(np.abs(off) < stated) > 0.5
+    found, _ = calibrate(tmp_path, "--scan-angle")
+    assert np.exp(-sum(found.swath[1:])) == pytest.approx(1 - falloff, abs=0.03)
+    off, _ = offsets(tmp_path, tmp_path / "fitted", "reflectance")
+    assert abs(np.median(off)) < 0.005 and np.quantile(np.abs(off), 0.9) < 0.03
 
 
 def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
