@@ -113,6 +113,11 @@ def test_mean_without_quiet_samples_is_zero():
     assert number.tolist() == [0, 0]
 
 
+def test_mean_of_a_single_quiet_sample_is_that_sample():
+    mean, number = quiet_mean(np.full((5, 1), 9.0, np.float32), np.arange(5)[:, None] == 3)
+    assert mean.tolist() == [9] and number.tolist() == [1]
+
+
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4), np.array([1.0])])
 @pytest.mark.parametrize("s", [1, 4, 50])
 def test_symmetric_filters_equal_a_double_loop(rng, taps, s):

@@ -257,9 +257,9 @@ def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
     truth = footprints.write_strip(tmp_path / "s.las", [Plane()], Flight(energy_spread=0.05), 2000)
     shuffled = zip(truth.gps_time, rng.permutation(truth.energy), strict=True)
     (tmp_path / "e.csv").write_text("time,energy\n" + "\n".join(f"{time:.9f},{one:.6f}" for time, one in shuffled))
-    options = ("--columns", "+amplitude_normalized", "--pulse-energy", tmp_path / "e.csv")
+    options = ("--columns", "+amplitude_normalized", "--energy", tmp_path / "e.csv")
     done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", *options)
-    assert done.exit_code == 4 and "--pulse-energy e.csv contradicts the strip" in done.stderr
+    assert done.exit_code == 4 and "--energy e.csv contradicts the strip" in done.stderr
 
 
 def test_degrees_without_a_crs_are_named(tmp_path):

@@ -157,8 +157,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
             job = replace(job, chain=_set_parameters(reader, scan, job.chain))
-            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
-            if energy is not None:
+            energy = find_pulse_energy(reader, scan, job.pulse_energy) if needs_sensor(job.chain) else None
+            if job.pulse_energy is not None and energy is not None:
                 check_energies(reader, scan, energy)
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
                       required=False)
 @shared.chain_options
 @shared.system_option
+@shared.energy_option
 @shared.sensor_options
 @shared.direction_option
 @shared.html_option
@@ -120,7 +121,7 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
 
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     request = replace(request, force=options["force"])
-    names = ("attenuation", "divergence", "reflectance_error", "direction", "scan_angle")
+    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy", "scan_angle")
     figures = {name: options[name] for name in names}
     return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
 

@@ -15,3 +15,5 @@
 #include "next_echo.h"
 #include "decompose.h"
 #include "signal.h"
+#include "elementary.h"
+#include "wdz.h"

@@ -67,7 +67,7 @@ def backscatter(
     Parameters
     ----------
     constant : float, 1/(m2 count ns)
-        C' = 4 rho cos(alpha) transmission / (R^2 amplitude sigma) of a reference; C_cal is C' pi divergence^2 / 4.
+        Calibration constant C' (docs/algorithms.md 5).
     distance : float (m,), m
         Sensor to echo.
     amplitude, sigma : float (m,), count, ns
@@ -79,10 +79,6 @@ def backscatter(
     -------
     float64 (m,)
         NaN where the distance is not positive.
-
-    References
-    ----------
-    Wagner et al. (2010); docs/algorithms.md 5.
     """
     distance = known_distance(distance)
     light = distance * distance * np.asarray(amplitude, np.float64) * np.asarray(sigma, np.float64)

@@ -78,7 +78,7 @@ def check_energies(reader: StripReader, scan: StripScan, energy: PulseEnergy) ->
     doubt = judge_energies(light[order], np.concatenate([block.pulse_energy for block in blocks])[order])
     if doubt:
         raise InputError(
-            f"{reader.facts.path}: --pulse-energy {energy.source} contradicts the strip: {doubt}; check its times, or "
+            f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
             "leave it out"
         )
 

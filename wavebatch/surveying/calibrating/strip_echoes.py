@@ -18,12 +18,13 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.header import decode_text
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.calibrating.setting import Setting, measure_setting
+from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
@@ -63,6 +64,7 @@ class EchoSource:
     system: SystemPulse
     sensor: SensorSource
     setting: Setting
+    energy: PulseEnergy | None = None
 
     @property
     def path(self) -> Path:
@@ -74,7 +76,7 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in self.reader.all_blocks(self.scan, _BLOCK):
+        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
             near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
             if len(near):
                 part = self.sensor.fill(block.rows(near))
@@ -90,6 +92,7 @@ def open_source(
     request: Request,
     attenuation: float,
     direction: str,
+    energy: str | None,
 ) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
@@ -104,6 +107,8 @@ def open_source(
         Of the air, one way [dB/km].
     direction : str
         Where packet vectors point: auto, toward or away.
+    energy : str or None
+        Of each emitted pulse; see `find_pulse_energy`.
 
     Yields
     ------
@@ -123,7 +128,10 @@ def open_source(
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
         setting = measure_setting(reader, scan, source, attenuation)
-        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, setting)
+        sent = find_pulse_energy(reader, scan, energy)
+        if energy is not None and sent is not None:
+            check_energies(reader, scan, sent)
+        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, setting, sent)
 
 
 def with_energy(chain: Chain) -> Chain:

@@ -62,6 +62,8 @@ class CalibrationOptions:
     """Where packet vectors point: auto, toward or away."""
     scan_angle: bool = False
     """Fit how the light depends on the scan angle, where strips overlap."""
+    energy: str | None = None
+    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
 
 
 def open_strip_source(path: Path, options: CalibrationOptions):
@@ -73,6 +75,7 @@ def open_strip_source(path: Path, options: CalibrationOptions):
         request=options.request,
         attenuation=options.attenuation,
         direction=options.direction,
+        energy=options.energy,
     )
 
 
