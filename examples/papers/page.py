@@ -291,7 +291,7 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
             failed = sum(bool(error) for _, _, error in drawn)
             fine &= accepted and bool(tables) and not failed
             banded, inside = count_accepted(tables)
-            mark = markup.identifier(paper.script)
+            mark = paper.script
             link = markup.Cell(f'<a href="#{mark}">{markup.text(paper.title)}</a>')
             rows.append([link, banded, inside, len(drawn) - failed])
             inner = []
