@@ -101,4 +101,5 @@ lint: $(VENV)/.test
 
 clean:
 	rm -rf $(VENV) papers.html $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	rm -rf wavebatch/kernels/_kernels.* wavebatch/kernels/.build-*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -128,6 +128,7 @@ int main(void) {
         {"table", read, none, 0, 0.2, 0, 4, 0, 0, 1, 0},
         {"log-normal", fixed, none, 0, 0.2, 0, 0, 0, 0, 1, 0},
         {"log-normal of the waveform", moving, none, 0, 0, 0, 1, 0, 1, 0, 0},
+        {"log-normal, skews asked for free", fixed, none, 0, 0, 0.1, 1, 0, 0, 1, 0},
     };
     make_strip(&strip);
     for (size_t i = 0; i < sizeof cases / sizeof *cases; i++)

@@ -10,6 +10,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bench import against, peers
+from bench import jobs_model as jobs
 from bench.against import compare_runs, format_paired, simulate_strips
 from bench.cases import CASES, list_cases, make_scene
 from bench.jobs_model import Parts
@@ -19,8 +21,6 @@ from bench.stability import FAILURES, count_changes, count_failures
 from click.testing import CliRunner
 
 import wavebatch
-from bench import against, peers
-from bench import jobs_model as jobs
 from wavebatch.cli import main
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError

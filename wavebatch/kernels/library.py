@@ -140,6 +140,8 @@ class Samples(NamedTuple):
             raise ValueError(f"gaps do not have the shape of {n} waveforms of {s} samples")
         if not (np.isfinite(baseline).all() and np.isfinite(std).all() and (std > 0).all()):
             raise ValueError("levels and noise must be finite, and the noise above 0")
+        if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
+            raise ValueError("samples must be finite where they are not missing")
         flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
         gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
         return Samples(np.ascontiguousarray(counts), *flat, gaps)
