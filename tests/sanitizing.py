@@ -21,10 +21,12 @@ import numpy as np
 
 from wavebatch.kernels import library
 from wavebatch.kernels.build_kernels import compile_library, find_compiler
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.decompose import Samples, decompose_clusters, promise_echoes
+from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
+from wavebatch.kernels.fit.decompose import decompose_clusters, promise_echoes
 from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import PulseShape, PulseTable
+from wavebatch.kernels.library import Samples
+from wavebatch.kernels.signal.maxima import find_maxima, quiet_levels
 
 FLAGS = ("-g", "-O1", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 SETTINGS = {
@@ -162,10 +164,29 @@ def solve(seed: int) -> bool:
     except (ValueError, MemoryError) as error:
         assert str(error), seed
         return False
+    look_for(problem[0], problem[1], np.random.default_rng(seed))
     number = problem[2].number
     assert len(found.number) == len(promise) == len(number) and (found.number > 0).all(), seed
     assert len(found.parameters) == found.number.sum() == len(found.errors) == len(found.at_bound), seed
     return True
+
+
+def look_for(samples: Samples, candidates: Candidates, rng: np.random.Generator) -> None:
+    """The functions of whole waveforms on the samples of a problem, with any options."""
+    n, s = samples.counts.shape
+    level = samples._replace(baseline=samples.baseline if samples.baseline.ndim == 1 else samples.baseline[:, 0])
+    reach, recovery = (int(value) for value in rng.integers(0, 3 * s + 2, 2))
+    quiet_levels(level, float(10 ** rng.uniform(-9, 12)), reach, recovery)
+    taps = rng.normal(size=int(rng.integers(1, 2 * s + 2)))
+    for broad in (0.0, float(10 ** rng.uniform(-2, 3))):
+        found = find_maxima(samples, float(rng.choice([0.0, 2.0])), float(10 ** rng.uniform(-2, 3)), broad, taps)
+        assert len({len(column) for column in found}) == 1
+    order = np.lexsort((candidates.time, candidates.waveform))
+    ordered = Candidates(*(field[order] for field in candidates))
+    tail = rng.integers(0, 2 * s, len(order)) if rng.random() < 0.5 else None
+    margin, reach, most = int(rng.integers(0, 99)), int(rng.integers(0, 99)), int(rng.integers(1, 9))
+    clusters = cluster_candidates(samples, ordered, margin=margin, reach=reach, most=most, tail=tail)
+    assert clusters.number.sum() == len(order)
 
 
 def damage_strips(folder: Path, cases: int, seed: int) -> list[str]:
