@@ -67,7 +67,7 @@ def learn_shape(samples: np.ndarray, spacing: float, reference: Reference) -> Ou
     Returns
     -------
     OutgoingShape or None
-        None with too few pulses.
+        None with too few pulses, or where they are no pulses.
 
     Notes
     -----
@@ -87,7 +87,10 @@ def learn_shape(samples: np.ndarray, spacing: float, reference: Reference) -> Ou
             return None
         fits = fit_gaussians(stack, reference.width, goal=GOAL * float(np.sqrt(np.mean(stack.error**2))))
         time, height = _align(signal, time + fits[-1].datum, height, fits[-1].components)
-    return _describe(stack, fits[-1], spacing, len(good))
+        if not (np.isfinite(time).all() and (height > 0).all()):
+            return None
+    shape = _describe(stack, fits[-1], spacing, len(good))
+    return shape if shape.fwhm > 0 else None
 
 
 def _align(

@@ -136,7 +136,7 @@ def _add(found: _Found, piece: Piece, every: int) -> None:
     for (rows,) in group_rows(segments, sent):
         start = (segments.start * segments.unit / segments.spacing)[rows]
         found.outgoing.setdefault(int(code_segments(segments, rows[:1])[0]), []).append((piece.samples(rows), start))
-    for (rows,) in group_rows(segments, returning[chosen[returning]]):
+    for (rows,) in group_rows(segments, returning[chosen[returning] & (segments.length[returning] > 1)]):
         found.steps.append(np.abs(np.diff(piece.samples(rows).astype(np.int64), axis=1)).mean(axis=1))
 
 
