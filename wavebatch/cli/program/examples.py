@@ -86,6 +86,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "calibrate": (
         ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
          "for `run --calibration cal.toml`"),
+        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
+         "with light that falls across the swath"),
     ),
     "bench": (
         ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
@@ -102,7 +104,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Reading": ("direction", "headerless", "recursive"),
     "Position of the sensor": ("trajectory", "lever_arm", "crs", "flight_height"),
     "Air and light": (
-        "attenuation", "attenuation_error", "visibility", "wavelength", "energy", "reflectance_error",
+        "attenuation", "attenuation_error", "visibility", "wavelength", "energy", "reflectance_error", "scan_angle",
     ),
     "Which points": (
         "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",

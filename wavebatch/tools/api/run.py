@@ -24,7 +24,7 @@ from wavebatch.files.pulse_energy import NONE
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
-from wavebatch.surveying.calibration import needs_sensor
+from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -306,6 +306,7 @@ def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
     value, error = attenuation if isinstance(attenuation, tuple) else (attenuation, 0.0)
     if not (0 <= value <= 100 and 0 <= error <= 100):
         raise ConfigError(f"attenuation: {value:g} +- {error:g} dB/km must lie in 0 to 100; clear air has 0.1 to 0.5")
+    check_attenuation(value)
     return float(value), float(error)
 
 
