@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from click.testing import CliRunner
+from pulse_files import Pulse, PulseFile, Sampling, bell
 from strips import vlr
 
 from wavebatch.cli import main
@@ -232,6 +233,8 @@ def build_inputs(base: Path) -> None:
     _sound("voxelize", base / "strip.las", "-o", base / "voxels.npz", "--size", "2")
     _sound("slice", base / "strip.las", "--cube", base / "cube.npz", "--lines", "0:2")
     _write_places(base)
+    echoes = [Pulse([[(2000, bell(50, 10 + 0.1 * i, 90, 2.0))]], time=10 * i) for i in range(60)]
+    PulseFile({1: (Sampling(scale=0.5, duration_bits=32),)}, echoes).write(base / "strip.pls")
     target = ["--targets", base / "targets.csv", "-o", base / "calibrated.toml"]
     _sound("calibrate", base / "strip.las", *target)
 
