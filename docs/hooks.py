@@ -1,7 +1,8 @@
 """What the documentation takes from the program itself when the site is built: commands, stages, the Python API.
 
 mkdocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A line `<!-- commands -->`, `<!-- stages -->`,
-`<!-- api -->` or `<!-- modules ROOM -->` of a page is replaced by what the function of that name returns.
+`<!-- api -->`, `<!-- options -->` or `<!-- modules ROOM -->` of a page is replaced by what the function of that name
+returns.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import click
 
 import wavebatch
+from wavebatch.batch.options import describe_options
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.program.command import group_options
 from wavebatch.cli.program.examples import EXAMPLES
@@ -26,7 +28,7 @@ from wavebatch.stages.chain_file import format_step
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """The page with the generated parts in their places."""
-    makers = {"commands": commands, "stages": stages, "api": api, "modules": modules}
+    makers = {"commands": commands, "stages": stages, "api": api, "options": options, "modules": modules}
     return re.sub(r"(?m)^<!-- (\w+)((?: \w+)*) -->$", lambda found: makers[found[1]](*found[2].split()), markdown)
 
 
@@ -124,6 +126,16 @@ def _plain(text: str) -> str:
         piece if piece.startswith("`") else re.sub(r"([*_\[\]<>#])", r"\\\1", piece) for piece in pieces
     )
     return re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[docs/\1](\1)", plain)
+
+
+def options() -> str:
+    """The keywords of `wavebatch.run`: the fields of RunOptions."""
+    lines = ["| keyword | type | meaning |", "|---|---|---|"]
+    for entry in describe_options().replace("\n    ", "\t").splitlines():
+        head, text = entry.split("\t")
+        name, kind = head.split(" : ", 1)
+        lines.append(f"| `{name}` | `{_cell(kind)}` | {_cell(_plain(text))} |")
+    return "\n".join(lines)
 
 
 def api() -> str:

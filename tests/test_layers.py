@@ -15,7 +15,7 @@ RANK = {name: rank for rank, name in enumerate(ROOMS)}
 
 INSIDE = {
     "batch": [
-        {"counts", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
+        {"counts", "options", "output_rows", "workers"}, {"selection"}, {"job"}, {"unit"},
         {"explain", "neighbour_pass", "row_transfer"}, {"report_file"}, {"strip_task"}, {"preflight"}, {"run"},
     ],
     "surveying/measuring": [{"lone_echoes"}, {"noise_and_width"}, {"residuals"}, {"misfit", "learn_pulse"}],

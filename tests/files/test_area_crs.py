@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from strips import add_record
 
 import wavebatch
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.selection import build_selection
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
@@ -294,7 +295,7 @@ def test_an_area_that_misses_the_strip_is_named_with_both_extents(strip, tmp_pat
 
 def test_a_selection_keeps_the_corners_of_its_file_for_the_report(strip, tmp_path):
     degrees = _write(tmp_path / "deg.geojson", _project(_box(strip), "EPSG:32633", "EPSG:4326"))
-    chosen = build_selection(polygon=degrees)
+    chosen = build_selection(RunOptions(polygon=degrees))
     facts = type("F", (), {"path": strip, "header": read_header(strip)})()
     placed = chosen.place(facts)
     assert placed.describe() == chosen.describe() and placed.areas != chosen.areas

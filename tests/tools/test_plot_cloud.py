@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from plot_tools import POINTS, write_cloud
 
 from wavebatch.cli import main
+from wavebatch.core.condition import read_flags
 from wavebatch.core.echoes import COLUMNS, EchoFlag
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
-from wavebatch.core.flag_names import read_flags
 from wavebatch.files.cloud import echo_reader as io_cloud
 from wavebatch.files.cloud.column_reader import ColumnReader
 from wavebatch.tools.plots import raster, values

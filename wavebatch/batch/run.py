@@ -18,9 +18,10 @@ from typing import Any
 from wavebatch import __version__
 from wavebatch.batch.counts import RunReport
 from wavebatch.batch.job import StripJob
+from wavebatch.batch.options import RunOptions
 from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, load_flight, with_flight
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
-from wavebatch.batch.strip_task import BatchOptions, StripTask
+from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.dask_cluster import Cluster
 from wavebatch.batch.workers.processes import WorkerDied, Workers
 from wavebatch.core import interrupts
@@ -93,14 +94,14 @@ class BatchResult:
 
 
 def run_batch(
-    jobs: Sequence[StripJob], options: BatchOptions, on_event: Callable[[dict[str, Any]], None] | None = None
+    jobs: Sequence[StripJob], options: RunOptions, on_event: Callable[[dict[str, Any]], None] | None = None
 ) -> BatchResult:
     """Write cloud and report of every strip; a strip that fails does not stop the others.
 
     Parameters
     ----------
     jobs : sequence of StripJob
-    options : BatchOptions
+    options : RunOptions
     on_event : callable, optional
         Called with a dictionary for each event; its key `event` is flight, worker (one that does not fit),
         start, unit, written, skipped or failed.
@@ -149,7 +150,7 @@ def _drop_flight(folder: Path) -> None:
 
 def _survey_flight(
     jobs: Sequence[StripJob],
-    options: BatchOptions,
+    options: RunOptions,
     workers: Workers | Cluster,
     on_event: Callable[[dict[str, Any]], None] | None,
 ) -> SavedSurvey | None:
@@ -182,7 +183,7 @@ class _Batch:
     def __init__(
         self,
         jobs: Sequence[StripJob],
-        options: BatchOptions,
+        options: RunOptions,
         workers: Workers | Cluster,
         on_event: Callable[[dict[str, Any]], None] | None,
     ) -> None:

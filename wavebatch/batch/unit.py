@@ -99,7 +99,7 @@ class Prepared:
     @property
     def _wanted(self) -> set[str]:
         """Columns that are written, or that decide what is written."""
-        return {*self.job.options.columns, *self.selector.needed}
+        return {*self.job.columns, *self.selector.needed}
 
 
 def list_carried(late: Iterable[Step]) -> tuple[str, ...]:
@@ -141,8 +141,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice = try_chain(reader, scan, make_choice(reader, scan, job.chain, job.request), job.request)
             if job.request.describe(job.chain) is not None:
                 choice = replace(choice, chain=job.extend(choice.chain))
-            columns = without_columns(job.options.columns, job.chain, choice.chain)
-            job = replace(job, chain=choice.chain, options=replace(job.options, columns=columns))
+            columns = without_columns(job.columns, job.chain, choice.chain)
+            job = replace(job, chain=choice.chain, columns=columns)
             surveyed = time.perf_counter()
             if job.chain.second_step is not None:
                 refuse_units(reader, scan)
@@ -153,7 +153,8 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
-            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
+            energy = job.options.pulse_energy
+            energy = None if energy is None else find_pulse_energy(reader, scan, str(energy))
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()
             units = reader.unit_count()

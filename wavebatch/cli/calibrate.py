@@ -5,12 +5,13 @@ Only reads options and prints; the work is in `wavebatch.surveying.calibrating.t
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
 from wavebatch.cli.messages import count, format_json, talk
 from wavebatch.core.units import format_relative
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("strips", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="STRIP...")
-@shared.recursive_option
+@shared.declared("recursive")
 @shared.file_option("--targets", required=True,
                     text="Targets: GeoJSON polygons with the property reflectance, in WGS 84, in the CRS that the file "
                     "names, or in the coordinates of the strips; or CSV with reflectance and x, y, radius or vertices, "
@@ -46,7 +47,7 @@ if TYPE_CHECKING:
 @shared.chain_options
 @shared.system_option
 @shared.sensor_options
-@shared.direction_option
+@shared.declared("direction")
 @shared.html_option
 @shared.common_options("overwrite")
 def calibrate(
@@ -110,13 +111,13 @@ def calibrate(
 def _read_options(options: dict[str, Any]) -> CalibrationOptions:
     """How to measure; pulse and chain are chosen as `wavebatch run` chooses them."""
     from wavebatch.surveying.calibrating.targets import CalibrationOptions
-    from wavebatch.tools.api.run import find_request
+    from wavebatch.tools.api.run import find_request, read_sensor
 
-    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
-    request = replace(request, force=options["force"])
+    asked = shared.from_options(RunOptions, options)
+    chain, request = find_request(asked)
     names = ("attenuation", "divergence", "reflectance_error", "direction")
     figures = {name: options[name] for name in names}
-    return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
+    return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
 
 
 def _list_report(flight: FlightCalibration) -> dict[str, Any]:

@@ -20,9 +20,9 @@ from wavebatch.cli.messages import count, print_json, print_text, printable, row
 from wavebatch.cli.options import (
     clouds_argument,
     common_options,
+    declared,
     file_option,
     output_option,
-    recursive_option,
     where_option,
 )
 from wavebatch.core.condition import Condition
@@ -49,7 +49,7 @@ _ZONE = ("dead_zone_m", "dead_zone_err_m")
 
 @click.command()
 @clouds_argument
-@recursive_option
+@declared("recursive")
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
 @file_option("--polygons", text="Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the "

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
 import numpy as np
 
+from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.suggest import nearest
 
 MOST_CHARACTERS = 2000
 """Longest text; longer ones are made by programs, and would be slow on every point."""
@@ -244,3 +246,31 @@ def _compare(tree: tuple, values: Mapping[str, np.ndarray], n: int) -> Truth:
     known = np.broadcast_to(~(np.isnan(left) | np.isnan(right)), n)
     met = np.broadcast_to(_COMPARISONS[sign](left, right), n)
     return known & met, known & ~met
+
+
+def read_flags(names: Sequence[str], option: str = "") -> int:
+    """Return the bits of flags given by names.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Each one name, or several separated by commas; in any case of letters.
+    option : str, optional
+        For the message, e.g. "--drop-flags".
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ConfigError
+        For an unknown name.
+    """
+    bits = 0
+    for name in (part.strip().upper() for text in names for part in text.split(",")):
+        if name not in EchoFlag.__members__:
+            where = f"{option}: " if option else ""
+            raise ConfigError(f"{where}flag {name!r} does not exist; {nearest(name, EchoFlag.__members__)}")
+        bits |= int(EchoFlag[name])
+    return bits

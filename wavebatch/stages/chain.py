@@ -9,16 +9,16 @@ from __future__ import annotations
 import inspect
 import re
 import time
-import types
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from wavebatch.core.echoes import COLUMNS, Column, EchoTable
 from wavebatch.core.errors import ConfigError, StageError
+from wavebatch.core.schema import Range, read_hint
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.clean import clean_block
 
@@ -33,13 +33,6 @@ KINDS: dict[str, tuple[tuple[str, ...], type]] = {
 _SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
 _ENTRY = re.compile(r"^(\w+)(?: :.*)?$", re.MULTILINE)
 """Heading of a section of a numpydoc docstring, and of a parameter in it."""
-
-
-class Range(NamedTuple):
-    """Least and largest value of a number, as in `threshold: Annotated[float, Range(0, 1e6)] = 4.0`."""
-
-    low: float
-    high: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,25 +169,9 @@ def _read_parameters(name: str, kind: str, function: Callable) -> dict[str, Para
             continue
         if parameter.default is parameter.empty or not meanings.get(key):
             raise StageError(f"stage {name}: parameter {key} needs a default and an entry under Parameters")
-        kinds, choices, limits = _read_hint(hints[key])
+        kinds, choices, limits = read_hint(hints[key])
         parameters[key] = Parameter(key, kinds, parameter.default, meanings[key], choices, limits)
     return parameters
-
-
-def _read_hint(hint: Any) -> tuple[tuple[type, ...], tuple[Any, ...] | None, Range | None]:
-    """Types, choices and range that an annotation allows."""
-    if typing.get_origin(hint) is typing.Annotated:
-        hint, *notes = typing.get_args(hint)
-        limits = next((note for note in notes if isinstance(note, Range)), None)
-        return (*_read_hint(hint)[:2], limits)
-    if typing.get_origin(hint) is typing.Literal:
-        choices = typing.get_args(hint)
-        return tuple({type(choice) for choice in choices}), choices, None
-    if typing.get_origin(hint) in (types.UnionType, typing.Union):
-        kinds, choices, limits = zip(*map(_read_hint, typing.get_args(hint)), strict=True)
-        chosen = next((choice for choice in choices if choice is not None), None)
-        return sum(kinds, ()), chosen, next((limit for limit in limits if limit is not None), None)
-    return (hint,), None, None
 
 
 def _split_docstring(function: Callable) -> tuple[str, dict[str, str]]:

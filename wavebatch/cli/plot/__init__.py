@@ -83,7 +83,7 @@ def waveform(strip: Path, output: Path, **options: Any) -> None:
 
     Exit code: 0 done, 1 the strip cannot be read or the picture cannot be written, 2 wrong usage.
     """  # fmt: skip
-    from wavebatch.core.flag_names import read_flags
+    from wavebatch.core.condition import read_flags
     from wavebatch.tools.plots.packets import Wanted
 
     if options["flags_with"] and (options["packets"] or options["point_numbers"] or options["times"]):
@@ -138,6 +138,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
     ranges: compute the distances of the echoes from the sensor, too, if its position is known.
     """
+    from wavebatch.batch.options import RunOptions
     from wavebatch.files.strip.reader import StripReader
     from wavebatch.surveying.choose_chain import make_choice
     from wavebatch.surveying.systems.saved_check import check_saved
@@ -145,7 +146,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
     from wavebatch.tools.plots.packets import find_places
     from wavebatch.tools.plots.waveform import add_ranges, describe_chain, read_views
 
-    chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
+    chain, request = find_request(shared.from_options(RunOptions, options))
     opened = StripReader(strip, direction=options["direction"], headerless=options["headerless"])
     with opened as reader, reader.scan() as scan:
         check_saved(reader, scan, request.system and request.system.survey, force=options["force"])
@@ -162,7 +163,7 @@ def _view(strip: Path, wanted: Any, options: dict[str, Any], *, ranges: bool) ->
 
 @plot.command()
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
 @click.option("--column", "columns", required=True, multiple=True, shell_complete=complete_columns,
               help="Extra dimension or standard field; echo_flags counts flags. May be repeated: columns of one unit "
@@ -260,15 +261,14 @@ def _refuse_for_flags(options: dict[str, Any]) -> None:
 
 @plot.command(name="map")
 @shared.clouds_argument
-@shared.recursive_option
+@shared.declared("recursive")
 @_output
 @click.option("--column", shell_complete=complete_columns,
               help="Extra dimension or standard field; not needed for count and density.")
 @click.option("--statistic", type=click.Choice(["mean", "median", "min", "max", "count", "density"]), default="mean",
               show_default=True, help="Statistic of the values in a cell; density is points per square metre.")
 @click.option("--size", type=float, metavar="M", help="Side of a cell [m].  [default: gives a few points per cell]")
-@click.option("--bounds", callback=shared.floats_reader("WEST,SOUTH,EAST,NORTH"), metavar="W,S,E,N",
-              help="Part to show: west, south, east, north [m].  [default: all]")
+@shared.floats_option("--bounds", "W,S,E,N", "Part to show: west, south, east, north [m].  [default: all]")
 @shared.selection_options
 @shared.common_options("overwrite", "json", "quiet")
 def map_(clouds: Sequence[Path], column: str | None, output: Path, **options: Any) -> None:
