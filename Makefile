@@ -11,6 +11,7 @@
 #   make lint      ruff                    make clean      remove what was made
 
 PYTHON ?= python3
+KERNELS := $(wildcard wavebatch/kernels/c/*) wavebatch/kernels/build_kernels.py
 VENV   := .venv
 BIN    := $(VENV)/bin
 DEMO   := demo
@@ -21,25 +22,27 @@ SEED   ?= 1
 
 .PHONY: demo test test-all readers papers bench fuzz attack docs man lint clean
 .DELETE_ON_ERROR:
+# Without cached bytecode every process compiles all of its modules anew: a second each.
+unexport PYTHONDONTWRITEBYTECODE
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "wavebatch needs Python 3.11 or later: make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.run: pyproject.toml | $(BIN)/python
+$(VENV)/.run: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	@touch $@
 
-$(VENV)/.test: pyproject.toml | $(BIN)/python
+$(VENV)/.test: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $@ $(VENV)/.run
 
-$(VENV)/.plot: pyproject.toml | $(BIN)/python
+$(VENV)/.plot: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
 	@touch $@ $(VENV)/.run
 
-$(VENV)/.docs: pyproject.toml | $(BIN)/python
+$(VENV)/.docs: pyproject.toml $(KERNELS) | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@touch $@ $(VENV)/.run
 

@@ -20,9 +20,9 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.gauss_newton import step_undamped
-from wavebatch.kernels.fit.least_squares import Limits, Windows, fit_windows
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
+from wavebatch.kernels.fit.problem import Settings
 from wavebatch.stages.decompose.models import gauss_newton
 from wavebatch.stages.detect.classic import sustained_threshold
 from wavebatch.stages.detect.maximum import matched_filter
@@ -157,18 +157,18 @@ def table_of_basins(number: int, seed: int) -> Table:
     rng = np.random.default_rng(seed)
     time = 30 + rng.uniform(-0.5, 0.5, (n, 1))
     y = 100 * np.exp(-0.5 * ((x - time) / sigma) ** 2) + rng.standard_normal((n, 60))
-    windows = Windows(y.astype(np.float32), np.tile(x, (n, 1)), np.ones(n))
-    limits = Limits(*(np.array(edge)[None, :, None] for edge in ((0.0, -3.0, 0.7 * sigma), (1e4, 63.0, 4 * sigma))))
+    samples = Samples(y.astype(np.float32), np.zeros(n, np.float32), np.ones(n, np.float32))
+    rows, one = np.arange(n), np.ones(n, np.int64)
+    clusters = Clusters(rows, 0 * one, len(x) * one, rows, one)
+    settings = Settings(sigma, 0.7 * sigma, 4 * sigma, tolerance=1e-3, grow=False)
     for off, (low, high) in BASIN.items():
         undamped, damped = [], []
         height = 100 * np.exp(-0.5 * off**2)
         for width in START_WIDTHS:
-            start = np.tile(np.array([[height], [off * sigma], [width * sigma]]), (n, 1, 1))
-            start[:, 1] += time
-            found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-3, max_iterations=40)
-            undamped.append((converged & (np.abs(found[:, 1] - time)[:, 0] < 0.2)).mean())
-            fit = fit_windows(windows, start, limits, GAUSSIAN)
-            damped.append((fit.converged & (np.abs(fit.parameters[:, 1] - time)[:, 0] < 0.2)).mean())
+            start = Candidates(rows, time[:, 0] + off * sigma, np.full(n, height), np.full(n, width * sigma))
+            for shares, without in ((undamped, True), (damped, False)):
+                fit = decompose_clusters(samples, start, clusters, settings._replace(undamped=without))
+                shares.append((fit.converged & (np.abs(fit.parameters[:, 1] - time[:, 0]) < 0.2)).mean())
         table.add(f"Gauss-Newton, {off:g} sigma off", 100 * np.mean(undamped), low, high)
         table.add(f"Levenberg-Marquardt, {off:g} sigma off", 100 * np.mean(damped), 99.5, spec=100)
     return table

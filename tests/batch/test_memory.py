@@ -18,7 +18,6 @@ from writer_tools import read_provenance
 from wavebatch.cli import main, messages
 from wavebatch.files.cloud.writer import MOST_PAYLOAD
 from wavebatch.files.las.header import MAX_EVLRS, find_evlrs, read_header
-from wavebatch.kernels.fit.least_squares import LARGEST_BATCH, batch_size
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="reads peaks from /proc")
 
@@ -69,10 +68,6 @@ def test_a_block_of_long_waveforms_has_fewer_of_them():
         small = _block_size(unit, 1024)
         assert 1 <= small <= 1024 and small * s <= max(1024 * 256, s)
         assert _block_size(unit, 1) == 1
-    for k in range(1, 8):
-        for length in (8, 96, 512, 4096, 65536):
-            values = (3 * k + 1) * length
-            assert batch_size(k, length) >= 1 and batch_size(k, length) * values <= max(LARGEST_BATCH, values)
 
 
 def test_simulated_waveforms_have_at_most_as_many_samples_as_are_read(tmp_path):

@@ -9,8 +9,6 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.bounds import bound_time
-from wavebatch.kernels.fit.gauss_newton import step_undamped
-from wavebatch.kernels.fit.least_squares import Windows
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import STAGES
 
@@ -167,33 +165,6 @@ def test_gauss_newton_reaches_the_bound_at_fifty_picoseconds(metres, ratio):
     assert bound == pytest.approx(metres, rel=0.06)
     for values in (found.time - time, found.sigma - sigma):
         assert 1000 * HALF_C * np.std(values) / bound == pytest.approx(1, abs=0.13)
-
-
-def test_undamped_steps_equal_the_plain_ones():
-    rng = np.random.default_rng(2)
-    x = np.arange(40.0)
-    true = np.stack([[60, 50], [15, 21.5], [2.0, 2.5]]) * np.ones((6, 1, 1))
-    y = np.stack([naive.model(p, x) for p in true]) + rng.standard_normal((6, 40))
-    start = true * rng.uniform(0.97, 1.03, true.shape)
-    windows = Windows(y.astype(np.float32), np.tile(x, (6, 1)).astype(np.float32), np.ones(6))
-    found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-8, max_iterations=12)
-    assert converged.all()
-    plain = np.stack([naive.gauss_newton(y[i], x, start[i], 12) for i in range(6)])
-    np.testing.assert_allclose(found, plain, atol=2e-3)
-
-
-@pytest.mark.parametrize(("off", "least", "most"), [(0.5, 1, 1), (1.0, 1, 1), (2.0, 0, 0)])
-@pytest.mark.parametrize("width", [0.8, 2.0, 3.0])
-def test_basin_of_undamped_steps(off, width, least, most):
-    """s = 2, SNR 100: from up to one sigma off every fit converges, from two none (docs/algorithms.md 1.3)."""
-    n, x = 100, np.arange(60.0)
-    y = 100 * np.exp(-0.5 * ((x - 30) / 2) ** 2) + np.random.default_rng(3).standard_normal((n, 60))
-    windows = Windows(y.astype(np.float32), np.tile(x, (n, 1)).astype(np.float32), np.ones(n))
-    start = np.tile(np.array([[100.0], [30 + 2 * off], [width]]), (n, 1, 1))
-    found, converged = step_undamped(windows, start, GAUSSIAN, tolerance=1e-3, max_iterations=40)
-    right = converged & (np.abs(found[:, 1, 0] - 30) < 0.2)
-    assert least <= right.mean() <= most
-    np.testing.assert_array_equal(found[~converged], start[~converged])
 
 
 def test_lost_fits_give_their_start_back_with_a_flag():

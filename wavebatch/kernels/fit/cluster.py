@@ -1,6 +1,6 @@
 """From candidate echoes to clusters of overlapping echoes, each with a window of samples to fit.
 
-Used by stages/decompose before `grow`; `find_runs` also by stages/detect. Windows of neighbouring clusters must not
+Used by stages/decompose before the fit; `find_runs` also by stages/detect. Windows of neighbouring clusters must not
 overlap: a window that reaches into its neighbour finds false echoes there (9 % false splits instead of 0.9 %).
 """
 
@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.fit.least_squares import OUTSIDE, Windows
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN
 
 RUN_LEVEL = 2.0
@@ -146,85 +145,3 @@ def _limit_joins(joined: np.ndarray, most: int) -> np.ndarray:
     position = np.arange(1, len(joined) + 1)
     begin = np.maximum.accumulate(np.where(joined, 0, position))
     return joined & ((position - begin) % most != 0)
-
-
-def cut_windows(
-    samples: np.ndarray,
-    baseline: np.ndarray,
-    std: np.ndarray,
-    waveform: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    length: int,
-    clip: float | None = None,
-    noise_gain: float = 0.0,
-    missing: np.ndarray | None = None,
-) -> tuple[Windows, np.ndarray]:
-    """Windows of one length around [low, high) of waveforms, ready for `fit_windows`.
-
-    Parameters
-    ----------
-    samples : uint (n, s), count
-        Raw counts, contiguous.
-    baseline : float32 (n,) or (n, s), count
-        Level of each waveform, or of each sample.
-    std : float32 (n,), count
-        Noise of each waveform.
-    waveform, low, high : int64 (m,)
-        Row of each window, its first sample and its end.
-    length : int, samples
-        Length of all windows; at least high - low.
-    clip : float, count, optional
-        Raw count from which a sample is clipped.
-    noise_gain : float, count
-        Noise variance per count of signal (docs/algorithms.md H12); 0 for noise that does not depend on the signal.
-    missing : bool (n, s), optional
-        Samples that were not recorded.
-
-    Returns
-    -------
-    windows : Windows
-        Samples outside [low, high) are moved out of reach of every pulse.
-    begin : int64 (m,)
-        Sample at which each window begins.
-    """
-    s = samples.shape[1]
-    length = min(length, s)
-    begin = np.minimum(low, s - length)
-    y = _windows_of(samples, length)[waveform * s + begin].astype(np.float32)
-    clipped = None
-    if clip is not None:
-        clipped = y >= clip
-        if not clipped.any():
-            clipped = None
-    if baseline.ndim == 1:
-        y -= baseline[waveform][:, None]
-    else:
-        y -= _windows_of(baseline, length)[waveform * s + begin]
-    position = np.arange(length, dtype=np.float32)
-    outside = position < (low - begin).astype(np.float32)[:, None]
-    outside |= position >= (high - begin).astype(np.float32)[:, None]
-    if missing is not None:
-        outside |= missing[waveform[:, None], begin[:, None] + np.arange(length)]
-    x = np.where(outside, OUTSIDE, position)
-    y[outside] = 0
-    weight = _weigh(y, std[waveform], noise_gain) if noise_gain > 0 else None
-    if clipped is not None:
-        clipped &= ~outside
-    return Windows(y, x, std[waveform].astype(np.float64), clipped, weight), begin
-
-
-def _windows_of(samples: np.ndarray, length: int) -> np.ndarray:
-    """View of all windows of `length` samples of contiguous waveforms laid end to end.
-
-    As NumPy's sliding_window_view, whose checks take longer than a small batch.
-    """
-    flat = samples.reshape(-1)
-    return np.lib.stride_tricks.as_strided(flat, (len(flat) - length + 1, length), 2 * flat.strides, writeable=False)
-
-
-def _weigh(y: np.ndarray, std: np.ndarray, noise_gain: float) -> np.ndarray:
-    """Noise without signal over noise at each sample, from the smoothed signal (m, L): var = std^2 + gain * signal."""
-    padded = np.pad(y, ((0, 0), (2, 2)), mode="edge")
-    smooth = (padded[:, :-4] + padded[:, 4:] + 4 * (padded[:, 1:-3] + padded[:, 3:-1]) + 6 * padded[:, 2:-2]) / 16
-    return 1 / np.sqrt(1 + np.float32(noise_gain) * np.maximum(smooth, 0) / (std * std).astype(np.float32)[:, None])

@@ -1,7 +1,6 @@
-"""The types of a decomposition: its settings, the clusters to fit, and the solutions found.
+"""The types of a decomposition: its settings, and the echoes found.
 
-`grow` and `next_echo` pass them to each other; stages/decompose makes Settings and reads Solution. All widths and times
-are in samples.
+stages/decompose makes Settings and reads Solution. All widths and times are in samples.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.fit.least_squares import WidthPrior
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 
 
@@ -32,7 +30,7 @@ class Settings(NamedTuple):
     tolerance: float = 1e-2
     """A fit has converged when the next step promises a fall of chi2 below this."""
     max_iterations: int = 40
-    """Largest number of iterations of one fit."""
+    """Largest number of iterations of one fit; 40 at least where samples are clipped."""
     grow: bool = True
     """Whether echoes are added where the residual shows more than noise."""
     acceptance: float = 15.0
@@ -41,49 +39,55 @@ class Settings(NamedTuple):
     """Deviation of the pulse from its model as a share of the amplitude: raises the acceptance of strong echoes."""
     max_echoes: int = 6
     """Largest number of echoes of one cluster that growth may reach."""
-    prior: WidthPrior | None = None
-    """Prior on the widths of overlapping echoes; None for none."""
+    prior_spread: float = 0.0
+    """Standard deviation of a one-sided prior on widths of overlapping echoes below `width_ref`; 0 for none. Without
+    it, close echoes trade width against amplitude (docs/algorithms.md H1)."""
     gate_residual: float = 4.2
     """Limit of the smoothed residual [noise standard deviations] (docs/algorithms.md 4.2)."""
     gate_hermite: float = 8.5
     """Limit of h3^2 + h4^2 (docs/algorithms.md 4.2)."""
+    undamped: bool = False
+    """Gauss-Newton steps without damping or limits, for comparison (docs/algorithms.md 1.3)."""
+    skew_mean: float = 0.0
+    """Mean of the normal prior on the skew of each echo (docs/algorithms.md 1.2)."""
+    skew_spread: float = 0.0
+    """Its standard deviation; 0 for echoes without a skew of their own."""
 
 
 class Solution(NamedTuple):
-    """Echoes of c clusters with k echoes each."""
+    """Echoes of c clusters, m in all, sorted by cluster."""
 
-    cluster: np.ndarray
-    """Number of the cluster, int64 (c,)."""
-    parameters: np.ndarray
-    """Amplitude [count], time [samples of the waveform], width [samples], float64 (c, 3, k)."""
-    errors: np.ndarray
-    """One standard deviation of each parameter, float64 (c, 3, k)."""
-    shared: np.ndarray
-    """Covariance of amplitude and width, and of time and width, of each echo, float64 (c, 2, k)."""
-    misfit: np.ndarray
-    """Root mean square residual in noise standard deviations, float64 (c,)."""
-    cost: np.ndarray
-    """chi2 plus prior, float64 (c,)."""
+    number: np.ndarray
+    """Number of echoes of each cluster, int64 (c,)."""
     converged: np.ndarray
-    """bool (c,)."""
+    """Whether the fit of each cluster has converged, bool (c,)."""
+    misfit: np.ndarray
+    """Root mean square residual of each cluster in noise standard deviations, float64 (c,)."""
+    cost: np.ndarray
+    """chi2 plus prior of each cluster, float64 (c,)."""
+    parameters: np.ndarray
+    """Amplitude [count], time [samples of the waveform], width [samples], skew of each echo, float64 (m, 4)."""
+    errors: np.ndarray
+    """One standard deviation of each parameter, float64 (m, 4)."""
+    shared: np.ndarray
+    """Covariance of the width of each echo with its amplitude, and with its time, float64 (m, 2)."""
     at_bound: np.ndarray
-    """Whether a parameter of the echo lies on its bound, bool (c, k)."""
+    """Whether a parameter of the echo lies on its limit, bool (m,)."""
 
-    def take(self, rows: np.ndarray) -> Solution:
-        """The clusters at `rows`."""
-        return Solution(*(field[rows] for field in self))
+    @property
+    def cluster(self) -> np.ndarray:
+        """Cluster of each echo, int64 (m,)."""
+        return np.repeat(np.arange(len(self.number)), self.number)
 
 
-class Problem(NamedTuple):
-    """Clusters to fit with k echoes: from candidates, or trials that must beat the solution they came from."""
-
-    cluster: np.ndarray
-    """Number of the cluster, int64 (c,)."""
-    start: np.ndarray
-    """Start parameters, float64 (c, 3, k), times in samples of the waveform."""
-    target: np.ndarray
-    """chi2 that the fit must fall below, float64 (c,); inf for clusters without an earlier solution."""
-
-    def take(self, rows: np.ndarray) -> Problem:
-        """The clusters at `rows`."""
-        return Problem(*(field[rows] for field in self))
+def choose(solutions: list[Solution], chosen: np.ndarray) -> Solution:
+    """For each cluster the solution number `chosen`, int (c,), of solutions of the same clusters."""
+    per_cluster = (np.choose(chosen, fields) for fields in zip(*(s[:4] for s in solutions), strict=True))
+    kept = [np.flatnonzero(chosen[solution.cluster] == i) for i, solution in enumerate(solutions)]
+    cluster = np.concatenate([s.cluster[rows] for s, rows in zip(solutions, kept, strict=True)])
+    order = np.argsort(cluster, kind="stable")
+    per_echo = (
+        np.concatenate([field[rows] for field, rows in zip(fields, kept, strict=True)])[order]
+        for fields in zip(*(s[4:] for s in solutions), strict=True)
+    )
+    return Solution(*per_cluster, *per_echo)

@@ -47,6 +47,9 @@ class PulseShape(NamedTuple):
     """Exponent p of the generalized Gaussian exp(-|z|^p / 2); 2 for the others."""
     table: PulseTable | None = None
     """Pulse of any shape, stretched in time by the width; None for the others."""
+    origin: str = ""
+    """"segment" or "waveform": a log-normal that begins a sample before its window or waveform, so that its skew is
+    the width over the distance of the peak from there (docs/algorithms.md 1.2); empty for the others."""
 
 
 GAUSSIAN = PulseShape()

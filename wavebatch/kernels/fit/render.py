@@ -80,3 +80,63 @@ def _reach(shape: PulseShape, width: np.ndarray) -> np.ndarray:
     delay = max((abs(delay) for _, delay, _ in shape.components), default=0.0)
     extra = max((extra for *_, extra in shape.components), default=0.0)
     return (delay + VANISHED * np.sqrt(width * width + extra)).astype(np.float32)
+
+
+SERIES = 1e-3
+"""Below this |skew| the logarithm is a series: the closed form divides by the skew."""
+
+
+def skewed_pulse(x: np.ndarray, t: np.ndarray, s: np.ndarray, skew: np.ndarray) -> np.ndarray:
+    """Unit skewed pulses with a skew per echo.
+
+    Parameters
+    ----------
+    x : float, samples
+        Sample positions.
+    t, s, skew : float
+        Peak [samples], width [samples] and skew of echoes; all broadcast.
+
+    Returns
+    -------
+    float64
+        Of the broadcast shape.
+
+    References
+    ----------
+    docs/algorithms.md 0.
+    """
+    z = (x - t) / s
+    grown = skew * z
+    inside = grown > -0.999999
+    small = np.abs(skew) < SERIES
+    near = z - 0.5 * skew * z * z + skew * skew * z**3 / 3.0
+    level = np.where(small, near, np.log1p(np.where(inside, grown, 0.0)) / np.where(small, 1.0, skew))
+    return np.where(inside, np.exp(-0.5 * level * level), 0.0)
+
+
+def render_skewed(
+    n: int, s: int, waveform: np.ndarray, time: np.ndarray, amplitude: np.ndarray, width: np.ndarray, skew: np.ndarray
+) -> np.ndarray:
+    """The sum of skewed pulses of each waveform.
+
+    Parameters
+    ----------
+    n, s : int
+        Number of waveforms, and of samples of each.
+    waveform : int (m,)
+        Row of each echo.
+    time, amplitude, width, skew : float (m,)
+        Peak [samples], amplitude [count], width [samples] and skew of each echo.
+
+    Returns
+    -------
+    float32 (n, s), count
+        Signal without baseline.
+    """
+    signal = np.zeros((n, s), np.float32)
+    x = np.arange(s, dtype=np.float64)
+    columns = [np.asarray(values, np.float64)[:, None] for values in (time, width, skew, amplitude)]
+    for begin in range(0, len(waveform), 4096):
+        t, w, kappa, height = (values[begin : begin + 4096] for values in columns)
+        np.add.at(signal, waveform[begin : begin + 4096], (height * skewed_pulse(x, t, w, kappa)).astype("f4"))
+    return signal

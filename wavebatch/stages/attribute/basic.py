@@ -10,9 +10,9 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C, SQRT_2PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.fit.hermite import residual_moments
 from wavebatch.kernels.fit.pulse_shape import PulseShape, evaluate_pulse
 from wavebatch.kernels.fit.render import render_echoes
-from wavebatch.kernels.fit.residual_test import residual_moments
 from wavebatch.kernels.geometry.match_returns import match_returns
 from wavebatch.stages.attribute.light import area_factor, light_error
 from wavebatch.stages.chain import Chain, Range, Step, stage

@@ -13,7 +13,6 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.closed_form import fit_closed_form
-from wavebatch.kernels.fit.least_squares import WidthPrior
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_candidates, fit_gaussian, make_settings
@@ -80,7 +79,7 @@ def gaussian(
 ) -> EchoTable:  # fmt: skip
     """Sum of Gaussians fitted to every cluster of overlapping candidates, with errors from the covariance.
 
-    Batched Levenberg-Marquardt. Widths stay within their limits, times within the window. No echo is added.
+    Levenberg-Marquardt. Widths stay within their limits, times within the window. No echo is added.
 
     Parameters
     ----------
@@ -169,7 +168,7 @@ def adaptive(
         acceptance=acceptance or system.acceptance,
         misfit=system.misfit,
         max_echoes=max_echoes,
-        prior=WidthPrior(ref, width_prior * ref) if width_prior > 0 else None,
+        prior_spread=width_prior * ref,
         gate_residual=gate_residual,
         gate_hermite=gate_hermite,
     )

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.kernels.fit.grow import UNRESOLVED
+
+UNRESOLVED = 0.25
+"""Distance, in its errors, below which two echoes are one, as in kernels/c/decompose.h."""
 
 OVERLAP = 2.0
 """Only echoes closer than this many widths of the narrower one are merged: a weak echo further away has a poor time,

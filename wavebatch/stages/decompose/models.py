@@ -11,23 +11,19 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.gauss_newton import step_undamped
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import evaluate_model
-from wavebatch.kernels.fit.normal_equations import fit_errors, gram_matrix
+from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.decompose.solve import (
     LeastWidth,
     MostWidth,
-    alike_clusters,
-    cut_alike,
-    describe_solutions,
+    describe_solution,
     fit_candidates,
     fit_gaussian,
     make_settings,
+    samples_of,
 )
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
@@ -162,28 +158,16 @@ def generalized_gaussian(
         max_iterations=max_iterations, grow=False,
     )  # fmt: skip
     candidates, clusters = find_clusters(block, noise, system, echoes, plain)
-    best = np.full(len(clusters.number), np.inf)
-    chosen = np.zeros(len(best), np.int64)
-    found: list[list[Solution]] = []
-    for number, power in enumerate(POWERS):
+    samples, solutions = samples_of(block, noise), []
+    for power in POWERS:
         factor = half_width_factor(power)
         widths = {name: getattr(plain, name) / factor for name in ("width_ref", "width_low", "width_high")}
         settings = plain._replace(shape=PulseShape(power=power), **widths)
-        solutions = decompose_clusters(
-            block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
-        )
-        found.append([_as_half_width(solution, factor) for solution in solutions])
-        for solution in found[-1]:
-            better = solution.cost < best[solution.cluster]
-            best[solution.cluster[better]] = solution.cost[better]
-            chosen[solution.cluster[better]] = number
-    kept, power = [], [np.empty(0, np.float32)]
-    for number, solutions in enumerate(found):
-        for solution in solutions:
-            kept.append(solution.take(np.flatnonzero(chosen[solution.cluster] == number)))
-            power.append(np.full(kept[-1].parameters[:, 0].size, POWERS[number], np.float32))
-    columns = {"power": np.concatenate(power)}
-    return describe_solutions(block, noise, system, clusters, kept, plain, significance, columns)
+        solutions.append(_as_half_width(decompose_clusters(samples, candidates, clusters, settings), factor))
+    chosen = np.argmin([solution.cost for solution in solutions], axis=0)
+    best = choose(solutions, chosen)
+    columns = {"power": np.array(POWERS, np.float32)[chosen[best.cluster]]}
+    return describe_solution(block, noise, system, clusters, best, plain, significance, columns)
 
 
 def half_width_factor(power: float) -> float:
@@ -234,38 +218,14 @@ def gauss_newton(
     """
     settings = make_settings(
         block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
-    candidates, clusters = find_clusters(block, noise, system, echoes, settings)
-    groups = alike_clusters(clusters, np.arange(len(clusters.number)), block)
-    found = [_solve_undamped(block, noise, candidates, clusters, rows, settings) for rows in groups]
-    return describe_solutions(block, noise, system, clusters, found, settings, significance)
-
-
-def _solve_undamped(
-    block: WaveformBlock, noise: Noise, candidates: Candidates, clusters: Clusters, rows: np.ndarray, settings: Settings
-) -> Solution:
-    windows, begin = cut_alike(block, noise, clusters, rows, settings._replace(noise_gain=0.0))
-    member = clusters.first[rows][:, None] + np.arange(clusters.number[rows[0]])
-    start = np.stack([candidates.amplitude[member], candidates.time[member], candidates.width[member]], axis=1)
-    start[:, 1] -= begin[:, None]
-    parameters, converged = step_undamped(
-        windows, start, settings.shape, tolerance=settings.tolerance, max_iterations=settings.max_iterations
-    )
-    bound = (parameters[:, 2] < settings.width_low) | (parameters[:, 2] > settings.width_high)
-    parameters[:, 2] = np.clip(parameters[:, 2], settings.width_low, settings.width_high)
-    model = evaluate_model(windows, parameters, settings.shape)
-    gram = gram_matrix(model)
-    errors, shared = fit_errors(parameters, windows.std, model, gram)
-    parameters[:, 1] += begin[:, None]
-    cost = gram[:, -1, -1] / windows.std**2
-    used = np.maximum(np.count_nonzero(windows.x >= 0, axis=1), 1)
-    return Solution(rows, parameters, errors, shared, np.sqrt(cost / used), cost, converged, bound)
+        max_iterations=max_iterations, grow=False, undamped=True,
+    )._replace(noise_gain=0.0)  # fmt: skip
+    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:
     """Multiply the widths of a solution by the factor."""
-    scale = np.array([1.0, 1.0, factor])[:, None]
+    scale = np.array([1.0, 1.0, factor, 1.0])
     return solution._replace(
         parameters=solution.parameters * scale, errors=solution.errors * scale, shared=solution.shared * factor
     )

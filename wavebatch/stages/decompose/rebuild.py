@@ -9,9 +9,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.free_skew import evaluate_skewed, render_skewed
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse
-from wavebatch.kernels.fit.render import render_echoes
+from wavebatch.kernels.fit.render import render_echoes, render_skewed, skewed_pulse
 from wavebatch.stages.chain import Step
 from wavebatch.stages.decompose.models import POWERS, half_width_factor, reference_shape
 from wavebatch.stages.decompose.skew import skewed_shape
@@ -170,7 +169,7 @@ def echo_pulses(
         x = np.tile(at / spacing, (len(echoes), 1))
         if "skew" in echoes.attributes:
             skew = echoes.attributes["skew"].astype(np.float64)[:, None]
-            return amplitude * evaluate_skewed(x, time, width, skew)[0]
+            return amplitude * skewed_pulse(x, time, width, skew)
         if "power" not in echoes.attributes:
             return amplitude * evaluate_pulse(shape, x, time, width)[0]
         curves = np.zeros(x.shape)

@@ -11,21 +11,18 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Clusters
-from wavebatch.kernels.fit.free_skew import MOST_SKEW, SkewFit, SkewPrior, fit_skews
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import Limits
+from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.decompose.group import find_clusters
 from wavebatch.stages.decompose.solve import (
     LeastWidth,
     MostWidth,
-    alike_clusters,
-    cut_alike,
-    describe_solutions,
+    describe_solution,
     fit_candidates,
     make_settings,
+    samples_of,
 )
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape
 
@@ -127,8 +124,8 @@ def skewed(
     )  # fmt: skip
     if kappa != "free":
         return fit_candidates(block, noise, system, echoes, settings, significance=significance)
-    prior = SkewPrior(shape.kappa, system.skew_spread or UNKNOWN_SPREAD)
-    return _fit_each(block, noise, system, echoes, settings, significance, prior=prior)
+    free = settings._replace(skew_mean=shape.kappa, skew_spread=system.skew_spread or UNKNOWN_SPREAD)
+    return _fit_each(block, noise, system, echoes, free, significance)
 
 
 def _fit_log_normal(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
@@ -172,10 +169,10 @@ def log_normal(
     Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
     """
     settings = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
+        block, system, PulseShape(origin=origin), widths=(least_width, most_width), tolerance=tolerance,
         max_iterations=max_iterations, grow=False,
     )  # fmt: skip
-    return _fit_each(block, noise, system, echoes, settings, significance, origin=origin)
+    return _fit_each(block, noise, system, echoes, settings, significance)
 
 
 def _fit_each(
@@ -185,70 +182,16 @@ def _fit_each(
     echoes: EchoTable,
     settings: Settings,
     significance: float,
-    *,
-    prior: SkewPrior | None = None,
-    origin: str = "",
 ) -> EchoTable:
-    """Fits with one shape for all first, then from there with a skew per echo; their skews as columns."""
+    """Fits with a skew per echo; the skews and their errors as columns."""
     candidates, clusters = find_clusters(block, noise, system, echoes, settings)
-    solutions: list[Solution] = []
-    columns = {name: [np.empty(0, np.float32)] for name in ("skew", "skew_err")}
-    for solution in decompose_clusters(
-        block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
-    ):
-        number = _with_number(clusters, solution)
-        for part in alike_clusters(number, solution.cluster, block):
-            one = solution.take(part)
-            fit, begin = _refit(block, noise, clusters, one, settings, prior, origin)
-            parameters = fit.parameters[:, :3].copy()
-            parameters[:, 1] += begin[:, None]
-            errors = fit.errors[:, :3]
-            # The skew takes part in the area: its error is not that of amplitude and width alone.
-            unknown = np.full_like(errors[:, :2], np.nan)
-            found = (fit.misfit, fit.cost, fit.converged, fit.at_bound)
-            solutions.append(Solution(one.cluster, parameters, errors, unknown, *found))
-            columns["skew"].append(fit.parameters[:, 3].reshape(-1).astype(np.float32))
-            columns["skew_err"].append(fit.errors[:, 3].reshape(-1).astype(np.float32))
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
+    columns = {
+        "skew": solution.parameters[:, 3].astype(np.float32),
+        "skew_err": solution.errors[:, 3].astype(np.float32),
+    }
+    # The skew takes part in the area: its error is not that of amplitude and width alone.
+    solution = solution._replace(shared=np.full_like(solution.shared, np.nan))
     # Widths and times are of the skewed pulse, which has no further components to be described.
     plain = settings._replace(shape=GAUSSIAN)
-    return describe_solutions(block, noise, system, clusters, solutions, plain, significance, joined)
-
-
-def _with_number(clusters: Clusters, solution: Solution) -> Clusters:
-    """The clusters with the number of echoes that a solution has: fits may have left some out."""
-    number = clusters.number.copy()
-    number[solution.cluster] = solution.parameters.shape[2]
-    return clusters._replace(number=number)
-
-
-def _refit(
-    block: WaveformBlock,
-    noise: Noise,
-    clusters: Clusters,
-    solution: Solution,
-    settings: Settings,
-    prior: SkewPrior | None,
-    origin: str,
-) -> tuple[SkewFit, np.ndarray]:
-    """Fits from a solution, in samples of their windows, and where each window begins."""
-    rows = solution.cluster
-    windows, begin = cut_alike(block, noise, clusters, rows, settings)
-    skew = np.full_like(solution.parameters[:, :1], settings.shape.kappa)
-    start = np.concatenate([solution.parameters, skew], axis=1)
-    start[:, 1] -= begin[:, None]
-    low = np.zeros((len(rows), 4, 1))
-    high = np.zeros_like(low)
-    low[:, 0], high[:, 0] = 0.0, 1e9
-    low[:, 1, 0], high[:, 1, 0] = clusters.low[rows] - begin - 3.0, clusters.high[rows] - begin + 2.0
-    low[:, 2], high[:, 2] = settings.width_low, settings.width_high
-    low[:, 3], high[:, 3] = -MOST_SKEW, MOST_SKEW
-    first = None
-    if origin:
-        low[:, 3], high[:, 3] = -np.inf, np.inf
-        first = (clusters.low[rows] if origin == "segment" else np.zeros(len(rows))) - begin - 1.0
-    fit = fit_skews(
-        windows, start, Limits(low, high), prior=prior, origin=first, tolerance=settings.tolerance,
-        max_iterations=settings.max_iterations,
-    )  # fmt: skip
-    return fit, begin
+    return describe_solution(block, noise, system, clusters, solution, plain, significance, columns)

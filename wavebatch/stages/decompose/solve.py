@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated, Any
@@ -12,9 +12,9 @@ import numpy as np
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import Clusters, cut_windows
-from wavebatch.kernels.fit.grow import Settings, Solution, decompose_clusters
-from wavebatch.kernels.fit.least_squares import Limits, Windows, batch_size, fit_windows
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
+from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, measure_pulse
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
@@ -70,14 +70,11 @@ def _gaussian_width(shape: PulseShape, width: float) -> float:
     measures = measure_pulse(shape, width, 1.001 * width)
     x = np.arange(-3 * PER_WIDTH, 3 * PER_WIDTH + 1, dtype=np.float64)
     whole = evaluate_pulse(shape, x[:, None] * unit + measures.delay[0], np.zeros(1), np.full(1, width))[0][:, 0]
-    windows = Windows(whole[None].astype(np.float32), x[None].astype(np.float32), np.full(1, 1e-3))
-    limits = Limits(*(np.array(edge)[None, :, None] for edge in ((0, -20, 0.3 * PER_WIDTH), (9, 20, 5 * PER_WIDTH))))
-    start = np.array([[[measures.peak[0]], [0.0], [PER_WIDTH]]])
-    # Samples before the middle would count as outside of the window.
-    shifted, start[:, 1] = windows._replace(x=windows.x + x[-1].astype(np.float32)), x[-1]
-    limits = Limits(limits.low + np.array([0, x[-1], 0])[:, None], limits.high + np.array([0, x[-1], 0])[:, None])
-    fit = fit_windows(shifted, start, limits, GAUSSIAN, tolerance=1e-6)
-    return float(fit.parameters[0, 2, 0] * unit)
+    samples = Samples(whole[None].astype(np.float32), np.zeros(1, np.float32), np.full(1, 1e-3, np.float32))
+    start = Candidates(np.zeros(1, int), x[-1:], measures.peak[:1], np.full(1, float(PER_WIDTH)))
+    one = Clusters(*(np.array([value]) for value in (0, 0, len(x), 0, 1)))
+    limits = Settings(PER_WIDTH, 0.3 * PER_WIDTH, 5.0 * PER_WIDTH, tolerance=1e-6, grow=False)
+    return float(decompose_clusters(samples, start, one, limits).parameters[0, 2] * unit)
 
 
 def make_settings(
@@ -139,79 +136,32 @@ def fit_candidates(
         Fitted echoes with errors and flags.
     """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
-    solutions = decompose_clusters(
-        block.samples, noise.for_fits, noise.std, candidates, clusters, settings, block.missing
-    )
-    return describe_solutions(block, noise, system, clusters, list(solutions), settings, significance)
+    solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
+    return describe_solution(block, noise, system, clusters, solution, settings, significance)
 
 
-def alike_clusters(clusters: Clusters, rows: np.ndarray, block: WaveformBlock) -> Iterator[np.ndarray]:
-    """Group clusters that have the same number of echoes and windows of about the same length.
-
-    Parameters
-    ----------
-    clusters : Clusters
-        All clusters.
-    rows : int array, shape (c,)
-        Those to group.
-    block : WaveformBlock
-        Their waveforms.
-
-    Yields
-    ------
-    int array
-        Positions in `rows` of a group that is small enough for one batch.
-    """
-    length = window_length(clusters, rows, block)
-    kind = clusters.number[rows] * (1 << 32) + length
-    order = np.argsort(kind, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else []:
-        size = batch_size(int(clusters.number[rows[group[0]]]), int(length[group[0]]))
-        yield from (group[begin : begin + size] for begin in range(0, len(group), size))
-
-
-def window_length(clusters: Clusters, rows: np.ndarray, block: WaveformBlock) -> np.ndarray:
-    """Length of the windows of clusters, in steps of 8 samples, int64 (c,)."""
-    needed = clusters.high[rows] - clusters.low[rows]
-    return np.minimum(-(-needed // 8) * 8, block.samples.shape[1])
-
-
-def cut_alike(
-    block: WaveformBlock, noise: Noise, clusters: Clusters, rows: np.ndarray, settings: Settings
-) -> tuple[Windows, np.ndarray]:
-    """Cut the windows of a group of `alike_clusters`.
+def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
+    """Put the waveforms of a block and their noise together, as the fit takes them.
 
     Parameters
     ----------
     block, noise
         As for a stage.
-    clusters : Clusters
-        All clusters.
-    rows : int array, shape (c,)
-        Clusters of one group.
-    settings : Settings
-        Level at which samples are clipped, growth of the noise.
 
     Returns
     -------
-    windows : Windows
-        Samples above the baseline.
-    begin : int64 array, shape (c,)
-        Sample at which each window begins.
+    Samples
+        Raw counts with their levels.
     """
-    length = int(window_length(clusters, rows, block).max())
-    return cut_windows(
-        block.samples, noise.for_fits, noise.std, clusters.waveform[rows], clusters.low[rows], clusters.high[rows],
-        length, settings.clip, settings.noise_gain, block.missing,
-    )  # fmt: skip
+    return Samples(block.samples, noise.for_fits, noise.std, block.missing)
 
 
-def describe_solutions(
+def describe_solution(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
     clusters: Clusters,
-    solutions: list[Solution],
+    solution: Solution,
     settings: Settings,
     significance: float,
     attributes: Mapping[str, np.ndarray] | None = None,
@@ -226,14 +176,14 @@ def describe_solutions(
         As for a stage.
     clusters : Clusters
         The fitted clusters.
-    solutions : list of Solution
+    solution : Solution
         Their fits.
     settings : Settings
         Pulse and limits of the fit.
     significance : float
         Least energy of an echo [standard deviations].
     attributes : mapping, optional
-        Further columns, arrays with one value per echo in the order of the solutions.
+        Further columns, arrays with one value per echo in their order.
 
     Returns
     -------
@@ -241,10 +191,12 @@ def describe_solutions(
         Fitted echoes with errors and flags.
     """
     given = attributes or {}
-    if not solutions:
-        return EchoTable.empty().with_attributes(**given)
-    flat = [_flatten(clusters, solution) for solution in solutions]
-    waveform, parameters, errors, shared, misfit, flags = map(np.concatenate, zip(*flat, strict=True))
+    cluster = solution.cluster
+    waveform, misfit = clusters.waveform[cluster], solution.misfit[cluster]
+    parameters, errors, shared = solution.parameters[:, :3], solution.errors[:, :3], solution.shared
+    flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
+    flags |= np.where(solution.converged[cluster], 0, EchoFlag.NOT_CONVERGED)
+    flags |= np.where(solution.number[cluster] > 1, EchoFlag.OVERLAPPED, 0)
     limits = ShapeLimits(settings.width_ref, settings.width_low, settings.width_high)
     fitted = system if settings.shape.components else replace(system, components=(), kappa=settings.shape.kappa)
     factors = error_factors(fitted, block.spacing, parameters[:, 2])
@@ -297,20 +249,3 @@ def relative_energy_errors(parameters: np.ndarray, errors: np.ndarray, shared: n
         variance = (errors[:, 0] / amplitude) ** 2 + (errors[:, 2] / width) ** 2
         variance += 2 * shared[:, 0] / (amplitude * width)
     return np.sqrt(np.maximum(variance, 0))
-
-
-def _flatten(clusters: Clusters, solution: Solution) -> tuple[np.ndarray, ...]:
-    """One row per echo: waveform, parameters (m, 3), errors (m, 3), shared (m, 2), misfit, flags."""
-    k = solution.parameters.shape[2]
-    flags = np.where(solution.at_bound, EchoFlag.AT_BOUND, 0)
-    flags |= np.where(solution.converged, 0, EchoFlag.NOT_CONVERGED)[:, None]
-    if k > 1:
-        flags |= int(EchoFlag.OVERLAPPED)
-    return (
-        np.repeat(clusters.waveform[solution.cluster], k),
-        solution.parameters.transpose(0, 2, 1).reshape(-1, 3),
-        solution.errors.transpose(0, 2, 1).reshape(-1, 3),
-        solution.shared.transpose(0, 2, 1).reshape(-1, 2),
-        np.repeat(solution.misfit, k),
-        flags.reshape(-1),
-    )

@@ -12,11 +12,12 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import MAD_TO_STD, SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.cluster import cut_windows
-from wavebatch.kernels.fit.least_squares import Limits, evaluate_model, gram_matrix
-from wavebatch.kernels.fit.next_echo import propose_echo
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.decompose import promise_echoes
+from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
+from wavebatch.stages.decompose.solve import samples_of
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest
@@ -92,15 +93,12 @@ def _promise(part: WaveformBlock, noise: Noise, system: SystemPulse, echoes: Ech
     reach = int(np.ceil(CORE_REACH * system.sigma_ref / spacing))
     middle = np.rint(whole[:, 1]).astype(np.int64)
     low, high = np.clip(middle - reach, 0, s - 1), np.clip(middle + reach + 1, 1, s)
-    windows, begin = cut_windows(
-        part.samples, noise.for_fits, noise.std, echoes.waveform.astype(np.int64), low, high, min(2 * reach + 1, s),
-        clip_level(part, system), system.noise_gain, part.missing,
-    )  # fmt: skip
-    main[:, 1] -= begin
-    parameters = main[:, :, None]
-    rows = evaluate_model(windows, parameters, shape)
-    box = Limits(np.array([0.0, -np.inf, limits.low])[:, None], np.array([np.inf, np.inf, limits.high])[:, None])
-    return propose_echo(windows, parameters, rows, gram_matrix(rows), box, limits.ref)[1]
+    echo = np.arange(len(echoes))
+    windows = Clusters(echoes.waveform.astype(np.int64), low, high, echo, np.ones_like(echo))
+    amplitude, time, width = main.T
+    settings = Settings(*limits, shape, clip_level(part, system), system.noise_gain)
+    fitted = Candidates(windows.waveform, time, amplitude, width)
+    return promise_echoes(samples_of(part, noise), fitted, windows, settings)
 
 
 def _measure_tail(part: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> tuple[tuple[float, float], ...]:

@@ -12,8 +12,10 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.kernels.fit.free_skew import MOST_SKEW, SkewPrior, fit_skews
-from wavebatch.kernels.fit.least_squares import OUTSIDE, Limits, Windows
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.decompose import decompose_clusters
+from wavebatch.kernels.fit.problem import Settings
+from wavebatch.stages.decompose.solve import samples_of
 from wavebatch.stages.noise import pooled
 from wavebatch.surveying.measuring.lone_echoes import MIN_SNR
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW, find_edge
@@ -27,8 +29,8 @@ LOBE = 3.0
 NARROW = 1.1
 """Width, over the narrowest that repeats, up to which an echo is one of a flat target: its skew is the pulse's."""
 
-WEAK_PRIOR = SkewPrior(0.0, 0.5)
-"""Keeps the skew of an echo that says nothing of it within reason."""
+WEAK_PRIOR = 0.5
+"""Standard deviation of a prior around 0: it keeps the skew of an echo that says nothing of it within reason."""
 
 MOST, NORMAL_MOST = 0.9, 1.645
 """Share of the echoes from which the spread is found, and the distance within which a normal law has so many: half of
@@ -96,21 +98,13 @@ def fit_single(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     """
     spacing, s = block.spacing, block.samples.shape[1]
     part = block.rows(echoes.waveform)
-    signal = (part.samples - pooled(part, system).level).astype(np.float32)
     time, width = echoes.time / spacing, echoes.sigma.astype(np.float64) / spacing
-    reach = np.maximum(LOBE * width, 2.5)
-    length = min(int(np.ceil(2 * reach.max())) + 2, s)
-    begin = np.clip(np.rint(time - 0.5 * length), 0, s - length).astype(np.int64)
-    at = begin[:, None] + np.arange(length)
-    x, rows = at.astype(np.float32), np.arange(len(echoes))[:, None]
-    signal = signal[rows, at]
-    outside = np.abs(x - time[:, None]) > reach[:, None]
-    if part.missing is not None:
-        outside |= part.missing[rows, at]
-    x[outside], signal[outside] = OUTSIDE, 0
-    windows = Windows(signal, x, np.full(len(echoes), system.noise_std))
-    start = np.stack([echoes.amplitude.astype(np.float64), time, width, np.zeros(len(echoes))], axis=1)[:, :, None]
-    edges = np.array([[0.0, -3.0, 0.05, -MOST_SKEW], [1e9, s + 3.0, float(s), MOST_SKEW]])
-    fit = fit_skews(windows, start, Limits(*edges[:, None, :, None]), prior=WEAK_PRIOR)
-    known = fit.converged & ~fit.at_bound[:, 0]
-    return tuple(np.where(known, values[:, 3, 0], np.nan) for values in (fit.parameters, fit.errors))
+    reach, row = np.maximum(LOBE * width, 2.5), np.arange(len(echoes))
+    low = np.clip(np.ceil(time - reach), 0, s - 1).astype(np.int64)
+    high = np.clip(np.floor(time + reach) + 1, low + 1, s).astype(np.int64)
+    settings = Settings(1.0, 0.05, float(s), tolerance=0.1, grow=False, skew_spread=WEAK_PRIOR)
+    starts = Candidates(row, time, echoes.amplitude.astype(np.float64), width)
+    clusters = Clusters(row, low, high, row, np.ones_like(row))
+    fit = decompose_clusters(samples_of(part, pooled(part, system)), starts, clusters, settings)
+    known = fit.converged & ~fit.at_bound
+    return tuple(np.where(known, values[:, 3], np.nan) for values in (fit.parameters, fit.errors))

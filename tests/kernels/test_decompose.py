@@ -1,0 +1,167 @@
+"""The compiled decomposer against its slow twin: clusters grow to what their samples hold, whatever the candidates."""
+
+import naive_fit
+import numpy as np
+import pytest
+from fits import decompose, settings
+
+from wavebatch.kernels.fit.cluster import Candidates, Clusters
+from wavebatch.kernels.fit.decompose import Samples, decompose_clusters, promise_echoes
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+
+LENGTH = 48
+GROWING = {"grow": True, "prior_spread": 0.2, "tolerance": 1e-6, "max_iterations": 200}
+LEARNED = PulseShape(components=((0.12, 3.0, 1.0),))
+
+
+def bell(time, amplitude, width=2.0):
+    return amplitude * np.exp(-0.5 * ((np.arange(LENGTH) - time) / width) ** 2)
+
+
+def repeat(signal, times, amplitudes, seed=0):
+    """The Solution of 200 waveforms that hold the same signal, each with the same candidates."""
+    noise = np.random.default_rng(seed).standard_normal((200, LENGTH))
+    start = np.stack([np.array(amplitudes), np.array(times), np.full(len(times), 2.0)])
+    return decompose(np.rint(signal + noise), np.tile(start, (200, 1, 1)), std=1.04, grow=True)
+
+
+def test_candidates_where_nothing_is_do_not_keep_others_out():
+    """Two echoes that share a maximum, and a candidate in a dip: it is fitted to nothing, and then the second grows."""
+    found = repeat(bell(16, 150) + bell(20, 80) - bell(30, 12, 3.0), [17.0, 30.0], [150.0, 5.0])
+    apart = np.abs(found.parameters[:, 1, None] - [16, 20]).min(axis=1) < 0.7
+    both = np.bincount(found.cluster, apart) == found.number
+    assert np.count_nonzero(both & (found.number >= 2)) > 170
+
+
+def test_candidates_of_nothing_are_left_out():
+    found = repeat(bell(20, 100) - bell(30, 8, 3.0), [20.0, 30.0], [100.0, 4.0])
+    assert np.count_nonzero(found.number == 1) > 160
+    assert (found.parameters[:, 0] > 0).all()
+
+
+def draw_random(rng):
+    """One to three echoes of any strength and distance; one candidate."""
+    k = rng.integers(1, 4)
+    time = np.sort(rng.uniform(10, 38, k))
+    return np.stack([np.exp(rng.uniform(2, 5.5, k)), time, rng.uniform(1.8, 2.8, k)])
+
+
+def draw_stiff(rng):
+    """Two echoes closer than their widths, of very unlike strength, or at the end of the window."""
+    time = rng.choice([20.0, 1.0, 46.0]) + np.array([0.0, rng.uniform(1.0, 4.0)])
+    return np.stack([np.array([rng.uniform(100, 230), np.exp(rng.uniform(1, 5))]), time, rng.uniform(1.5, 4.0, 2)])
+
+
+@pytest.mark.parametrize("shape", [GAUSSIAN, LEARNED], ids=["gaussian", "learned"])
+@pytest.mark.parametrize("draw", [draw_random, draw_stiff])
+@pytest.mark.parametrize("clip", [np.inf, 200.0])
+def test_clusters_grow_as_those_of_the_twin(shape, draw, clip):
+    rng, m = np.random.default_rng(5), 50
+    truth = [draw(rng) for _ in range(m)]
+    y = np.stack([naive_fit.naive.model(p, np.arange(float(LENGTH)), components=shape.components) for p in truth])
+    y = np.minimum(np.rint(y + rng.standard_normal(y.shape)), clip)
+    peak = y.argmax(axis=1).astype(float)
+    start = np.stack([y.max(axis=1), peak, np.full(m, 2.0)], axis=1)[:, :, None]
+    options = GROWING | {"shape": shape, "clip": clip if np.isfinite(clip) else None}
+    found = decompose(y, start, **options)
+    ends, same, near = np.cumsum(found.number), 0, 0
+    for i in range(m):
+        twin = naive_fit.decompose(y[i], 1.0, start[i], settings(**options), clip, components=shape.components)
+        p, errors, chi2 = twin
+        if p.shape[1] != found.number[i]:
+            continue
+        same += 1
+        ours = found.parameters[ends[i] - found.number[i] : ends[i], :3].T
+        ours, p, errors = ours[:, np.argsort(ours[1])], p[:, np.argsort(p[1])], errors[:, np.argsort(p[1])]
+        near += bool(np.abs((ours - p) / errors).max() < 0.1 and abs(found.cost[i] - chi2) < 0.1)
+    assert same >= 0.9 * m
+    assert near >= 0.9 * same
+
+
+def test_the_promise_of_one_more_echo_is_that_of_the_twin():
+    rng, m, x = np.random.default_rng(6), 30, np.arange(float(LENGTH))
+    p = np.stack([rng.uniform(50, 150, m), rng.uniform(16, 30, m), rng.uniform(1.8, 2.4, m)], axis=1)
+    y = np.stack([bell(t, a, w) + bell(t + 5, 0.2 * a) for a, t, w in p]) + rng.standard_normal((m, LENGTH))
+    rows, one = np.arange(m), np.ones(m, int)
+    samples = Samples(y.astype(np.float32), np.zeros(m, np.float32), np.ones(m, np.float32))
+    clusters = Clusters(rows, 0 * one, LENGTH * one, rows, one)
+    promised = promise_echoes(samples, Candidates(rows, p[:, 1], p[:, 0], p[:, 2]), clusters, settings())
+    for i in range(m):
+        residual = y[i] - bell(p[i, 1], p[i, 0], p[i, 2])
+        expected = naive_fit.propose(p[i][:, None], x, residual, 1.0, settings(), {})[1]
+        assert promised[i] == pytest.approx(expected, rel=0.02)
+
+
+def test_no_number_of_echoes_is_too_many():
+    """Memory by need: 60 echoes of one cluster, and growth by as many as the setting allows."""
+    times = 10.0 + 12.0 * np.arange(60)
+    y = sum(80.0 * np.exp(-0.5 * ((np.arange(740) - t) / 2.0) ** 2) for t in times)[None]
+    start = np.stack([np.full(60, 70.0), times + 0.3, np.full(60, 2.0)])[None]
+    given = decompose(y, start)
+    np.testing.assert_allclose(given.parameters[:, 1], times, atol=1e-2)
+    grown = decompose(y, start[:, :, :1], grow=True, max_echoes=60, width_high=2.5)
+    np.testing.assert_allclose(np.sort(grown.parameters[:, 1]), times, atol=1e-2)
+
+
+def test_a_cluster_alone_gives_the_same_bits_as_among_others():
+    rng = np.random.default_rng(8)
+    truth = np.stack([draw_random(rng)[:, :1] for _ in range(40)])
+    y = np.rint(np.stack([bell(t, a, w) for a, t, w in truth[:, :, 0]]) + rng.standard_normal((40, LENGTH)))
+    whole = decompose(y, truth, grow=True)
+    ends = np.cumsum(whole.number)
+    for i in (0, 7, 39):
+        alone = decompose(y[i : i + 1], truth[i : i + 1], grow=True)
+        np.testing.assert_array_equal(alone.parameters, whole.parameters[ends[i] - whole.number[i] : ends[i]])
+        np.testing.assert_array_equal(alone.errors, whole.errors[ends[i] - whole.number[i] : ends[i]])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_problems_give_finite_echoes(seed):
+    """Any counts, candidates anywhere, gaps, widths out of all proportion."""
+    rng = np.random.default_rng(seed)
+    for kind in (np.uint8, np.uint16, np.uint32):
+        m, s, k = 20, int(rng.integers(1, 90)), int(rng.integers(1, 9))
+        y = (rng.random((m, s)) ** rng.choice([0.1, 1, 9]) * np.iinfo(kind).max).astype(kind)
+        missing = rng.random((m, s)) < rng.choice([0, 0.5, 1])
+        amplitude, width = 10 ** rng.uniform(-6, 9, (m, k)), 10 ** rng.uniform(-3, 4, (m, k))
+        start = np.stack([amplitude, rng.uniform(-1e3, 1e3, (m, k)), width], axis=1)
+        options = {
+            "shape": (GAUSSIAN, LEARNED, PulseShape(kappa=-0.4), PulseShape(power=4.0))[rng.choice(4)],
+            "clip": float(np.iinfo(kind).max),
+            "noise_gain": rng.choice([0, 2.0]),
+        }
+        widths = {"width_low": 1e-3, "width_high": 1e4}
+        found = decompose(y, start, missing=missing, std=10 ** rng.uniform(-3, 3), **options, **widths, **GROWING)
+        for field in found:
+            assert np.isfinite(field).all()
+        assert found.number.sum() == len(found.parameters)
+
+
+def test_arrays_that_the_library_would_read_beyond_are_refused():
+    samples = Samples(np.zeros((2, 8), np.uint8), np.zeros(2, np.float32), np.ones(2, np.float32))
+    good = Clusters(*(np.array([value]) for value in (0, 0, 8, 0, 1)))
+    start = Candidates(*(np.array([value]) for value in (0, 3.0, 5.0, 2.0)))
+    assert decompose_clusters(samples, start, good, settings()).number.tolist() == [1]
+    wrong = {"waveform": (2, -1), "high": (9,), "low": (8, -1), "first": (1,), "number": (2, 0)}
+    for name, value in ((name, value) for name, values in wrong.items() for value in values):
+        with pytest.raises(ValueError):
+            decompose_clusters(samples, start, good._replace(**{name: np.array([value])}), settings())
+    for name, value in (("time", np.nan), ("amplitude", np.inf), ("width", np.nan)):
+        with pytest.raises(ValueError):
+            decompose_clusters(samples, start._replace(**{name: np.array([value])}), good, settings())
+    for name, value in (
+        ("std", np.zeros(2, np.float32)),
+        ("std", np.ones(3, np.float32)),
+        ("baseline", np.full(2, np.nan, np.float32)),
+        ("counts", np.zeros((2, 8))),
+        ("missing", np.zeros((2, 7), bool)),
+    ):
+        with pytest.raises(ValueError):
+            decompose_clusters(samples._replace(**{name: value}), start, good, settings())
+
+
+def test_no_clusters_give_no_echoes():
+    none = np.empty(0, int)
+    samples = Samples(np.zeros((0, 8), np.uint8), np.zeros(0, np.float32), np.ones(0, np.float32))
+    found = decompose_clusters(samples, Candidates(*(none,) * 4), Clusters(*(none,) * 5), settings())
+    assert found.parameters.shape == (0, 4) and not len(found.number)

@@ -1,0 +1,277 @@
+"""The compiled fit against scipy on the same windows: free, at bounds, clipped, with gaps and with a prior."""
+
+import naive
+import numpy as np
+import pytest
+from fits import TIGHT, decompose, fit
+
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.stages.decompose.solve import relative_energy_errors
+
+LENGTH = 32
+SHAPES = {
+    "gaussian": PulseShape(),
+    "skewed": PulseShape(kappa=0.15),
+    "learned": PulseShape(components=((0.15, 2.5, 0.8), (0.04, 9.0, 1.2), (-0.02, 6.0, 0.5))),
+}
+
+
+def draw(rng, m, k, apart=6.0):
+    """True parameters (m, 3, k) of k echoes that overlap a little."""
+    amplitude = rng.uniform(20, 150, (m, k))
+    time = 8 + apart * np.arange(k) + rng.uniform(-0.5, 0.5, (m, k))
+    return np.stack([amplitude, time, rng.uniform(1.6, 2.6, (m, k))], axis=1)
+
+
+def record(rng, truth, shape=GAUSSIAN, noise=1.0, length=LENGTH):
+    """Waveforms (m, length) that hold the echoes."""
+    x = np.arange(float(length))
+    y = np.stack([naive.model(p, x, kappa=shape.kappa, components=shape.components) for p in truth])
+    return y + noise * rng.standard_normal(y.shape)
+
+
+def near(rng, truth):
+    """Starts as a detector would give them."""
+    start = truth.copy()
+    start[:, 0] *= rng.uniform(0.85, 1.15, start[:, 0].shape)
+    start[:, 1] += rng.uniform(-0.4, 0.4, start[:, 1].shape)
+    start[:, 2] = 2.0
+    return start
+
+
+def assert_reaches_scipy(y, found, start, shape=GAUSSIAN, std=1.0, widths=(1.4, 8.0), slack=(2e-3, 0.05), **optional):
+    """Every problem ends in the minimum that scipy finds: chi2 equal, parameters within 5 % of their errors."""
+    low, high = (np.array(edge)[:, None] for edge in ((0.0, -3.0, widths[0]), (1e9, y.shape[1] + 2.0, widths[1])))
+    x = np.arange(float(y.shape[1]))
+    for i, one in enumerate(start):
+        rows = {name: field[i] for name, field in optional.items() if name != "prior"}
+        used = ~rows.pop("missing", np.zeros(len(x), bool))
+        rows = {name: field[used] for name, field in rows.items()}
+        prior = optional.get("prior")
+        components = {"kappa": shape.kappa, "components": shape.components}
+        expected, chi2 = naive.fit(y[i][used], x[used], std, one, low, high, prior=prior, **rows, **components)
+        assert found.cost[i] == pytest.approx(chi2, rel=2e-4, abs=slack[0])
+        assert np.abs((found.parameters[i, :3] - expected) / found.errors[i, :3]).max() < slack[1]
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(23)
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_free_fits_equal_scipy(rng, shape, k):
+    truth = draw(rng, 12, k)
+    y, start = record(rng, truth, shape), near(rng, truth)
+    found = fit(y, start, shape=shape, **TIGHT)
+    assert found.converged.all()
+    assert not found.at_bound.any()
+    assert_reaches_scipy(y, found, start, shape)
+
+
+def test_default_tolerance_ends_within_a_fraction_of_the_error(rng):
+    truth = draw(rng, 200, 2, apart=4.5)
+    y, start = record(rng, truth), near(rng, truth)
+    loose, tight = fit(y, start, tolerance=0.05), fit(y, start, **TIGHT)
+    assert np.abs((loose.parameters - tight.parameters)[:, :3] / tight.errors[:, :3]).max() < 0.1
+
+
+def test_exact_waveforms_give_exact_parameters(rng):
+    truth = draw(rng, 40, 2)
+    found = fit(record(rng, truth, noise=0.0), near(rng, truth), **TIGHT)
+    np.testing.assert_allclose(found.parameters[:, :3], truth, rtol=1e-5)
+    np.testing.assert_allclose(found.cost, 0, atol=1e-4)
+
+
+def test_times_are_as_exact_at_the_end_of_a_long_window(rng):
+    truth = draw(rng, 6, 1)
+    truth[:, 1] += 60_000
+    found = fit(record(rng, truth, noise=0.0, length=60_040), near(rng, truth), **TIGHT)
+    np.testing.assert_allclose(found.parameters[:, 1], truth[:, 1], rtol=0, atol=2e-5)
+
+
+def test_fits_at_the_bounds_equal_scipy(rng):
+    truth = draw(rng, 16, 1)
+    truth[:8, 2], truth[8:, 2] = 0.9, 5.0
+    y, start = record(rng, truth), near(rng, truth)
+    found = fit(y, start, width_high=4.0, **TIGHT)
+    assert found.converged.all()
+    assert found.at_bound.all()
+    np.testing.assert_array_equal(found.parameters[:8, 2], 1.4)
+    np.testing.assert_array_equal(found.parameters[8:, 2], 4.0)
+    assert_reaches_scipy(y, found, start, widths=(1.4, 4.0))
+
+
+def test_clipped_samples_only_bound_the_signal_from_below(rng):
+    truth = draw(rng, 12, 1)
+    truth[:, 0] = 400
+    y, start = np.minimum(record(rng, truth), 250), near(rng, truth)
+    found = fit(y, start, clip=250.0, **TIGHT)
+    assert_reaches_scipy(y, found, start, clipped=y >= 250)
+    assert np.abs((found.parameters[:, :3] - truth) / found.errors[:, :3]).max() < 4.5
+    assert (fit(y, start, **TIGHT).parameters[:, 0] < 300).all()
+
+
+def test_noise_that_grows_with_the_signal_weighs_samples(rng):
+    truth = draw(rng, 8, 1)
+    y, start = record(rng, truth), near(rng, truth)
+    smooth = np.pad(y, ((0, 0), (2, 2)), mode="edge") @ np.stack([np.roll([1, 4, 6, 4, 1] + [0] * (LENGTH - 1), i)
+                                                                  for i in range(LENGTH)], axis=1) / 16  # fmt: skip
+    weight = 1 / np.sqrt(1 + 0.2 * np.maximum(smooth, 0))
+    assert_reaches_scipy(y, fit(y, start, noise_gain=0.2, **TIGHT), start, weight=weight)
+
+
+def test_missing_samples_take_no_part(rng):
+    truth = draw(rng, 8, 1)
+    y, start = record(rng, truth), near(rng, truth)
+    missing = np.zeros(y.shape, bool)
+    missing[:, 10], missing[:, 20:] = True, True
+    spoilt = np.where(missing, 500.0, y)
+    assert_reaches_scipy(spoilt, fit(spoilt, start, missing=missing, **TIGHT), start, missing=missing)
+
+
+def test_the_width_prior_costs_narrow_echoes_only(rng):
+    truth = draw(rng, 12, 2, apart=3.5)
+    truth[:, 2] = [1.7, 2.6]
+    y, start = record(rng, truth), near(rng, truth)
+    held, free = fit(y, start, width_ref=2.2, prior_spread=0.15, **TIGHT), fit(y, start, **TIGHT)
+    # The prior sets in with a kink of the slope, around which steps alternate.
+    assert_reaches_scipy(y, held, start, prior=(2.2, 0.15), slack=(0.1, 0.3))
+    assert (held.cost > free.cost).all()
+    wide = fit(y, start, width_ref=0.5, prior_spread=0.15, **TIGHT)
+    np.testing.assert_array_equal(wide.parameters, free.parameters)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32])
+def test_counts_of_any_size_are_read_as_they_are(rng, kind):
+    truth = draw(rng, 20, 2)
+    truth[:, 0] *= 1.2 if kind is np.uint8 else 200.0
+    top = np.iinfo(kind).max
+    counts = np.clip(np.rint(record(rng, truth)), 0, top).astype(kind)
+    start = near(rng, truth)
+    whole, plain = fit(counts, start, **TIGHT), fit(counts.astype(np.float32), start, **TIGHT)
+    np.testing.assert_array_equal(whole.parameters, plain.parameters)
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+@pytest.mark.parametrize(("k", "apart"), [(1, 6.0), (2, 6.0), (2, 3.0), (3, 4.0)])
+def test_errors_are_those_of_the_inverse_fisher_matrix(rng, shape, k, apart):
+    truth = draw(rng, 10, k, apart)
+    found = fit(record(rng, truth, shape), truth, shape=shape, **TIGHT)
+    x = np.arange(float(LENGTH))
+    for i in np.flatnonzero(~found.at_bound.any(axis=1)):
+        p = found.parameters[i, :3]
+        plain = naive.fisher_errors(p, x, 1.0, kappa=shape.kappa, components=shape.components)
+        # Errors are those of the last step but one: where echoes overlap, they change with every step.
+        np.testing.assert_allclose(found.errors[i, :3], plain, rtol=2e-3 if apart > 5 else 0.15)
+
+
+def test_errors_grow_with_the_noise(rng):
+    truth = draw(rng, 5, 1)
+    y = record(rng, truth)
+    one, three = (fit(y, truth, std=std, **TIGHT) for std in (1.0, 3.0))
+    np.testing.assert_allclose(three.errors[:, :3], 3 * one.errors[:, :3], rtol=1e-3)
+
+
+def test_two_echoes_in_one_place_do_not_break_the_fit(rng):
+    truth = draw(rng, 10, 1)
+    start = np.repeat(truth, 2, axis=2)
+    start[:, 0] /= 2
+    found = fit(record(rng, truth), start)
+    assert np.isfinite(found.parameters).all()
+    assert np.isfinite(found.errors).all()
+    assert (found.errors[:, 0].max(axis=1) > 100).all(), "amplitudes that cannot be told apart must have large errors"
+    np.testing.assert_allclose(found.parameters[:, 0].sum(axis=1), truth[:, 0, 0], rtol=0.2)
+
+
+def test_a_lone_echo_of_which_two_samples_are_seen_has_errors(rng):
+    """Rounding of float32 products made the variance of its time less than nothing, and the error 0."""
+    truth = np.stack([np.full(500, 30.0), rng.uniform(0.0, 4.0, 500), rng.uniform(1.4, 3.0, 500)], axis=1)[:, :, None]
+    found = fit(record(rng, truth, length=2), truth, max_iterations=1)
+    assert np.isfinite(found.errors[:, :3]).all() and (found.errors[:, :3] > 0).all()
+    rows = (field[:, :size, 0] for field, size in ((found.parameters, 3), (found.errors, 3), (found.shared, 2)))
+    assert (relative_energy_errors(*rows)[found.parameters[:, 0, 0] > 0] > 0).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 200.0])
+def test_windows_without_information_stay_finite(level):
+    missing = np.ones((3, 8), bool)
+    missing[0] = False
+    start = np.tile([[[10.0], [3.0], [2.0]]], (3, 1, 1))
+    found = fit(np.full((3, 8), level), start, missing=missing)
+    assert np.isfinite(found.parameters).all()
+    assert np.isfinite(found.errors).all()
+
+
+def test_too_few_iterations_are_reported(rng):
+    truth = draw(rng, 10, 2, apart=3.0)
+    start = truth.copy()
+    start[:, 1] += 1.5
+    found = fit(record(rng, truth), start, tolerance=1e-8, max_iterations=2)
+    assert not found.converged.any()
+    assert np.isfinite(found.cost).all()
+
+
+def test_no_fit_ends_worse_than_it_says(rng):
+    """Close echoes lie in a curved valley: a last step along it may climb its side, however little it promises."""
+    m = 4000
+    truth = draw(rng, m, 2, apart=2.5)
+    start = truth.copy()
+    start[:, 0] *= rng.uniform(0.4, 1.6, start[:, 0].shape)
+    start[:, 1] += rng.uniform(-1.5, 1.5, start[:, 1].shape)
+    y = record(rng, truth)
+    found = decompose(y, start, tolerance=0.5)
+    ends = np.cumsum(found.number)
+    x = np.arange(float(LENGTH))
+    for i in range(0, m, 4):
+        p = found.parameters[ends[i] - found.number[i] : ends[i], :3].T
+        assert np.sum((y[i].astype(np.float32) - naive.model(p, x)) ** 2) - found.cost[i] < 10
+
+
+@pytest.mark.parametrize("apart", [1.8, 2.2, 2.7, 6.0])
+def test_the_error_of_an_energy_is_its_scatter_also_where_echoes_overlap(rng, apart):
+    """With the correlation of lone echoes, -1/sqrt(3), errors were 1.4 to 1.9 times too small."""
+    truth = np.empty((800, 3, 2))
+    truth[:, 0], truth[:, 2] = (60.0, 45.0), 2.0
+    truth[:, 1, 0] = rng.uniform(10.0, 11.0, 800)
+    truth[:, 1, 1] = truth[:, 1, 0] + 2.0 * apart
+    found = fit(record(rng, truth), truth.copy(), **TIGHT)
+    rows = [field.transpose(0, 2, 1).reshape(1600, -1) for field in found[:3]]
+    energy = relative_energy_errors(rows[0][:, :3], rows[1][:, :3], rows[2])
+    area = found.parameters[:, 0] * found.parameters[:, 2]
+    off = area / (truth[:, 0] * truth[:, 2]) - 1.0
+    inside = np.mean(np.abs(off) < energy.reshape(800, 2), axis=0)
+    assert inside == pytest.approx(0.683, abs=0.075)
+
+
+@pytest.mark.parametrize("power", [1.4, 2.4, 4.0])
+def test_generalized_gaussians_are_fitted_exactly(rng, power):
+    truth = draw(rng, 20, 1)
+    x = np.arange(float(LENGTH))
+    y = np.stack([a * naive.power_pulse(x, t, s, power) for a, t, s in truth[:, :, 0]])
+    found = fit(y, near(rng, truth), shape=PulseShape(power=power), **TIGHT)
+    np.testing.assert_allclose(found.parameters[:, :3], truth, rtol=2e-4)
+
+
+def test_undamped_steps_are_those_of_the_twin(rng):
+    truth = np.stack([[60, 50], [15, 21.5], [2.0, 2.5]]) * np.ones((6, 1, 1))
+    y = record(rng, truth, length=40)
+    start = truth * rng.uniform(0.97, 1.03, truth.shape)
+    found = fit(y, start, undamped=True, tolerance=1e-8, max_iterations=12)
+    assert found.converged.all()
+    plain = np.stack([naive.gauss_newton(y[i], np.arange(40.0), start[i], 12) for i in range(6)])
+    np.testing.assert_allclose(found.parameters[:, :3], plain, atol=2e-3)
+
+
+@pytest.mark.parametrize(("off", "least", "most"), [(0.5, 1, 1), (1.0, 1, 1), (2.0, 0, 0)])
+@pytest.mark.parametrize("width", [0.8, 2.0, 3.0])
+def test_basin_of_undamped_steps(off, width, least, most):
+    """s = 2, SNR 100: from up to one sigma off every fit converges, from two none (docs/algorithms.md 1.3)."""
+    n, x = 100, np.arange(60.0)
+    y = 100 * np.exp(-0.5 * ((x - 30) / 2) ** 2) + np.random.default_rng(3).standard_normal((n, 60))
+    start = np.tile(np.array([[100.0], [30 + 2 * off], [width]]), (n, 1, 1))
+    found = fit(y, start, undamped=True, tolerance=1e-3, width_low=0.5)
+    right = found.converged & (np.abs(found.parameters[:, 1, 0] - 30) < 0.2)
+    assert least <= right.mean() <= most
+    np.testing.assert_array_equal(found.parameters[~found.converged, :3], start[~found.converged])

@@ -1,0 +1,107 @@
+"""The slow twin of kernels/c: one waveform, NumPy and scipy in float64, as docs/algorithms.md 2.3 and 4.2 say it."""
+
+import naive
+import numpy as np
+
+GAIN_121 = np.sqrt(6.0) / 4.0
+
+
+def slopes(p, x, **shape):
+    """Derivatives of the model by amplitudes, times and widths, (L, 3 k)."""
+    return naive.differentiate(lambda flat: naive.model(flat.reshape(3, -1), x, **shape), p, 1e-4)
+
+
+def moments(p, x, residual, std):
+    """h3 and h4 of the residual around each Gaussian, (k,) both."""
+    found = []
+    for _, t, s in p.T:
+        z = np.clip((x - t) / s, -5, 5)
+        bell = np.exp(-0.5 * ((x - t) / s) ** 2)
+        for direction in ((8 * z**3 - 12 * z) * bell, (16 * z**4 - 48 * z**2 + 12) * bell):
+            found.append(direction @ residual / np.sqrt(max(direction @ direction, 1e-12)) / std)
+    return np.array(found).reshape(-1, 2).T
+
+
+def is_misfit(p, x, residual, std, s):
+    """Whether the residual holds more than noise."""
+    smooth = (residual[:-2] + 2 * residual[1:-1] + residual[2:]) / 4
+    h3, h4 = moments(p, x, residual, std)
+    return smooth.max(initial=0) > s.gate_residual * GAIN_121 * std or (h3**2 + h4**2).max() > s.gate_hermite
+
+
+def propose(p, x, residual, std, s, shape):
+    """Start of the fit with one echo more, and the fall of chi2 that it promises."""
+    jacobian = slopes(p, x, **shape)
+    best, place, height, change = 0.0, 0, 0.0, np.zeros(p.size)
+    for i in range(len(x)):
+        new = np.where(np.abs(x - x[i]) <= np.ceil(3 * s.width_ref), np.exp(-0.5 * ((x - x[i]) / s.width_ref) ** 2), 0)
+        shared = np.linalg.lstsq(jacobian, new, rcond=None)[0]
+        left = new - jacobian @ shared
+        energy, onto = left @ left, max(left @ residual, 0.0)
+        if energy > 0.03 * s.width_ref * np.sqrt(np.pi) and onto**2 / energy > best:
+            best, place, height, change = onto**2 / energy, i, onto / energy, shared
+    da, dt, ds = -height * change.reshape(p.shape)
+    a, t, w = p
+    ref = s.width_ref
+    old = np.array([np.maximum(a + da, 0.2 * a), t + np.clip(dt, -ref, ref), w + np.clip(ds, -0.4 * w, 0.3 * w)])
+    start, promise = np.c_[old, [height, x[place], ref]], best / std**2
+    h3, h4 = moments(p, x, residual, std)
+    gain = np.where(h4 < 0, h3**2 + h4**2, 0.0)
+    j = int(np.argmax(gain))
+    if gain[j] > promise:
+        narrow = min(w[j], 1.1 * ref)
+        apart, half = max(np.sqrt(w[j] ** 2 - narrow**2), 0.5 * w[j]), 0.5 * a[j] * w[j] / narrow
+        start, promise = np.c_[p, [half, t[j] + apart, narrow]], gain[j]
+        start[:, j] = half, t[j] - apart, narrow
+    return start, promise
+
+
+def errors_of(p, x, std, prior, used, shape):
+    """Standard deviations (3, k) with what is known of the widths."""
+    jacobian = slopes(p, x, **shape)[used] / std
+    fisher = jacobian.T @ jacobian
+    k = p.shape[1]
+    if prior:
+        for j in range(k):
+            fisher[2 * k + j, 2 * k + j] += (p[2, j] < prior[0]) / prior[1] ** 2
+    return np.sqrt(np.diag(np.linalg.pinv(fisher))).reshape(3, k)
+
+
+def is_resolved(p, errors):
+    order = np.argsort(p[1])
+    gap, error = np.diff(p[1][order]), errors[1][order]
+    return (p[0] > 0).all() and (gap > 0.25 * np.hypot(error[1:], error[:-1])).all()
+
+
+def decompose(y, std, start, s, clip=np.inf, **shape):
+    """Parameters (3, k), errors and chi2 of one window; s: Settings, whose widths, gates and acceptance count."""
+    x = np.arange(float(len(y)))
+    clipped = y >= clip
+    low = np.array([0.0, -3.0, s.width_low])[:, None]
+    high = np.array([1e9, len(y) + 2.0, s.width_high])[:, None]
+    best, target = None, np.inf
+    for _ in range(20):
+        prior = (s.width_ref, s.prior_spread) if s.prior_spread and start.shape[1] > 1 else None
+        p, chi2 = naive.fit(y, x, std, start, low, high, clipped=clipped, prior=prior, **shape)
+        if not chi2 < target:
+            return best
+        outside = np.maximum(np.maximum(-p[1], p[1] - x[-1]), 0) / p[2]
+        height = p[0] * np.exp(-0.5 * outside**2)
+        if p.shape[1] > 1 and height.min() <= std:
+            start = np.delete(p, np.argmin(height), axis=1)
+            continue
+        residual = y - naive.model(p, x, **shape)
+        used = ~(clipped & (residual <= 0))
+        residual = residual * used
+        errors = errors_of(p, x, std, prior, used, shape)
+        if best is not None and not is_resolved(p, errors):
+            return best
+        best = p, errors, chi2
+        if not s.grow or p.shape[1] >= s.max_echoes or not is_misfit(p, x, residual, std, s):
+            return best
+        start, promise = propose(p, x, residual, std, s, shape)
+        fall = s.acceptance + s.misfit**2 * np.sqrt(np.pi) * np.sum(p[0] ** 2 * p[2]) / std**2
+        if not promise > 0.5 * fall:
+            return best
+        target = chi2 - fall
+    return best

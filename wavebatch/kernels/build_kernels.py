@@ -1,0 +1,117 @@
+"""Build backend: compiles kernels/c, then lets setuptools do the rest (pyproject.toml names it).
+
+Uses $CC, else cc, gcc or clang; where the machine has none, pip installs `ziglang`, a compiler in a wheel, for the time
+of the build. The flags are strict, so that every build gives the same bits: no contraction of products and sums, no
+fast mathematics, no instructions beyond the baseline of the architecture.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+from pathlib import Path
+
+SOURCES = Path(__file__).with_name("c")
+LIBRARY = Path(__file__).with_name("_kernels" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
+FLAGS = ("-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-shared")
+
+
+def find_compiler() -> list[str] | None:
+    """The command of a C compiler; None where there is none."""
+    if os.environ.get("CC"):
+        return shlex.split(os.environ["CC"])
+    for name in ("cc", "gcc", "clang"):
+        if shutil.which(name):
+            return [name]
+    if importlib.util.find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+    return None
+
+
+def compile_library(target: Path = LIBRARY, flags: tuple[str, ...] = ()) -> None:
+    """Compile the library to `target`, which appears whole or not at all.
+
+    Raises
+    ------
+    RuntimeError
+        There is no compiler, or it failed; one line.
+    """
+    command = find_compiler()
+    if command is None:
+        raise RuntimeError("no C compiler found: install cc, gcc or clang, set CC, or `pip install ziglang`")
+    position = () if sys.platform == "win32" else ("-fPIC",)
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
+        built = Path(folder) / target.name
+        call = [*command, *FLAGS, *position, *flags, str(SOURCES / "library.c"), "-o", str(built), "-lm"]
+        done = subprocess.run(call, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"{shlex.join(call)} failed: {done.stderr.strip()}")
+        os.replace(built, target)
+
+
+def is_outdated() -> bool:
+    """Whether this is a checkout whose C is newer than the library."""
+    sources = list(SOURCES.glob("*.[ch]"))
+    return bool(sources) and (
+        not LIBRARY.exists() or max(path.stat().st_mtime for path in sources) > LIBRARY.stat().st_mtime
+    )
+
+
+def _setuptools() -> object:
+    from setuptools import build_meta
+
+    return build_meta
+
+
+def get_requires_for_build_wheel(config_settings: dict | None = None) -> list[str]:
+    """What pip must install before a build: a compiler, where the machine has none."""
+    return [*_setuptools().get_requires_for_build_wheel(config_settings), *([] if find_compiler() else ["ziglang"])]
+
+
+def get_requires_for_build_editable(config_settings: dict | None = None) -> list[str]:
+    """As for a wheel."""
+    return get_requires_for_build_wheel(config_settings)
+
+
+def get_requires_for_build_sdist(config_settings: dict | None = None) -> list[str]:
+    """What setuptools asks for: a source distribution holds no library."""
+    return _setuptools().get_requires_for_build_sdist(config_settings)
+
+
+def prepare_metadata_for_build_wheel(metadata_directory: str, config_settings: dict | None = None) -> str:
+    """As setuptools does it."""
+    return _setuptools().prepare_metadata_for_build_wheel(metadata_directory, config_settings)
+
+
+def prepare_metadata_for_build_editable(metadata_directory: str, config_settings: dict | None = None) -> str:
+    """As setuptools does it."""
+    return _setuptools().prepare_metadata_for_build_editable(metadata_directory, config_settings)
+
+
+def build_sdist(sdist_directory: str, config_settings: dict | None = None) -> str:
+    """The sources; MANIFEST.in leaves out the library of this machine."""
+    return _setuptools().build_sdist(sdist_directory, config_settings)
+
+
+def build_wheel(
+    wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None
+) -> str:
+    """A wheel for this platform and any Python 3: the library needs no Python headers."""
+    compile_library()
+    platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    settings = {**(config_settings or {}), "--build-option": ["--plat-name", platform]}
+    return _setuptools().build_wheel(wheel_directory, settings, metadata_directory)
+
+
+def build_editable(
+    wheel_directory: str, config_settings: dict | None = None, metadata_directory: str | None = None
+) -> str:
+    """A link to the checkout, in which the library is compiled; it is compiled again when its source changes."""
+    compile_library()
+    return _setuptools().build_editable(wheel_directory, config_settings, metadata_directory)

@@ -1,0 +1,178 @@
+/* A cluster from its candidates to its echoes: fit, test, add, accept, docs/algorithms.md 2.3, 4.2. */
+
+static const double UNRESOLVED = 0.25;         /* distance, in its errors, below which two echoes are one. At 1, a quarter
+                                                  of the pairs 1.5 widths apart with an amplitude ratio of 0.5 is lost */
+static const double FAINT = 1;                 /* height in the window, in noise, at which a fit found no echo */
+static const double MOST_SKEW = 0.6;           /* the half after the peak is then twice as wide as the half before it */
+static const double ROOT_PI = 1.7724538509055161;
+
+/* Amplitudes from 0, times within 3 samples of the window, widths and skews as set. */
+static Limits limits_of(const Settings *s, const Window *w) {
+    double first = s->pulse.kind == LOG_NORMAL ? fmax(-3, origin_of(s, w) + LEAST_AWAY) : -3;
+    return (Limits){{0, first, s->width_low, -MOST_SKEW}, {1e9, w->n + 2, s->width_high, MOST_SKEW}};
+}
+
+/* Takes out the echo with the least height in the window, if that is no more than noise; returns whether it did. It
+   would block growth: no larger fit with it is resolved. */
+static int leave_out_faint(Work *work) {
+    const Fit *fit = &work->fit;
+    const int64_t k = fit->k;
+    double least = INFINITY;
+    int64_t lowest = 0;
+    if (k < 2) return 0;
+    for (int64_t j = 0; j < k; j++) {
+        double time = fit->parameters[k + j], out = fmax(fmax(-time, time - (work->window.n - 1)), 0) / fit->parameters[2 * k + j];
+        double height = fit->parameters[j] * exp_lanes(ALL(-0.5 * out * out))[0];
+        if (height < least) { least = height; lowest = j; }
+    }
+    if (least > FAINT * work->window.std) return 0;
+    double *next = work->next.parameters;
+    for (int64_t i = 0; i < 3 * k; i++)
+        if (i % k != lowest) *next++ = fit->parameters[i];
+    work->next.k = k - 1;
+    return 1;
+}
+
+/* Whether no two neighbours are closer than their errors allow (H1), and all echoes have an amplitude. */
+static int is_resolved(const Solution *s) {
+    const double *time = s->parameters + s->k, *error = s->errors + s->k;
+    for (int64_t i = 0; i < s->k; i++) {
+        int64_t after = -1;
+        if (!(s->parameters[i] > 0)) return 0;
+        for (int64_t j = 0; j < s->k; j++)
+            if ((time[j] > time[i] || (time[j] == time[i] && j > i)) && (after < 0 || time[j] < time[after])) after = j;
+        if (after >= 0 && !(time[after] - time[i] > UNRESOLVED * sqrt(error[i] * error[i] + error[after] * error[after]))) return 0;
+    }
+    return 1;
+}
+
+/* Fall of chi2 that one more echo needs: the acceptance, and what a misfit of the pulse model may explain (R3). */
+static double least_fall(const Settings *s, const Fit *fit, double std) {
+    const double *amplitude = fit->parameters, *width = fit->parameters + 2 * fit->k;
+    double energy = 0;
+    for (int64_t j = 0; j < fit->k; j++) energy += amplitude[j] * amplitude[j] * width[j];
+    return s->acceptance + s->misfit * s->misfit * ROOT_PI * energy / (std * std);
+}
+
+/* The echoes of the window from the starts in work->next, into work->best; 0, or -1 where there is no memory.
+
+   A larger fit is kept if it lowers chi2 below the target and its echoes are resolved; else the one before it stands.
+   The number of rounds is bounded, because each echo that is left out must have been there or been added. */
+static int decompose_window(const Settings *s, Work *work) {
+    const Limits limits = limits_of(s, &work->window);
+    const Prior width_prior = {s->width_ref, s->prior_spread, 0, 0}, none = {0};
+    double target = INFINITY;
+    int64_t rounds = 4 * (work->next.k + s->max_echoes);
+    work->best.k = 0;
+    for (; rounds > 0; rounds--) {
+        const int64_t k = work->next.k;
+        memcpy(work->fit.parameters, work->next.parameters, 3 * k * sizeof(double));
+        fit_window(k, 3, s, &limits, k > 1 ? &width_prior : &none, target, work);
+        if (work->fit.hopeless || (target < INFINITY && !(work->fit.cost < target))) return 0;
+        if (leave_out_faint(work)) continue;
+        describe_fit(&limits, work, &work->trial);
+        if (target < INFINITY && !is_resolved(&work->trial)) return 0;
+        Solution better = work->trial;
+        work->trial = work->best; work->best = better;
+        if (!work->fit.converged || !s->grow || k >= s->max_echoes) return 0;
+        hermite_moments(work, &work->fit);
+        if (!is_misfit(s, work, &work->fit)) return 0;
+        if (!reserve(work, k + 1, work->window.vectors)) return -1;
+        double promise = propose_echo(s, work, &work->fit, &limits, &work->next), fall = least_fall(s, &work->fit, work->window.std);
+        if (!(promise > 0.5 * fall)) return 0;
+        target = work->fit.cost - fall;
+    }
+    return 0;
+}
+
+/* The same echoes with a skew of their own each, 1.2. */
+static void free_skews(const Settings *s, Work *work) {
+    const int64_t k = work->best.k;
+    const Limits limits = limits_of(s, &work->window);
+    const Prior prior = {0, 0, s->skew_mean, s->skew_spread};
+    memcpy(work->fit.parameters, work->best.parameters, 3 * k * sizeof(double));
+    for (int64_t j = 0; j < k; j++) work->fit.parameters[3 * k + j] = s->pulse.kind == SKEWED ? s->pulse.skew : 0;
+    fit_window(k, 4, s, &limits, &prior, INFINITY, work);
+    describe_fit(&limits, work, &work->best);
+}
+
+/* The skews of log-normals follow from their widths and times. */
+static void tied_skews(double origin, Solution *s) {
+    const int64_t k = s->k;
+    for (int64_t j = 0; j < k; j++) {
+        double away = fmax(s->parameters[k + j] - origin, LEAST_AWAY), skew = s->parameters[2 * k + j] / away;
+        double by_width = s->errors[2 * k + j] / away, by_time = skew * s->errors[k + j] / away;
+        s->parameters[3 * k + j] = skew;
+        s->errors[3 * k + j] = sqrt(by_width * by_width + by_time * by_time);
+    }
+    s->per = 4;
+}
+
+/* Puts candidates first .. first + k - 1 into the starts, in samples of the window; false without memory. */
+static int set_starts(const Clusters *c, int64_t cluster, Work *work) {
+    const int64_t k = c->number[cluster], first = c->first[cluster], n = c->high[cluster] - c->low[cluster];
+    if (!reserve(work, k, VECTORS(n))) return 0;
+    work->next.k = k;
+    for (int64_t j = 0; j < k; j++) {
+        work->next.parameters[j] = c->amplitude[first + j];
+        work->next.parameters[k + j] = c->time[first + j] - c->low[cluster];
+        work->next.parameters[2 * k + j] = c->width[first + j];
+    }
+    return 1;
+}
+
+static void write_echoes(const Solution *s, int64_t begin, int64_t cluster, int64_t at, const Echoes *out) {
+    out->number[cluster] = s->k; out->converged[cluster] = s->converged;
+    out->misfit[cluster] = s->misfit; out->cost[cluster] = s->cost;
+    for (int64_t j = 0; j < s->k; j++) {
+        double *parameters = out->parameters + 4 * (at + j), *errors = out->errors + 4 * (at + j), *shared = out->shared + 2 * (at + j);
+        for (int64_t q = 0; q < 4; q++) {
+            parameters[q] = q < s->per ? s->parameters[q * s->k + j] : 0;
+            errors[q] = q < s->per ? s->errors[q * s->k + j] : 0;
+        }
+        parameters[1] += begin;
+        shared[0] = s->shared[j]; shared[1] = s->shared[s->k + j];
+        out->at_bound[at + j] = s->at_bound[j];
+    }
+}
+
+/* Echoes of clusters `from` and after it, one after the other, until their room ends. Returns the first cluster that is
+   not done, and in `found` the number of echoes; -1 where there is no memory. */
+EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, const Settings *s, int64_t from, Echoes *out, int64_t *found) {
+    Work work = {0};
+    int64_t i = make_taps(&work, s) ? from : -1;
+    *found = 0;
+    for (; i >= 0 && i < clusters->n; i++) {
+        if (!set_starts(clusters, i, &work)) { i = -1; break; }
+        cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
+        if (decompose_window(s, &work) < 0) { i = -1; break; }
+        if (s->skew_spread > 0) free_skews(s, &work);
+        if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
+        if (*found + work.best.k > out->room) break;
+        write_echoes(&work.best, clusters->low[i], i, *found, out);
+        *found += work.best.k;
+    }
+    free_work(&work);
+    return i;
+}
+
+/* Fall of chi2 that one more echo promises beside the candidates of each cluster, which are the fit; -1 without memory. */
+EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, const Settings *s, double *promise) {
+    Work work = {0};
+    int64_t done = make_taps(&work, s);
+    for (int64_t i = 0; i < clusters->n && done; i++) {
+        const int64_t k = clusters->number[i];
+        done = set_starts(clusters, i, &work) && reserve(&work, k + 1, VECTORS(clusters->high[i] - clusters->low[i]));
+        if (!done) break;
+        cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
+        Limits limits = limits_of(s, &work.window);
+        memcpy(work.fit.parameters, work.next.parameters, 3 * k * sizeof(double));
+        work.fit.k = k; work.fit.per = 3;
+        evaluate_rows(k, 3, s, &work, work.fit.parameters);
+        multiply_rows(3 * k + 1, work.window.vectors, work.rows, work.fit.gram);
+        hermite_moments(&work, &work.fit);
+        promise[i] = propose_echo(s, &work, &work.fit, &limits, &work.next);
+    }
+    free_work(&work);
+    return done ? 0 : -1;
+}

@@ -1,0 +1,295 @@
+/* Least squares of k overlapping echoes in one window by Levenberg and Marquardt's steps, docs/algorithms.md 2.3.
+
+   Equations are in units in which each row has about the same scale, so that their condition is that of the overlap
+   alone: products in float32 are then exact enough, solutions need float64 (H2). Functions take `k` and `per` as
+   arguments, so that the compiler makes copies for one and two echoes, which are most. */
+
+static const double DAMPING = 0.01;            /* of the first step, in units of the diagonal */
+static const double KEPT = 0.75, EASE = 0.2;   /* a step that keeps so much of its promise eases the damping */
+static const double RAISE = 4;                 /* one that is refused raises it, the next in a row twice as much */
+static const double RIDGE = 1e-9;              /* an echo outside its window must not make the equations singular */
+static const double LONG_STEP = 0.1;           /* longer steps, in widths or amplitudes, are never taken unchecked:
+                                                  along the curved valley of overlapping echoes some end 250 in chi2 worse */
+static const double STEEP = 1e3;               /* variance inflation from which products are taken in float64 (H2) */
+static const double UNDETERMINED = 1e30;       /* pivot of an unknown that the data do not determine: it stays 0 */
+static const int MOST_IDLE = 2;                /* iterations with an echo of no amplitude, whose time then drifts: it is
+                                                  left out before the others are fitted on (decompose.h) */
+static const int CENSORED = 100;               /* least iterations with clipped samples: starts are far off (H6) */
+
+static const double LEAST_AWAY = 0.25;         /* of a peak from a log-normal's origin, where the pulse has no width */
+static const double LEAST_WIDTH = 0.1;         /* below it a fit without damping is lost: the echo lies on one sample */
+
+typedef struct { double low[4], high[4]; } Limits;
+typedef struct { double width, spread, skew, skew_spread; } Prior; /* spread 0: none */
+
+/* The sample of the window at which a log-normal as printed in papers begins, 1.2. */
+INLINE double origin_of(const Settings *s, const Window *w) { return s->pulse.from_waveform ? -1.0 - w->begin : -1; }
+
+/* A log-normal whose skew is tied to its origin: kappa = width / (time - origin). */
+static void log_normal(double origin, const Echo *echo, const Window *w, lanes *by_skew, Basis row) {
+    const float skew = echo->width / fmax(echo->time - origin, LEAST_AWAY);
+    row.by_skew = by_skew;
+    skewed(skew, 1, echo, w->x, w->vectors, row);
+    for (int64_t v = 0; v < w->vectors; v++) {
+        row.by_time[v] -= by_skew[v] * (skew * skew);
+        row.by_width[v] += by_skew[v] * skew;
+    }
+}
+
+/* The rows of the model: pulses, derivatives, residual. Clipped samples count only where the model lies below them. */
+INLINE void evaluate_rows(int64_t k, int64_t per, const Settings *s, Work *work, const double *p) {
+    const Window *w = &work->window;
+    const int64_t n = w->vectors;
+    lanes *residual = work->rows + per * k * n;
+    memcpy(residual, w->y, n * sizeof(lanes));
+    for (int64_t j = 0; j < k; j++) {
+        Echo echo = {p[j], p[k + j], p[2 * k + j], per > 3 ? p[3 * k + j] : 0};
+        Basis row = {work->rows + j * n, work->rows + (k + j) * n, work->rows + (2 * k + j) * n, work->rows + (3 * k + j) * n};
+        if (s->pulse.kind == LOG_NORMAL) log_normal(origin_of(s, w), &echo, w, residual + n, row);
+        else evaluate_pulse(&s->pulse, per > 3, &echo, w->x, n, row);
+        const float amplitude = echo.amplitude;
+        for (int64_t v = 0; v < n; v++) residual[v] -= row.pulse[v] * amplitude;
+    }
+    if (!w->any_clipped && !w->is_weighted) return;
+    for (int64_t v = 0; v < n; v++) {
+        lanes weight = w->is_weighted ? w->weight[v] : ALL(1);
+        if (w->any_clipped) weight = pick((w->clipped[v] > 0.f) & (residual[v] <= 0.f), ALL(0), weight);
+        for (int64_t i = 0; i <= per * k; i++) work->rows[i * n + v] *= weight;
+    }
+}
+
+/* Inner products of all rows: the lower triangle of gram, (rows, rows). */
+INLINE void multiply_rows(int64_t rows, int64_t vectors, const lanes *row, double *gram) {
+    for (int64_t i = 0; i < rows; i++)
+        for (int64_t j = 0; j <= i; j++) {
+            const lanes *a = row + i * vectors, *b = row + j * vectors;
+            lanes sum = a[0] * b[0];
+            for (int64_t v = 1; v < vectors; v++) sum += a[v] * b[v];
+            gram[i * rows + j] = sum_lanes(sum);
+        }
+}
+
+/* Adds to the products what is known of widths (H1) and skews (1.2) before the fit; the cost of that. */
+INLINE double add_prior(int64_t k, int64_t per, const Prior *prior, double std, const double *p, double *gram) {
+    const int64_t rows = per * k + 1;
+    double cost = 0;
+    for (int64_t j = 0; j < k; j++) {
+        double height = fmax(p[j], 0.5 * std), lack = prior->width - p[2 * k + j];
+        if (prior->spread > 0 && lack > 0) {
+            double unit = p[2 * k + j] / height, weight = std * std / (prior->spread * prior->spread);
+            int64_t at = 2 * k + j;
+            cost += weight * lack * lack;
+            gram[at * rows + at] += weight * unit * unit;
+            gram[(rows - 1) * rows + at] += weight * unit * lack;
+        }
+        if (per > 3 && prior->skew_spread > 0) {
+            double unit = 1 / height, weight = std * std / (prior->skew_spread * prior->skew_spread);
+            int64_t at = 3 * k + j;
+            lack = prior->skew - p[at];
+            cost += weight * lack * lack;
+            gram[at * rows + at] += weight * unit * unit;
+            gram[(rows - 1) * rows + at] += weight * unit * lack;
+        }
+    }
+    return cost;
+}
+
+/* matrix = L D L', in place: L below the diagonal, D in pivot. Pivots up to `least` are as if infinite. */
+INLINE void factor(int64_t n, double *matrix, double *pivot, double least) {
+    for (int64_t j = 0; j < n; j++) {
+        pivot[j] = matrix[j * n + j] > least ? matrix[j * n + j] : UNDETERMINED;
+        for (int64_t i = j + 1; i < n; i++) {
+            double share = matrix[i * n + j] / pivot[j];
+            for (int64_t m = j + 1; m <= i; m++) matrix[i * n + m] -= share * matrix[m * n + j];
+        }
+        for (int64_t i = j + 1; i < n; i++) matrix[i * n + j] /= pivot[j];
+    }
+}
+
+INLINE void solve(int64_t n, const double *lower, const double *pivot, double *right) {
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < i; j++) right[i] -= lower[i * n + j] * right[j];
+    for (int64_t i = 0; i < n; i++) right[i] /= pivot[i];
+    for (int64_t i = n - 1; i >= 0; i--)
+        for (int64_t j = i + 1; j < n; j++) right[i] -= lower[j * n + i] * right[j];
+}
+
+/* What one unit of a row's coefficient means: 1 for amplitudes, width / amplitude for times and widths, 1 / amplitude
+   for skews. Amplitudes below half of the noise count as that. */
+INLINE double unit_of(int64_t k, int64_t i, const double *p, double std) {
+    int64_t kind = i / k, j = i - kind * k;
+    double height = fmax(p[j], 0.5 * std);
+    return kind == 0 ? 1 : kind == 3 ? 1 / height : p[2 * k + j] / height;
+}
+
+/* Marquardt's step in units of the rows, 0 where a limit holds a parameter; returns the fall of the cost it promises. */
+INLINE double find_step(int64_t k, int64_t per, Work *work, const double *p, const double *gram, const Limits *limits, double damping) {
+    const int64_t n = per * k, rows = n + 1;
+    const double *slope = gram + n * rows;
+    double promise = 0;
+    for (int64_t i = 0; i < n; i++) {
+        int64_t kind = i / k;
+        work->frozen[i] = (p[i] <= limits->low[kind] && slope[i] < 0) || (p[i] >= limits->high[kind] && slope[i] > 0);
+    }
+    for (int64_t i = 0; i < n; i++) {
+        for (int64_t j = 0; j <= i; j++) work->matrix[i * n + j] = work->frozen[i] || work->frozen[j] ? 0 : gram[i * rows + j];
+        work->matrix[i * n + i] = work->matrix[i * n + i] * (1 + damping) + RIDGE;
+        work->step[i] = work->frozen[i] ? 0 : slope[i];
+    }
+    factor(n, work->matrix, work->pivot, 1e-300);
+    solve(n, work->matrix, work->pivot, work->step);
+    for (int64_t i = 0; i < n; i++) promise += work->frozen[i] ? 0 : work->step[i] * slope[i];
+    return promise;
+}
+
+/* The parameters after the step, within their limits; returns whether a step is long. */
+INLINE int take_step(int64_t k, int64_t per, const Work *work, const double *p, const Limits *limits, double std, double *after) {
+    int is_long = 0;
+    for (int64_t i = 0; i < per * k; i++) {
+        int64_t kind = i / k, j = i - kind * k;
+        after[i] = fmin(fmax(p[i] + work->step[i] * unit_of(k, i, p, std), limits->low[kind]), limits->high[kind]);
+        double scale = kind == 0 ? p[j] + std : kind == 3 ? 1 : p[2 * k + j];
+        is_long |= fabs(after[i] - p[i]) > LONG_STEP * scale;
+    }
+    return is_long;
+}
+
+INLINE int has_vanished(int64_t k, const double *amplitude) {
+    int any = 0;
+    for (int64_t j = 0; j < k; j++) any |= amplitude[j] <= 0;
+    return any;
+}
+
+/* Fits from fit->parameters. Given up as hopeless where it cannot come below the cost `target`. */
+INLINE void fit_echoes(int64_t k, int64_t per, const Settings *s, const Limits *limits, const Prior *prior, double target, Work *work) {
+    const int64_t n = per * k, rows = n + 1;
+    const double std = work->window.std, variance = std * std;
+    int64_t most = work->window.any_clipped && s->max_iterations < CENSORED ? CENSORED : s->max_iterations;
+    Fit *fit = &work->fit;
+    double *trial = work->kept, damping = DAMPING, promised = INFINITY, raise = RAISE;
+    int idle = 0;
+    for (int64_t i = 0; i < n; i++) trial[i] = fmin(fmax(fit->parameters[i], limits->low[i / k]), limits->high[i / k]);
+    fit->cost = INFINITY; fit->converged = fit->hopeless = 0;
+    for (int64_t iteration = 0;; iteration++) {
+        evaluate_rows(k, per, s, work, trial);
+        multiply_rows(rows, work->window.vectors, work->rows, work->products);
+        double cost = work->products[n * rows + n] + add_prior(k, per, prior, std, trial, work->products), before = fit->cost;
+        int accepted = iteration == 0 || cost <= fit->cost * (1 + 1e-6);
+        if (iteration) damping = fmax(damping * (!accepted ? raise : fit->cost - cost > KEPT * promised ? EASE : 1), 1e-7);
+        raise = accepted ? RAISE : 2 * raise;
+        if (accepted) {
+            memcpy(fit->parameters, trial, n * sizeof(double));
+            memcpy(fit->gram, work->products, rows * rows * sizeof(double));
+            fit->cost = cost;
+        }
+        idle = k > 1 && has_vanished(k, fit->parameters) ? idle + 1 : 0;
+        if (idle == MOST_IDLE) return;
+        promised = find_step(k, per, work, fit->parameters, fit->gram, limits, damping);
+        int is_long = take_step(k, per, work, fit->parameters, limits, std, trial);
+        int settled = accepted && promised < s->tolerance * variance && !is_long;
+        fit->converged = settled || (iteration > 3 && accepted && before - fit->cost < 0.1 * s->tolerance * variance);
+        fit->hopeless = iteration >= 2 && fit->cost - 4 * promised > target * variance;
+        if (fit->hopeless) return;
+        if (!fit->converged && damping <= 1e6 && iteration + 1 < most) continue;
+        if (settled) { memcpy(fit->parameters, trial, n * sizeof(double)); fit->cost -= promised; } /* so short a step needs no check */
+        fit->cost /= variance;
+        if (fit->converged) return;
+        evaluate_rows(k, per, s, work, fit->parameters); /* the rows are those of a step that was refused */
+        multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+        return;
+    }
+}
+
+/* Steps of Gauss and Newton without damping or limits, from fit->parameters: lost from bad starts (1.3), and then the
+   start itself. */
+static void fit_undamped(int64_t k, const Settings *s, const Limits *limits, Work *work) {
+    const int64_t n = 3 * k, rows = n + 1, samples = work->window.n;
+    const double std = work->window.std;
+    const Limits none = {{-INFINITY, -INFINITY, -INFINITY, 0}, {INFINITY, INFINITY, INFINITY, 0}};
+    Fit *fit = &work->fit;
+    double *start = work->kept, *p = fit->parameters;
+    memcpy(start, p, n * sizeof(double));
+    fit->converged = fit->hopeless = 0;
+    int is_sane = 1;
+    for (int64_t iteration = 0; iteration < s->max_iterations && is_sane && !fit->converged; iteration++) {
+        evaluate_rows(k, 3, s, work, p);
+        multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+        double promise = find_step(k, 3, work, p, fit->gram, &none, 0);
+        for (int64_t i = 0; i < n; i++) work->step[i] *= unit_of(k, i, p, std);
+        for (int64_t i = 0; i < n; i++) p[i] += work->step[i];
+        for (int64_t j = 0; j < k; j++)
+            is_sane &= p[j] > 0 && p[j] < limits->high[0] && p[2 * k + j] > LEAST_WIDTH && p[2 * k + j] < samples
+                && p[k + j] > -samples && p[k + j] < 2 * samples;
+        fit->converged = is_sane && promise < s->tolerance * std * std;
+    }
+    if (!is_sane) memcpy(p, start, n * sizeof(double));
+    for (int64_t j = 2 * k; j < n; j++) p[j] = fmin(fmax(p[j], limits->low[2]), limits->high[2]);
+    evaluate_rows(k, 3, s, work, p);
+    multiply_rows(rows, work->window.vectors, work->rows, fit->gram);
+    fit->cost = fit->gram[n * rows + n] / (std * std);
+}
+
+/* The inverse of the equations: variances, and what the width shares with amplitude and time; false if they are steep. */
+INLINE int invert(int64_t k, int64_t per, Work *work, const double *gram, double *variance, double *shared) {
+    const int64_t n = per * k, rows = n + 1;
+    double *matrix = work->matrix, *column = work->column;
+    int is_flat = 1;
+    for (int64_t i = 0; i < n; i++) {
+        for (int64_t j = 0; j <= i; j++) matrix[i * n + j] = gram[i * rows + j];
+        matrix[i * n + i] = matrix[i * n + i] * (1 + RIDGE) + RIDGE;
+    }
+    factor(n, matrix, work->pivot, 1e-300);
+    for (int64_t c = 0; c < n; c++) {
+        memset(column, 0, n * sizeof(double));
+        column[c] = 1;
+        solve(n, matrix, work->pivot, column);
+        variance[c] = column[c];
+        is_flat &= column[c] * gram[c * rows + c] < STEEP && column[c] > 0;
+        if (c / k == 2) { shared[c - 2 * k] = column[c - 2 * k]; shared[c - k] = column[c - k]; }
+    }
+    return is_flat;
+}
+
+/* One standard deviation of each parameter and the covariances of widths, in float64 where echoes overlap much. */
+INLINE void find_errors(int64_t k, int64_t per, Work *work, Solution *out) {
+    const int64_t n = per * k, rows = n + 1, samples = work->window.vectors * LANES;
+    const double *p = work->fit.parameters, std = work->window.std;
+    if (!invert(k, per, work, work->fit.gram, out->errors, out->shared)) {
+        const float *row = (const float *)work->rows;
+        for (int64_t i = 0; i < n; i++)
+            for (int64_t j = 0; j <= i; j++) {
+                double sum = 0;
+                for (int64_t x = 0; x < samples; x++) sum += (double)row[i * samples + x] * row[j * samples + x];
+                work->products[i * rows + j] = sum;
+            }
+        invert(k, per, work, work->products, out->errors, out->shared);
+    }
+    for (int64_t i = 0; i < n; i++) out->errors[i] = sqrt(fmax(out->errors[i], 0)) * unit_of(k, i, p, std) * std;
+    for (int64_t i = 0; i < 2 * k; i++) out->shared[i] *= unit_of(k, i, p, std) * unit_of(k, 2 * k + i % k, p, std) * std * std;
+}
+
+/* `call` for the numbers of echoes that are common, so that their loops have constant ends, and for any other. */
+#define FOR_EACH_NUMBER(call, ...) \
+    (k == 1 && per == 3 ? call(1, 3, __VA_ARGS__) : k == 2 && per == 3 ? call(2, 3, __VA_ARGS__) : call(k, per, __VA_ARGS__))
+
+static void fit_window(int64_t k, int64_t per, const Settings *s, const Limits *limits, const Prior *prior, double target, Work *work) {
+    work->fit.k = k; work->fit.per = per;
+    if (s->undamped) fit_undamped(k, s, limits, work);
+    else FOR_EACH_NUMBER(fit_echoes, s, limits, prior, target, work);
+}
+
+/* The fit as a solution: errors, root mean square residual in noise, parameters that lie on their limits. */
+static void describe_fit(const Limits *limits, Work *work, Solution *out) {
+    const int64_t k = work->fit.k, per = work->fit.per;
+    const Window *w = &work->window;
+    const lanes *residual = work->rows + per * k * w->vectors;
+    FOR_EACH_NUMBER(find_errors, work, out);
+    lanes squares = ALL(0);
+    for (int64_t v = 0; v < w->vectors; v++) squares += residual[v] * residual[v];
+    out->misfit = sqrt(sum_lanes(squares) / (w->used > 0 ? w->used : 1)) / w->std;
+    out->k = k; out->per = per; out->converged = work->fit.converged; out->cost = work->fit.cost;
+    memcpy(out->parameters, work->fit.parameters, per * k * sizeof(double));
+    memset(out->at_bound, 0, k);
+    for (int64_t i = 0; i < per * k; i++)
+        out->at_bound[i % k] |= out->parameters[i] <= limits->low[i / k] || out->parameters[i] >= limits->high[i / k];
+}

@@ -1,0 +1,50 @@
+/* Four samples at a time. `lanes` is a vector type of GCC and Clang: a + b * c works on all four, as in NumPy.
+
+   Sums run in four fixed parts that are then added in a fixed order, so that builds for SSE2, AVX2, AVX-512 and NEON
+   give the same bits. Four fill one register of every processor; eight and sixteen were 1.4 and 1.7 times slower on
+   plain x86-64. Nothing here calls the mathematics library but for functions that are exact (sqrt, rint, ceil): its
+   other results depend on the processor. */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define LANES 4
+#define INLINE static inline __attribute__((always_inline))
+typedef float lanes __attribute__((vector_size(4 * LANES), aligned(16)));
+typedef int32_t lane_bits __attribute__((vector_size(4 * LANES), aligned(16)));
+
+#define ALL(number) ((lanes){0} + (float)(number))
+#define VECTORS(samples) (((samples) + LANES - 1) / LANES)
+
+INLINE lanes pick(lane_bits on, lanes yes, lanes no) { return (lanes)((on & (lane_bits)yes) | (~on & (lane_bits)no)); }
+INLINE lanes least_of(lanes a, lanes b) { return pick(a < b, a, b); }
+INLINE lanes most_of(lanes a, lanes b) { return pick(a > b, a, b); }
+
+INLINE float sum_lanes(lanes v) { return (v[0] + v[2]) + (v[1] + v[3]); }
+
+/* e^a for a <= 0, error 1e-7 of the value; 0 below e^-40: nothing that small changes a fit, and squares of still smaller
+   numbers make processors slow. e^a = 2^n e^r with |r| <= ln(2) / 2; the series in r is a Chebyshev fit. */
+INLINE lanes exp_lanes(lanes a) {
+    lanes inside = most_of(a, ALL(-40));
+    lane_bits n = __builtin_convertvector(inside * 1.44269504f - 0.5f, lane_bits);
+    lanes whole = __builtin_convertvector(n, lanes);
+    lanes r = inside - whole * 0.693145752f - whole * 1.42860677e-6f;
+    lanes series = ((r * 1.39336509e-3f + 8.36317986e-3f) * r + 4.16664667e-2f) * r + 1.66665763e-1f;
+    lane_bits scale = (n + 127) << 23;
+    return pick(a > -40.f, ((series * r + 0.5f) * r * r + r + 1.f) * (lanes)scale, ALL(0));
+}
+
+/* ln a for a > 0, error 1e-7: a = 2^n m with m near 1, ln m = 2 atanh((m - 1) / (m + 1)) as its series. */
+INLINE lanes log_lanes(lanes a) {
+    lane_bits bits = (lane_bits)a - 0x3f3504f3, n = bits >> 23; /* from the root of 1/2 on */
+    lanes m = (lanes)((bits & 0x7fffff) + 0x3f3504f3), q = (m - 1.f) / (m + 1.f), s = q * q;
+    lanes series = (((s * 0.1111111f + 0.14285714f) * s + 0.2f) * s + 0.33333333f) * s + 1.f;
+    return __builtin_convertvector(n, lanes) * 0.69314718f + 2.f * q * series;
+}
+
+/* ln(1 + a) for a > -1, exact for small a too: rounding of 1 + a is made good by the factor a / ((1 + a) - 1). */
+INLINE lanes log1p_lanes(lanes a) {
+    lanes one = a + 1.f, rounded = one - 1.f;
+    return pick(rounded == 0.f, a, log_lanes(one) * a / pick(rounded == 0.f, ALL(1), rounded));
+}

@@ -1,0 +1,16 @@
+/* The library of kernels/: one compilation, arrays in, arrays out. Read decompose.h first, then fit.h and next_echo.h.
+
+   No state is kept between calls. Python checks shapes and ranges before each call (kernels/library.py). */
+#ifdef _WIN32
+#define EXPORT __declspec(dllexport)
+#else
+#define EXPORT __attribute__((visibility("default")))
+#endif
+#include "lanes.h"
+#include "types.h"
+#include "pulse.h"
+#include "work.h"
+#include "window.h"
+#include "fit.h"
+#include "next_echo.h"
+#include "decompose.h"

@@ -1,0 +1,159 @@
+/* Does the residual hold more than noise, and where would one more echo explain most? docs/algorithms.md 2.3, 4.2. */
+
+static const double SMOOTH_GAIN = 0.61237243569579452; /* of white noise through [1 2 1]/4 */
+static const double HERMITE_REACH = 5;         /* widths: beyond, the pulse is zero */
+static const double LEAST_PIVOT = 1e-7;        /* below is what rounding of float32 products leaves */
+static const double LEAST_NEW = 0.03;          /* share of a new echo's energy that the present ones must leave */
+
+/* Gauss-Hermite moments h3, h4 of the residual around each echo: N(0, 1) if the fit is right. The directions are the next
+   two after the three that a fit removes: (8 z^3 - 12 z) e and (16 z^4 - 48 z^2 + 12) e. */
+static void hermite_moments(Work *work, const Fit *fit) {
+    const Window *w = &work->window;
+    const int64_t k = fit->k, n = w->vectors;
+    const lanes *row = work->rows, *residual = work->rows + 3 * k * n;
+    for (int64_t j = 0; j < k; j++) {
+        lanes norm3 = ALL(0), norm4 = ALL(0), sum3 = ALL(0), sum4 = ALL(0);
+        float time = fit->parameters[k + j], inverse = 1 / fit->parameters[2 * k + j];
+        for (int64_t v = 0; v < n; v++) {
+            lanes z = least_of(most_of((w->x[v] - time) * inverse, ALL(-HERMITE_REACH)), ALL(HERMITE_REACH));
+            lanes pulse = row[j * n + v], by_time = row[(k + j) * n + v], by_width = row[(2 * k + j) * n + v];
+            lanes third = by_width * z, fourth = third * z;
+            third = third * 8.f - by_time * 12.f;
+            fourth = fourth * 16.f - by_width * 48.f + pulse * 12.f;
+            norm3 += third * third; sum3 += third * residual[v];
+            norm4 += fourth * fourth; sum4 += fourth * residual[v];
+        }
+        work->h3[j] = sum_lanes(sum3) / sqrt(fmax(sum_lanes(norm3), 1e-12)) / w->std;
+        work->h4[j] = sum_lanes(sum4) / sqrt(fmax(sum_lanes(norm4), 1e-12)) / w->std;
+    }
+}
+
+/* Whether the smoothed residual or its moments exceed what noise explains. Needs hermite_moments. */
+static int is_misfit(const Settings *s, const Work *work, const Fit *fit) {
+    const Window *w = &work->window;
+    const float *residual = (const float *)(work->rows + 3 * fit->k * w->vectors);
+    double shape = 0;
+    float highest = 0;
+    for (int64_t i = 1; i + 1 < w->n; i++) highest = fmaxf(highest, residual[i - 1] + residual[i + 1] + 2 * residual[i]);
+    for (int64_t j = 0; j < fit->k; j++) shape = fmax(shape, work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j]);
+    return 0.25 * highest > s->gate_residual * SMOOTH_GAIN * w->std || shape > s->gate_hermite;
+}
+
+/* Half of a Gaussian of height 1 with the width of a new echo, up to three widths, and after it the same squared. */
+static int make_taps(Work *work, const Settings *s) {
+    work->reach = (int64_t)ceil(3 * s->width_ref);
+    if (!enlarge(&work->taps, 2 * (work->reach + 1) * sizeof(float))) return 0;
+    for (int64_t i = 0; i <= work->reach; i++) {
+        double z = i / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];
+        work->taps[i] = tap;
+        work->taps[work->reach + 1 + i] = tap * tap;
+    }
+    return 1;
+}
+
+/* A row correlated with symmetric taps, 0 outside of the window. */
+static void correlate(const Work *work, const lanes *row, const float *taps, lanes *out) {
+    const int64_t n = work->window.vectors, before = VECTORS(work->reach);
+    float *padded = (float *)work->padded;
+    memset(padded, 0, before * sizeof(lanes));
+    memcpy(padded + before * LANES, row, n * sizeof(lanes));
+    memset(padded + (before + n) * LANES, 0, before * sizeof(lanes));
+    for (int64_t v = 0; v < n; v++) {
+        const float *here = padded + (before + v) * LANES;
+        lanes sum = row[v] * taps[0], left, right;
+        for (int64_t i = 1; i <= work->reach; i++) {
+            memcpy(&left, here - i, sizeof left);
+            memcpy(&right, here + i, sizeof right);
+            sum += (left + right) * taps[i];
+        }
+        out[v] = sum;
+    }
+}
+
+/* What a new echo at each sample would have in common with none of the present ones: its energy, and its share of the
+   residual, by taking off the rows of the factorised equations one after the other. */
+static void project_out(Work *work, const Fit *fit, lanes *energy, lanes *onto) {
+    const int64_t p = 3 * fit->k, n = work->window.vectors;
+    double *lower = work->matrix, *right = work->step;
+    for (int64_t i = 0; i < p; i++) {
+        for (int64_t j = 0; j <= i; j++) lower[i * p + j] = fit->gram[i * (p + 1) + j];
+        lower[i * p + i] = lower[i * p + i] * (1 + RIDGE) + RIDGE;
+        right[i] = fit->gram[p * (p + 1) + i];
+    }
+    factor(p, lower, work->pivot, LEAST_PIVOT);
+    for (int64_t i = 0; i < p; i++) {
+        lanes *row = work->about + i * n;
+        for (int64_t j = 0; j < i; j++) {
+            const float share = lower[i * p + j];
+            right[i] -= lower[i * p + j] * right[j];
+            for (int64_t v = 0; v < n; v++) row[v] -= work->about[j * n + v] * share;
+        }
+        const float inverse = 1 / work->pivot[i], rest = right[i];
+        for (int64_t v = 0; v < n; v++) {
+            lanes share = row[v] * inverse;
+            energy[v] -= share * row[v];
+            onto[v] -= share * rest;
+        }
+    }
+}
+
+/* One echo as two where its top is too flat: no single new echo can flatten a top. The pair leaves h4 < 0, and
+   h3^2 + h4^2 is the fall of chi2 that it promises; it is taken where that is more. */
+static double split_flat(const Settings *s, const Work *work, const Fit *fit, double promise, Fit *next) {
+    const int64_t k = fit->k;
+    const double *p = fit->parameters;
+    int64_t echo = -1;
+    for (int64_t j = 0; j < k; j++) {
+        double gain = work->h4[j] < 0 ? work->h3[j] * work->h3[j] + work->h4[j] * work->h4[j] : 0;
+        if (gain > promise) { promise = gain; echo = j; }
+    }
+    if (echo < 0) return promise;
+    double amplitude = p[echo], time = p[k + echo], broad = p[2 * k + echo], narrow = fmin(broad, 1.1 * s->width_ref);
+    double apart = fmax(sqrt(broad * broad - narrow * narrow), 0.5 * broad), half = 0.5 * amplitude * broad / narrow;
+    double first[3] = {half, time - apart, narrow}, second[3] = {half, time + apart, narrow};
+    for (int64_t q = 0; q < 3; q++) {
+        memcpy(next->parameters + q * (k + 1), p + q * k, k * sizeof(double));
+        next->parameters[q * (k + 1) + echo] = first[q];
+        next->parameters[q * (k + 1) + k] = second[q];
+    }
+    return promise;
+}
+
+/* The best new echo: the start of the larger fit, and the fall of chi2 that it promises. One Gauss-Newton step in which
+   the new amplitude starts at zero. Needs hermite_moments. */
+static double propose_echo(const Settings *s, Work *work, const Fit *fit, const Limits *limits, Fit *next) {
+    const Window *w = &work->window;
+    const int64_t k = fit->k, p = 3 * k, n = w->vectors;
+    lanes *onto = work->about + p * n;
+    for (int64_t i = 0; i <= p; i++) correlate(work, work->rows + i * n, work->taps, work->about + i * n);
+    for (int64_t v = 0; v < n; v++) work->rows[v] = pick(w->x[v] >= 0.f, ALL(1), ALL(0)); /* the pulses are not needed any more */
+    correlate(work, work->rows, work->taps + work->reach + 1, work->energy);
+    float most = 0, *left = (float *)work->energy;
+    for (int64_t i = 0; i < w->n; i++) most = fmaxf(most, left[i]);
+    project_out(work, fit, work->energy, onto);
+    int64_t place = 0;
+    double best = 0, amplitude = 0;
+    for (int64_t i = 0; i < w->n; i++) {
+        float share = ((float *)onto)[i];
+        if (!(left[i] > LEAST_NEW * most && share > 0 && ((const float *)w->x)[i] >= 0)) continue;
+        double score = (double)share * share / left[i];
+        if (score > best) { best = score; place = i; amplitude = share / left[i]; }
+    }
+    double *change = work->column;
+    for (int64_t i = 0; i < p; i++) change[i] = ((float *)(work->about + i * n))[place] / work->pivot[i];
+    for (int64_t i = p - 1; i >= 0; i--)
+        for (int64_t j = i + 1; j < p; j++) change[i] -= work->matrix[j * p + i] * change[j];
+    next->k = k + 1; next->per = 3;
+    for (int64_t j = 0; j < k; j++) {
+        double a = fit->parameters[j], time = fit->parameters[k + j], width = fit->parameters[2 * k + j];
+        double unit = -amplitude * unit_of(k, k + j, fit->parameters, w->std);
+        next->parameters[j] = fmax(a - change[j] * amplitude, 0.2 * a);
+        next->parameters[k + 1 + j] = time + fmin(fmax(change[k + j] * unit, -s->width_ref), s->width_ref);
+        next->parameters[2 * k + 2 + j] = width + fmin(fmax(change[2 * k + j] * unit, -0.4 * width), 0.3 * width);
+    }
+    next->parameters[k] = amplitude; next->parameters[2 * k + 1] = place; next->parameters[3 * k + 2] = s->width_ref;
+    double promise = split_flat(s, work, fit, best / (w->std * w->std), next);
+    for (int64_t i = 0; i < 3 * k + 3; i++)
+        next->parameters[i] = fmin(fmax(next->parameters[i], limits->low[i / (k + 1)]), limits->high[i / (k + 1)]);
+    return promise;
+}

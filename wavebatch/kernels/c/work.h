@@ -1,0 +1,76 @@
+/* Memory of one call. It grows to the largest window and cluster that it meets, and is freed at the end of the call. */
+
+typedef struct { /* samples of one cluster, padded to whole vectors */
+    int64_t begin, n, vectors, used;           /* used: recorded samples */
+    double std;
+    lanes *y, *x;                              /* signal; position, OUTSIDE where there is no sample */
+    lanes *clipped, *weight;                   /* 1 where clipped; noise without signal over noise */
+    int any_clipped, is_weighted;
+} Window;
+
+typedef struct { /* k echoes with `per` parameters each: k amplitudes, then k times, widths, skews */
+    int64_t k, per;
+    int converged, hopeless;
+    double cost;                               /* chi2 and prior */
+    double *parameters, *gram;                 /* gram: products of the rows, the last row is the residual */
+} Fit;
+
+typedef struct { /* a fit with its errors; laid out as `parameters` */
+    int64_t k, per;
+    int converged;
+    double cost, misfit;
+    double *parameters, *errors, *shared;
+    uint8_t *at_bound;
+} Solution;
+
+typedef struct {
+    int64_t room, vectors;                     /* echoes and vectors for which there is memory */
+    Window window;
+    lanes *rows, *about, *padded, *energy;     /* of the fit; correlated with a new pulse */
+    Fit fit, next;
+    Solution trial, best;
+    double *kept, *products, *matrix, *pivot, *step, *column, *h3, *h4;
+    uint8_t *frozen;
+    float *taps;
+    int64_t reach;                             /* of the taps of a new pulse */
+} Work;
+
+static void *const NO_MEMORY = 0;
+
+/* Enlarges a buffer and keeps what is in it; false where there is no memory. */
+static int enlarge(void *buffer, size_t bytes) {
+    void *larger = realloc(*(void **)buffer, bytes);
+    if (larger == NO_MEMORY) return 0;
+    *(void **)buffer = larger;
+    return 1;
+}
+
+/* Memory for k echoes in a window of so many vectors; what is there stays. */
+static int reserve(Work *w, int64_t k, int64_t vectors) {
+    if (k <= w->room && vectors <= w->vectors) return 1;
+    k = k > w->room ? k + 2 : w->room;
+    vectors = vectors > w->vectors ? vectors + 2 : w->vectors;
+    size_t row = vectors * sizeof(lanes), p = 4 * k + 1, number = sizeof(double);
+    size_t padded = row + 2 * VECTORS(w->reach) * sizeof(lanes);
+    int good = enlarge(&w->window.y, row) && enlarge(&w->window.x, row) && enlarge(&w->window.clipped, row)
+        && enlarge(&w->window.weight, row) && enlarge(&w->rows, p * row) && enlarge(&w->about, p * row)
+        && enlarge(&w->padded, padded) && enlarge(&w->energy, row)
+        && enlarge(&w->fit.parameters, p * number) && enlarge(&w->fit.gram, p * p * number) && enlarge(&w->next.parameters, p * number)
+        && enlarge(&w->kept, p * number) && enlarge(&w->products, p * p * number) && enlarge(&w->matrix, p * p * number)
+        && enlarge(&w->pivot, p * number) && enlarge(&w->step, p * number) && enlarge(&w->column, p * p * number)
+        && enlarge(&w->h3, p * number) && enlarge(&w->h4, p * number) && enlarge(&w->frozen, p);
+    Solution *both[] = {&w->trial, &w->best};
+    for (int i = 0; i < 2 && good; i++)
+        good = enlarge(&both[i]->parameters, p * number) && enlarge(&both[i]->errors, p * number)
+            && enlarge(&both[i]->shared, p * number) && enlarge(&both[i]->at_bound, p);
+    if (good) { w->room = k; w->vectors = vectors; }
+    return good;
+}
+
+static void free_work(Work *w) {
+    void *all[] = {w->window.y, w->window.x, w->window.clipped, w->window.weight, w->rows, w->about, w->padded, w->energy,
+        w->fit.parameters, w->fit.gram, w->next.parameters, w->kept, w->products, w->matrix, w->pivot, w->step, w->column, w->h3, w->h4,
+        w->frozen, w->taps, w->trial.parameters, w->trial.errors, w->trial.shared, w->trial.at_bound, w->best.parameters,
+        w->best.errors, w->best.shared, w->best.at_bound};
+    for (size_t i = 0; i < sizeof all / sizeof *all; i++) free(all[i]);
+}
