@@ -14,7 +14,7 @@ from wavebatch.stages.chain_file import load_profile
 def make_job(path, *, profile="fast", columns=None, **options) -> StripJob:
     """A job of a strip with a shipped chain."""
     chain = load_profile(profile)
-    return StripJob(Path(path), chain, RunOptions(**options), choose_columns(chain, columns))
+    return StripJob(Path(path), chain, RunOptions(profile=profile, **options), choose_columns(chain, columns))
 
 
 def run_one(path, folder, *, profile="fast", columns=None, batch=None, **options):

@@ -122,14 +122,12 @@ def test_a_chunk_that_fails_names_the_cloud(tmp_path):
 needs_memory = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="a place for files in memory")
 
 
-_ELSEWHERE = """
-from pathlib import Path
-from wavebatch.files.disk import temp_folders
-temp_folders.MEMORY_PLACE = Path({place!r})  # in the worker processes too, which run this script up to here
-if __name__ == "__main__":
-    from wavebatch.__main__ import main
-    main()
-"""
+def _elsewhere(tmp_path, place):
+    """Environment in which processes and their workers have another place in memory: Python reads sitecustomize."""
+    (tmp_path / "site").mkdir()
+    text = "from pathlib import Path\nfrom wavebatch.files.disk import temp_folders\n"
+    (tmp_path / "site" / "sitecustomize.py").write_text(f"{text}temp_folders.MEMORY_PLACE = Path({str(place)!r})\n")
+    return {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
 
 
 @needs_memory
@@ -139,13 +137,13 @@ def test_a_killed_run_leaves_nothing_in_memory(tmp_path):
     simulate_strip("flat", tmp_path / "a.las", pulses=400_000, seed=1)
     place = tmp_path / "memory"
     place.mkdir()
-    script = tmp_path / "run.py"
-    script.write_text(_ELSEWHERE.format(place=str(place)))
-    command = [sys.executable, str(script), "run", str(tmp_path / "a.las"), "-o", str(tmp_path / "out")]
+    environment = _elsewhere(tmp_path, place)
+    command = [sys.executable, "-m", "wavebatch", "run", str(tmp_path / "a.las"), "-o", str(tmp_path / "out")]
     deadline, killed = time.monotonic() + 100, False
     while not killed:  # again if it ended before this process, on a busy machine, saw rows
         assert time.monotonic() < deadline
-        process = subprocess.Popen([*command, "--profile", "fast", "--quiet", "--jobs", "2", "--overwrite"])
+        process = subprocess.Popen([*command, "--profile", "fast", "--quiet", "--jobs", "2", "--overwrite"],
+                                   env=environment)  # fmt: skip
         while not list(place.glob("*/tmp*")) and process.poll() is None:
             time.sleep(0.001)
         process.send_signal(signal.SIGKILL)
@@ -157,9 +155,6 @@ def test_a_killed_run_leaves_nothing_in_memory(tmp_path):
 
 _IDLE = """
 import os, signal
-from pathlib import Path
-from wavebatch.files.disk import temp_folders
-temp_folders.MEMORY_PLACE = Path({place!r})
 if __name__ == "__main__":
     from wavebatch.batch.workers.processes import Workers
     with Workers(2) as workers:
@@ -177,8 +172,8 @@ def test_workers_that_wait_for_calls_clean_up_before_they_end(tmp_path):
     place = tmp_path / "memory"
     place.mkdir()
     script = tmp_path / "idle.py"
-    script.write_text(_IDLE.format(place=str(place)))
-    assert subprocess.run([sys.executable, str(script)]).returncode == -signal.SIGKILL
+    script.write_text(_IDLE)
+    assert subprocess.run([sys.executable, str(script)], env=_elsewhere(tmp_path, place)).returncode == -signal.SIGKILL
     deadline = time.monotonic() + 60
     while list(place.iterdir()):
         assert time.monotonic() < deadline, "the memory is never given back"

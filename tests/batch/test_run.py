@@ -272,7 +272,7 @@ def test_a_prepared_strip_travels_between_processes(tiny_strip):
     prepared = prepare_strip(make_job(tiny_strip))
     again = pickle.loads(pickle.dumps(prepared))
     assert again.system == prepared.system and again.layout.dtype == prepared.layout.dtype
-    assert again.job.options == RunOptions() and again.job.columns == prepared.job.columns
+    assert again.job.options == RunOptions(profile="fast") and again.job.columns == prepared.job.columns
     prepared.scan.close()
 
 

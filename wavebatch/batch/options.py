@@ -267,7 +267,7 @@ def _is_name(value: Any) -> bool:
 def _text(name: str, value: Any) -> str:
     """A value as it is typed."""
     if isinstance(value, tuple | list):
-        return ",".join(map(str, value))
+        return ",".join(f"{one:.15g}" for one in value)
     if name == "where":
         return getattr(value, "text", value)
     if not isinstance(value, str | Path):

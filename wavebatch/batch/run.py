@@ -23,7 +23,7 @@ from wavebatch.batch.preflight import check_outputs, find_inputs, flight_path, l
 from wavebatch.batch.report_file import BATCH_SCHEMA, build_timing
 from wavebatch.batch.strip_task import StripTask
 from wavebatch.batch.workers.dask_cluster import Cluster
-from wavebatch.batch.workers.processes import WorkerDied, Workers
+from wavebatch.batch.workers.processes import WorkerDied, Workers, refuse_import
 from wavebatch.core import interrupts
 from wavebatch.core.errors import InputError
 from wavebatch.files.disk.protect import protecting
@@ -53,6 +53,12 @@ class BatchResult:
 
     outcomes: tuple[Outcome, ...]
     seconds: float
+
+    def __repr__(self) -> str:
+        """One line: a prompt or a notebook prints it."""
+        names = [outcome.status for outcome in self.outcomes]
+        written = f"{names.count('written')} strip{'s' * (names.count('written') != 1)} written"
+        return f"BatchResult({written}, {names.count('skipped')} skipped, {names.count('failed')} failed)"
 
     @property
     def failed(self) -> int:
@@ -120,6 +126,7 @@ def run_batch(
     KeyboardInterrupt
         After temporary files were removed.
     """
+    refuse_import()
     start = time.perf_counter()
     check_outputs(jobs, options)
     saved = load_flight(jobs, options)

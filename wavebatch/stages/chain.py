@@ -12,7 +12,7 @@ import time
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -198,6 +198,18 @@ class Step:
         return (*self.stage.needs, *(column for columns in more for column in columns))
 
 
+class Solved(NamedTuple):
+    """The echoes of a block, and what the stages found them in."""
+
+    block: WaveformBlock
+    """Without the strip's defects: slopes, patterns, spikes, transients."""
+    noise: Noise
+    """Of that block."""
+    system: SystemPulse
+    """Of the block's digitizer."""
+    echoes: EchoTable
+
+
 @dataclass(frozen=True, slots=True)
 class Chain:
     """Checked, ordered steps: one noise stage, one detector, one decomposer, then any attributes."""
@@ -288,27 +300,52 @@ class Chain:
         StageError
             Where a stage fails: a bug.
         """
-        system = system.of(block)
-        self.check(system)
-        data: dict[str, Any] = {"block": clean_block(block, system), "system": system}
-        slot = {"noise": "noise", "detect": "echoes", "decompose": "echoes", "attribute": "echoes"}
-        for step in self.steps:
-            start = time.perf_counter()
-            arguments = [data[name] for name in KINDS[step.stage.kind][0]]
-            try:
-                result = step.stage.function(*arguments, **step.parameters)
-            except ConfigError as error:
-                raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
-            except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
-                raise StageError(
-                    f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "
-                    f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
-                ) from error
-            data[slot[step.stage.kind]] = result
+        return self.solve(block, system, timing).echoes
+
+    def solve(self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None) -> Solved:
+        """Find the echoes of a block, and keep what they were found in: for residuals and pictures.
+
+        Parameters
+        ----------
+        block, system, timing
+            As for `run`.
+
+        Returns
+        -------
+        Solved
+        """
+        cleaned, noise, system = self.estimate_noise(block, system, timing)
+        used, echoes = system, None
+        for step in self.steps[1:]:
+            data = {"block": cleaned, "noise": noise, "system": used, "echoes": echoes}
+            echoes = self._call(step, data, timing)
             if step.stage.fits is not None:
                 fitted = step.stage.fits(system, step.effective())
                 other = (fitted.components, fitted.kappa) != (system.components, system.kappa)
-                data["system"] = replace(fitted, other_pulse=other)
-            if timing is not None:
-                timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
-        return data["echoes"]
+                used = replace(fitted, other_pulse=other)
+        return Solved(cleaned, noise, system, echoes)
+
+    def estimate_noise(
+        self, block: WaveformBlock, system: SystemPulse, timing: dict[str, float] | None = None
+    ) -> tuple[WaveformBlock, Noise, SystemPulse]:
+        """Return the block without the strip's defects, its noise, and the system of its digitizer."""
+        system = system.of(block)
+        self.check(system)
+        cleaned = clean_block(block, system)
+        return cleaned, self._call(self.steps[0], {"block": cleaned, "system": system}, timing), system
+
+    def _call(self, step: Step, data: Mapping[str, Any], timing: dict[str, float] | None) -> Any:
+        """The result of a stage."""
+        start, block = time.perf_counter(), data["block"]
+        try:
+            result = step.stage.function(*(data[name] for name in KINDS[step.stage.kind][0]), **step.parameters)
+        except ConfigError as error:
+            raise ConfigError(f"chain {self.name or '(unnamed)'}: {step.stage.name}: {error}") from error
+        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError, np.linalg.LinAlgError) as error:
+            raise StageError(
+                f"stage {step.stage.name} failed on the {len(block)} waveforms from point {block.first}: "
+                f"{type(error).__name__}: {error}; this is a bug, please report it with the strip"
+            ) from error
+        if timing is not None:
+            timing[step.stage.name] = timing.get(step.stage.name, 0.0) + time.perf_counter() - start
+        return result

@@ -175,9 +175,11 @@ def _match_cloud(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Noise and echoes of a chain in a block."""
+    """Noise and echoes of a chain in a block; as Solved of the chain."""
 
+    cleaned: WaveformBlock
     noise: Noise
+    system: SystemPulse
     echoes: EchoTable
 
     def rows(self, block: WaveformBlock) -> np.ndarray:
@@ -220,10 +222,10 @@ class _Found:
         inside = np.flatnonzero((sample >= 0) & (sample < block.samples.shape[1]))
         waveform = returns.waveform[inside]
         at = sample[inside].astype(np.int64)
-        level = np.broadcast_to(self.noise.level, block.samples.shape)[waveform, at]
-        rows["amplitude"][inside] = block.samples[waveform, at] - level
-        if block.missing is not None:
-            rows["amplitude"][inside[block.missing[waveform, at]]] = np.nan
+        level = np.broadcast_to(self.noise.level, self.cleaned.samples.shape)[waveform, at]
+        rows["amplitude"][inside] = self.cleaned.samples[waveform, at] - level
+        if self.cleaned.missing is not None:
+            rows["amplitude"][inside[self.cleaned.missing[waveform, at]]] = np.nan
         return rows
 
 
@@ -238,14 +240,12 @@ class ChainRun:
 
     def find(self, block: WaveformBlock) -> _Found:
         """Runs the chain on a block."""
-        echoes = self.chain.run(block, self.system)
-        estimate = self.chain.steps[0]
-        return _Found(estimate.stage.function(block, self.system.of(block), **estimate.parameters), echoes)
+        return _Found(*self.chain.solve(block, self.system))
 
     def add(self, block: WaveformBlock, found: _Found, both: np.ndarray) -> None:
         """Adds the result of a block; both: waveforms in which the other side has an echo, bool (n,)."""
         number = found.echoes.count(len(block))
-        misfit, floor = measure_fit(block, found.noise, self.system.of(block), self.chain.steps[2], found.echoes)
+        misfit, floor = measure_fit(found.cleaned, found.noise, found.system, self.chain.steps[2], found.echoes)
         self.fit.add(misfit, floor, number, both & (number > 0))
         self.vendor.pair_by_time(found.rows(block), found.vendor_rows(block), _keys(block))
 
