@@ -1,8 +1,8 @@
 """What the documentation takes from the program itself when the site is built: commands, stages, the Python API.
 
 mkdocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A line `<!-- commands -->`, `<!-- stages -->`,
-`<!-- api -->`, `<!-- options -->` or `<!-- modules ROOM -->` of a page is replaced by what the function of that name
-returns.
+`<!-- api -->`, `<!-- options -->`, `<!-- vocabulary -->` or `<!-- modules ROOM -->` of a page is replaced by what the
+function of that name returns.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from wavebatch.stages.chain_file import format_step
 
 def on_page_markdown(markdown: str, **_: object) -> str:
     """The page with the generated parts in their places."""
-    makers = {"commands": commands, "stages": stages, "api": api, "options": options, "modules": modules}
+    makers = {one.__name__: one for one in (commands, stages, api, options, vocabulary, modules)}
     return re.sub(r"(?m)^<!-- (\w+)((?: \w+)*) -->$", lambda found: makers[found[1]](*found[2].split()), markdown)
 
 
@@ -126,6 +126,21 @@ def _plain(text: str) -> str:
         piece if piece.startswith("`") else re.sub(r"([*_\[\]<>#])", r"\\\1", piece) for piece in pieces
     )
     return re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[docs/\1](\1)", plain)
+
+
+def vocabulary() -> str:
+    """Which command has which of the options that several of them have."""
+    have: dict[str, list[str]] = {}
+    for name in COMMANDS:
+        command = main.get_command(click.Context(main), name)
+        parts = getattr(command, "commands", {}) or {"": command}
+        for inner, one in parts.items():
+            for option in one.params:
+                if isinstance(option, click.Option):
+                    have.setdefault(max(option.opts, key=len), []).append(f"{name} {inner}".strip())
+    shared = {name: found for name, found in have.items() if len(found) > 1}
+    lines = ["| option | commands |", "|---|---|"]
+    return "\n".join(lines + [f"| `{name}` | {', '.join(found)} |" for name, found in sorted(shared.items())])
 
 
 def options() -> str:

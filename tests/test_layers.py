@@ -23,7 +23,7 @@ INSIDE = {
     "surveying": [
         {"measuring"}, {"flat_ground"}, {"survey", "sensor"},
         {"system_file", "auto_chain", "predict_error"},
-        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"},
+        {"choose_chain", "inspect_strip", "calibration"}, {"angle_limits", "flight"}, {"prepare"},
     ],
 }
 """The same within packages whose modules do one thing after another."""

@@ -18,7 +18,7 @@ from wavebatch.cli.program import log_file
 from wavebatch.cli.program.about import roff
 from wavebatch.cli.program.command import ProgramCommand
 from wavebatch.cli.program.examples import EXAMPLES, GROUPS
-from wavebatch.cli.program.settings import NEVER
+from wavebatch.cli.program.settings import NEVER, OLD_NAMES
 
 
 def invoke(*arguments, **environment):
@@ -112,6 +112,28 @@ def test_options_that_take_a_number_name_its_unit():
                 unit = option.metavar and option.metavar not in ("FLOAT", None)
                 none = option.help.startswith(("Correlation", "Share"))
                 assert unit or none or re.search(r"\[[^\]]+\]", option.help), (title, option.name)
+
+
+def test_options_of_several_commands_mean_the_same():
+    seen = {}
+    for title, command in _commands():
+        for option in command.params:
+            if isinstance(option, click.Option):
+                name = max(option.opts, key=len)
+                kind = (type(option.type).__name__, option.is_flag)
+                seen.setdefault(name, {}).setdefault(kind, []).append(title)
+    mixed = {name: kinds for name, kinds in seen.items() if len(kinds) > 1}
+    # Files that are written in one command are read by others; other names stand for numbers of different things.
+    read_or_written = {"--chain", "--truth", "--angles"}
+    assert mixed.keys() <= {*read_or_written, "--tolerance", "--point-format", "--no-data", "--pulses", "--width", "--most"}
+    assert not seen.keys() & OLD_NAMES.keys() and set(OLD_NAMES.values()) <= seen.keys()
+
+
+def test_old_names_of_options_work_with_a_remark(tiny_strip, tmp_path):
+    (tmp_path / "a.las").write_bytes(tiny_strip.read_bytes())
+    old = invoke("stats", tmp_path / "a.las", "--where", "flag(WEAK) or z > 0", "--polygons=none.json")
+    assert old.exit_code == 2 and old.stderr.startswith("remark: --polygons is now --polygon; ")
+    assert "none.json" in old.stderr.splitlines()[1]
 
 
 def test_version_names_python_and_the_libraries():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import shlex
 import typing
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -49,13 +49,15 @@ ELSEWHERE = ("output", "recursive", "jobs", "scheduler", "memory", "block_size",
 """Options that do not change a cloud."""
 
 
-def check_together(given: Mapping[str, Any]) -> None:
+def check_together(given: Mapping[str, Any], known: Collection[str] | None = None) -> None:
     """Raise ConfigError for two options of which only one is possible, and for one that another one needs.
 
     Parameters
     ----------
     given : mapping
         Its keys are the names of the options that the user gave.
+    known : collection of str, optional
+        Names of the options that there are: another command may have one without those that it needs in `run`.
     """
     for rivals in EXCLUSIVE:
         names = [_typed(name) for name in rivals if name in given]
@@ -64,6 +66,8 @@ def check_together(given: Mapping[str, Any]) -> None:
     if "system" in given and given.get("survey") == "flight":
         raise ConfigError("--system and --survey flight exclude each other; give one of them")
     for name, needed in NEEDS.items():
+        if known is not None and not set(known) & set(needed):
+            continue
         if name in given and not any(one in given for one in needed):
             others = " or ".join(map(_typed, needed))
             raise ConfigError(f"{_typed(name)} is of no use without {others}; give that too, or leave it out")

@@ -204,10 +204,9 @@ def where_option(text: str) -> Callable:
 
 
 selection_options = together(
-    click.option("--flags-with", multiple=True, metavar="NAMES", shell_complete=complete_flags,
+    click.option("--flags", multiple=True, metavar="NAMES", shell_complete=complete_flags,
                  help="Use only points with one of these flags of echo_flags, e.g. SATURATED,WEAK."),
-    click.option("--flags-without", multiple=True, metavar="NAMES", shell_complete=complete_flags,
-                 help="Use only points with none of these flags."),
+    declared("drop_flags", "Leave out points with one of these flags.", multiple=True, default=()),
     where_option("Use only points"),
 )  # fmt: skip
 """Options that select points by their flags and columns."""
@@ -277,8 +276,8 @@ def _protected(command: Callable) -> Callable:
     def call(*args: Any, **options: Any) -> Any:
         context = click.get_current_context()
         sources = {name: context.get_parameter_source(name) for name in context.params}
-        check_together({name: context.params[name] for name, source in sources.items()
-                        if source is not ParameterSource.DEFAULT})  # fmt: skip
+        given = {name for name, source in sources.items() if source is not ParameterSource.DEFAULT}
+        check_together({name: context.params[name] for name in given}, context.params)
         inputs: list[Any] = [context.meta[READ]] if READ in context.meta else []
         outputs: dict[str, Any] = {}
         if LOG in context.meta:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
               help="Side of a cell, in the unit of the coordinates. Borders are multiples of it, so that neighbouring "
               "rasters fit together.")
 @shared.output_option("Raster to write: .tif.", "X.tif")
-@shared.floats_option("--bounds", "W,S,E,N", "Part to write: west, south, east, north [m].  [default: all]")
+@shared.bbox_option("Write")
 @shared.selection_options
 @click.option("--crs", metavar="CRS", help="CRS of the clouds, e.g. EPSG:32632.  [default: that of their headers]")
 @click.option("--no-data", type=float, default=-9999.0, show_default=True, metavar="VALUE",
@@ -53,8 +53,9 @@ def grid(clouds: Sequence[Path], columns: tuple[str, ...], output: Path, **optio
 
     paths = find_files(map(str, clouds), recursive=options["recursive"])
     check_raster(output, overwrite=options["overwrite"])
-    flags = {name: read_flags(options[name]) for name in ("flags_with", "flags_without")}
-    given = {name: options[name] for name in ("statistic", "size", "bounds", "where", "crs", "no_data")}
+    flags = {"flags_with": read_flags(options["flags"]), "flags_without": read_flags(options["drop_flags"])}
+    given = {name: options[name] for name in ("statistic", "size", "where", "crs", "no_data")}
+    given["bounds"] = options["bbox"]
     found = write_grid(paths, output, GridOptions(columns, **given, **flags), overwrite=options["overwrite"])
     layout = found.layout
     if layout.crs is None:

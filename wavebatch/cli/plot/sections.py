@@ -25,7 +25,7 @@ def select(column: str | None, options: dict[str, Any]) -> Any:
     from wavebatch.core.condition import read_flags
     from wavebatch.tools.plots.values import Selection
 
-    flags = read_flags(options["flags_with"]), read_flags(options["flags_without"])
+    flags = read_flags(options["flags"]), read_flags(options["drop_flags"])
     return Selection(column, *flags, where=options["where"])
 
 

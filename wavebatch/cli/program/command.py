@@ -11,8 +11,9 @@ from collections.abc import Iterator
 import click
 
 from wavebatch.batch.options import HEADINGS, OPTIONS
+from wavebatch.cli.messages import talk
 from wavebatch.cli.program.examples import ALSO_USUAL, EXAMPLES, FEWEST, GROUPS, MANY, USUAL
-from wavebatch.cli.program.settings import add_variables, drop_rivals, read_settings, tell_settings
+from wavebatch.cli.program.settings import OLD_NAMES, add_variables, drop_rivals, read_settings, tell_settings
 
 MAYBE_NAN = ("no_data",)
 """Options whose number may be NaN."""
@@ -29,6 +30,7 @@ class ProgramCommand(click.Command):
 
         Numbers must be finite, because no limit of an option holds for NaN.
         """
+        args = [self._rename(word) for word in args]
         is_real = not ctx.resilient_parsing and {"-h", "--help"}.isdisjoint(args)
         if is_real:
             read_settings(self, self.title, ctx, args)
@@ -42,6 +44,16 @@ class ProgramCommand(click.Command):
             drop_rivals(ctx)
             tell_settings(ctx)
         return rest
+
+    def _rename(self, word: str) -> str:
+        """A word of the command line with the new name of an option, and a remark."""
+        old, mark, value = word.partition("=")
+        new = OLD_NAMES.get(old, "")
+        names = {name for option in self.params for name in option.opts}
+        if new not in names or old in names:
+            return word
+        talk(f"remark: {old} is now {new}; the old name goes with the next version")
+        return new + mark + value
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Writes the options by group, then the examples."""

@@ -49,7 +49,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "plot": (),
     "plot waveform": (
         ("wavebatch plot waveform strip.las -o fits.png", "six waveforms, spread over the strip"),
-        ("wavebatch plot waveform strip.las -o bad.svg --flags-with NOT_CONVERGED,AT_BOUND", "fits to look at"),
+        ("wavebatch plot waveform strip.las -o bad.svg --flags NOT_CONVERGED,AT_BOUND", "fits to look at"),
         ("wavebatch plot waveform strip.las -o sheet.png --random 100 --sheet", "a sheet of 100 random waveforms"),
     ),
     "plot histogram": (
@@ -91,7 +91,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 GROUPS: dict[str, tuple[str, ...]] = {
     CHAIN: ("waveforms", "divergence"),
     AIR: ("reflectance_error",),
-    WHICH: ("flags_with", "flags_without", "bounds", "packets", "point_numbers", "times", "most", "random", "limit"),
+    WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
     OUTPUT: ("column", "html_file", "report", "as_json", "plot"),
     RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),
 }

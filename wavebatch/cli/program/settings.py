@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import glob
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,10 @@ the data."""
 SIMILAR = 0.74
 """Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
 
+OLD_NAMES = {"--bounds": "--bbox", "--polygons": "--polygon", "--flags-with": "--flags",
+             "--flags-without": "--drop-flags"}  # fmt: skip
+"""Names of earlier versions, and what they are now."""
+
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")
 """Names of the arguments that are files to read; settings lie beside the first."""
 
@@ -49,9 +54,10 @@ def add_variables(command: click.Command, title: str) -> None:
     """Let each option of a command be given by a variable: WAVEBATCH_RUN_JOBS counts before WAVEBATCH_JOBS."""
     for option in command.params:
         if isinstance(option, click.Option) and option.name not in NEVER:
-            words = _option_name(option).upper()
-            option.envvar = [f"{PREFIX}{part}".replace("-", "_").replace(" ", "_") for part in
-                             (f"{title.upper()}_{words}", words)]  # fmt: skip
+            words = re.sub("[- ]", "_", f"{title} {_option_name(option)}").upper()
+            general = _option_name(option).replace("-", "_").upper()
+            own = [option.envvar] if isinstance(option.envvar, str) else []
+            option.envvar = [*own, f"{PREFIX}{words}", f"{PREFIX}{general}"]
 
 
 def read_settings(command: click.Command, title: str, context: click.Context, arguments: list[str]) -> None:
@@ -194,6 +200,7 @@ def _read_file(path: Path, title: str, options: Mapping[str, click.Option]) -> d
     for key, value in table.items():
         if isinstance(value, dict):
             continue
+        key = OLD_NAMES.get(f"--{key}", key).removeprefix("--") if key not in known else key
         if key not in known:
             raise click.UsageError(f"{path}: [{title}] has no option {key!r}; {nearest(key, list(known))}")
         if known[key] in NEVER:

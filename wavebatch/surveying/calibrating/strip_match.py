@@ -22,7 +22,7 @@ from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
+from wavebatch.surveying.calibrating.strip_channels import read_day, read_sensor_name, see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 

@@ -21,9 +21,9 @@ from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.chain_file import list_profiles, load_chain, load_profile
 from wavebatch.surveying import Survey
 from wavebatch.surveying.auto_chain import widest_chain
-from wavebatch.surveying.choose_chain import Request, make_choice
+from wavebatch.surveying.choose_chain import Request
+from wavebatch.surveying.prepare import Positions, prepare
 from wavebatch.surveying.system_file import SavedSurvey
-from wavebatch.surveying.systems.saved_check import check_saved
 from wavebatch.tools.compare.clouds import PACKET_DTYPE, open_task, read_echoes
 from wavebatch.tools.compare.differences import SPEED
 from wavebatch.tools.compare.goodness import FitQuality, Goodness, measure_fit
@@ -111,9 +111,9 @@ def match_sides(
         raise ConfigError(f"{clouds[0].name}: a cloud has the echoes of all waveforms; leave --limit out")
     check_tolerance(tolerance_ns)
     with StripReader(strip) as reader, reader.scan() as scan:
-        check_saved(reader, scan, survey, force=force)
         saved = None if survey is None else SavedSurvey(survey)
-        choice = make_choice(reader, scan, widest_chain(), Request(auto=True, system=saved))
+        request = Request(auto=True, system=saved, force=force)
+        choice = prepare(reader, scan, widest_chain(), request, positions=Positions.NONE).choice
         chains = {key: side for key, side in (("a", a), ("b", b)) if side is not None and not side.is_cloud}
         system = choice.survey.system
         runs = {key: ChainRun(side.chain or choice.chain, system, tolerance_ns) for key, side in chains.items()}
