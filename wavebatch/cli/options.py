@@ -218,9 +218,12 @@ html_option = output_option(
 )  # fmt: skip
 
 
-def check_html(target: Path | None) -> None:
-    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it."""
-    if target is not None:
+def check_html(target: Path | None, *, will_exist: bool = False) -> None:
+    """Raises ConfigError, before the work, if the page of --html cannot be written; does nothing without it.
+
+    will_exist: its folder will be made.
+    """
+    if target is not None and not (will_exist and not target.parent.exists()):
         from wavebatch.tools.html.page import check_page
 
         check_page(target)

@@ -85,7 +85,7 @@ def run(**options: Any) -> None:
             _check_report(Path(options["report"]), jobs, batch_options)
         if options["html_file"] is not None:
             _check_report(options["html_file"], jobs, batch_options, "--html")
-            check_html(options["html_file"])
+            check_html(options["html_file"], will_exist=True)
         if options["dry_run"]:
             sys.exit(_dry_run(jobs, batch_options, options))
         sys.exit(_run(jobs, batch_options, options))
@@ -107,12 +107,19 @@ def _start_processes(options: dict[str, Any]) -> None:
 
 def _check_options(options: dict[str, Any]) -> None:
     report = options["report"]
-    if report not in (None, "-") and not Path(report).absolute().parent.is_dir():
-        raise ConfigError(f"--report: folder {Path(report).parent} does not exist; make it first")
+    for name, target in (("--report", None if report == "-" else report), ("--html", options["html_file"])):
+        if target is not None and not _is_made(Path(target), options["output"]):
+            raise ConfigError(f"{name}: folder {Path(target).parent} does not exist; make it first")
     on_stdout = [*["--report -"][: report == "-"], *["--json"][: options["as_json"]]]
     on_stdout += ["--progress json"][: options["progress"] == "json"]
     if len(on_stdout) > 1:
         raise ConfigError(f"{' and '.join(on_stdout)} would both write to stdout; give the report a file")
+
+
+def _is_made(target: Path, output: Path) -> bool:
+    """Whether the folder of a file exists, or is the output or lies in it, and so is made with it."""
+    folder = Path(os.path.abspath(target)).parent
+    return folder.is_dir() or folder.is_relative_to(os.path.abspath(output))
 
 
 def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str = "--report") -> None:
@@ -151,6 +158,7 @@ def _report(document: dict[str, Any], target: str | None) -> bool:
         return print_safely(format_json(document))
     try:
         if target is not None:
+            Path(target).parent.mkdir(parents=True, exist_ok=True)
             write_json(Path(target), document, overwrite=True)
     except InputError as error:
         talk(f"error: --report: {one_line(error)}")
@@ -166,6 +174,7 @@ def _write_page(result: Any, folder: Path, options: dict[str, Any]) -> bool:
     from wavebatch.tools.html.run_page import write_run_page
 
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
         write_run_page(target, result, folder, typed_command(click.get_current_context()))
     except Exception as error:  # the clouds are written, whatever becomes of the page
         if options["debug"]:

@@ -51,8 +51,8 @@ _ZONE = ("dead_zone_m", "dead_zone_err_m")
 @declared("recursive")
 @click.option("--area", "size", type=float, metavar="SIZE",
               help="Also count in square cells with sides of SIZE, in the unit of the coordinates.")
-@declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or in "
-          "the coordinates of the clouds; where polygons overlap, the first one counts.")
+@declared("polygon", "Also count in the polygons of this GeoJSON file, in WGS 84, in the CRS that the file names, or "
+          "in the coordinates of the clouds; where polygons overlap, the first one counts.")
 @where_option("Count only points")
 @output_option("Write a table with one row per cloud and area.", "FILE.csv", required=False)
 @common_options("overwrite", "json")

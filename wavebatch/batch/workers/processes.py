@@ -170,7 +170,7 @@ def _kill_all() -> None:
 def refuse_import() -> None:
     """End this process where it only imports the user's script, and so would run it again."""
     if getattr(multiprocessing.current_process(), "_inheriting", False):
-        sys.exit(
+        raise SystemExit(
             "error: this script has a stage, so that each process imports it: write what it does under "
             'if __name__ == "__main__":, or put the stage into a module'
         )
