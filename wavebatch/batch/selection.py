@@ -27,7 +27,7 @@ from wavebatch.files.cloud.echo_reader import describe_dimension, list_fields, r
 from wavebatch.files.cloud.layout import OutputLayout
 from wavebatch.files.geojson import Polygon, find_inside, load_polygons
 from wavebatch.files.las.checked_header import CheckedHeader
-from wavebatch.files.las.point_formats import ANGLE_UNIT
+from wavebatch.files.las.point_formats import read_angles
 from wavebatch.stages.chain import STAGES, Chain
 
 WITHOUT_STAGE = ("echo_time", "echo_flags")
@@ -229,9 +229,8 @@ class RowSelector:
         if found in ("x", "y", "z"):
             header, axis = self.layout.source.header, "xyz".index(found)
             return rows[found.upper()] * header.scales[axis] + header.offsets[axis]
-        modern = self.layout.point_format >= 6
         if found == "scan_angle":
-            return rows["scan_angle"] * ANGLE_UNIT if modern else rows["scan_angle_rank"].astype(np.float64)
+            return read_angles(rows)
         return read_field(rows, self.layout.point_format, found)
 
 

@@ -13,7 +13,7 @@ import click
 
 from wavebatch.batch.options import RunOptions
 from wavebatch.cli import options as shared
-from wavebatch.cli.messages import count, format_json, talk
+from wavebatch.cli.messages import count, format_json, print_json, talk
 from wavebatch.core.units import format_relative
 from wavebatch.files.disk.protect import protecting, refuse_input
 from wavebatch.files.figure_file import check_picture
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 @shared.sensor_options
 @shared.declared("direction")
 @shared.html_option
-@shared.common_options("overwrite")
+@shared.common_options("overwrite", "json", "quiet")
 def calibrate(
     strips: tuple[Path, ...], targets: Path, output: Path, html_file: Path | None, overwrite: bool, **options: Any
 ) -> None:
@@ -96,12 +96,16 @@ def calibrate(
         from wavebatch.tools.plots.draw_flight import draw_flight
 
         draw_flight(flight, options["plot"], overwrite=overwrite)
+    if options["as_json"]:
+        print_json(_list_report(flight))
+    for note in found.notes:
+        talk(f"warning: {note}")
+    if options["quiet"]:
+        return
     for line in [*map(_describe_target, found.targets), *map(_describe_channel, found.channels)]:
         talk(line)
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
         talk(line)
-    for note in found.notes:
-        talk(f"warning: {note}")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
