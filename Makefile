@@ -1,6 +1,6 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
-#   make test      the fast tests          make test-all   all of them
+#   make test      the fast tests          make test-all   all of them, each with its own surveys
 #   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make readers   other programs' LAS readers, from PyPI and npm as far as these have them, for `make test`
@@ -61,8 +61,9 @@ readers: $(VENV)/.test
 	-command -v npm >/dev/null && npm install --silent --no-save --no-audit --no-fund --prefix $(VENV)/npm \
 	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.4.5 @loaders.gl/las@4.5.1
 
+# A file at a time for each process: its strips and surveys are then made once.
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q -n auto -m 'not slow'
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m 'not slow'
 
 test-all: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto

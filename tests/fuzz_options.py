@@ -49,7 +49,7 @@ _TEXTS = {
     "column": "amplitude", "classes": "2,6-9", "drop_flags": "RINGING_SUSPECT,WEAK", "flags_with": "SATURATED,WEAK",
     "flags_without": "WEAK", "lever_arm": "0.1,-0.2,0.5", "crs": "EPSG:32632", "lines": "0:3", "packet": "0:3",
     "times": "0:20", "value_range": "0:100", "memory": "2G", "tolerance": "0.02m", "profile": "accurate",
-    "line": "300000,5000000,300100,5000100", "pulse_energy": "intensity", "no_data": "-9999.0", "gps_time": "1.5",
+    "line": "300000,5000000,300100,5000100", "energy": "intensity", "no_data": "-9999.0", "gps_time": "1.5",
     "by": "number_of_returns", "scene": "forest", "hazard": "H3", "area": "5",
 }  # fmt: skip
 _PLACES = [

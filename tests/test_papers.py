@@ -279,7 +279,7 @@ def test_the_page_is_shown_by_a_browser_without_complaints(load, tmp_path, monke
     for name, width in (("papers", 1300), ("probe", 1300), ("probe", 520)):
         target = (tmp_path / f"{name}.html").as_uri()
         shown = subprocess.run(
-            [*command, f"--window-size={width},900", target], capture_output=True, text=True, timeout=90
+            [*command, f"--window-size={width},900", target], capture_output=True, text=True, timeout=300
         )
         assert shown.returncode == 0 and "CONSOLE" not in shown.stderr, shown.stderr
         if name == "probe":

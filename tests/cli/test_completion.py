@@ -27,6 +27,7 @@ def complete(words, number, shell="bash"):
     return result.stdout.split()
 
 
+@pytest.mark.quick_cases("run", "voxelize", "stats")
 @pytest.mark.parametrize("command", ["run", "info", "survey", "voxelize", "slice", "check", "stats"])
 def test_arguments_are_files(command):
     assert complete(f"wavebatch {command} fl", 2) == ["file,fl"]
@@ -63,6 +64,7 @@ def test_every_shell_has_its_script(shell):
     result = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True)
     assert f"_WAVEBATCH_COMPLETE={shell}_complete" in result.stdout
 
+@pytest.mark.quick_cases("*drop-flags*", "*+ran*", "*decompose.resid*", "*bench*")
 @pytest.mark.parametrize(
     ("words", "number", "offers"),
     [
@@ -134,7 +136,7 @@ def test_a_terminal_completes_names_after_tab(shell, tmp_path):
             os.killpg(child.pid, signal.SIGKILL)
 
 
-def _talk(child, keys, wanted, seconds=40.0):
+def _talk(child, keys, wanted, seconds=100.0):
     """Types keys and waits until the terminal shows the text."""
     child.stdin.write(keys.encode())
     child.stdin.flush()

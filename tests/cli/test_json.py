@@ -113,18 +113,21 @@ CASES = {
     "stages": "stages/1",
     "calibrate STRIP --targets TARGETS -o cal.toml -q": "calibration-report/1",
     "simulate slope -o s.las --pulses 300 -q": "simulate/1",
+    "import PULSES -o i.las -q": "import/1",
+    "export STRIP -o e.npz -q": "export/1",
     "synthesize SIM -o y.las -q": "synthesize/1",
     "slice STRIP -o s.csv -q": "slice/1",
     "voxelize STRIP --size 3 -o v.npz -q": "voxelize/1",
 }
 
 
+@pytest.mark.quick_cases("[!b]*")
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
-    names = {"STRIP": riegl, "CLOUD": folder / f"{riegl.stem}.laz", "ROOT": PAGE.parents[1],
-             "SIM": folder / "sim.las", "CUBE": folder / "cube.npz", "VOXELS": folder / "voxels.npz",
-             "TARGETS": "t.csv"}  # fmt: skip
+    names = {"STRIP": riegl, "PULSES": riegl.with_suffix(".pls"), "CLOUD": folder / f"{riegl.stem}.laz",
+             "ROOT": PAGE.parents[1], "SIM": folder / "sim.las", "CUBE": folder / "cube.npz",
+             "VOXELS": folder / "voxels.npz", "TARGETS": "t.csv"}  # fmt: skip
     Path("t.csv").write_text("name,reflectance,x,y,radius\ngrey,0.3,548363.742,5389952.964,3\n")
     if line.startswith("grid"):
         pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")

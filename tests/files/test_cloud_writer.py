@@ -635,7 +635,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, name):
     target = tmp_path / "out" / name
     run = subprocess.run(
         [sys.executable, "-W", "error", "-c", FULL_DISK, str(tmp_path / "a.las"), str(target)],
-        capture_output=True, text=True, cwd=Path(__file__).resolve().parents[2], timeout=60,
+        capture_output=True, text=True, cwd=Path(__file__).resolve().parents[2], timeout=300,
     )  # fmt: skip
     assert run.stderr == "" and run.returncode == 0
     lines = run.stdout.splitlines()

@@ -141,6 +141,7 @@ def gable(rng, degrees, noise, density, half=6.0, length=40.0):
     return xyz, np.tile(ray, (n, 1)), np.degrees(np.arccos(cosine))
 
 
+@pytest.mark.quick_cases("*-4-*", "0.02-10-10")
 @pytest.mark.parametrize("degrees", [5, 10, 15, 20])
 @pytest.mark.parametrize(("noise", "density"), [(0.01, 4), (0.02, 4), (0.02, 10), (0.05, 20)])
 def test_at_a_ridge_the_error_grows_or_there_is_no_angle(degrees, noise, density):

@@ -99,6 +99,7 @@ def test_attenuation_by_visibility(visibility, wavelength, expected):
     assert attenuation_of_visibility(visibility, wavelength) == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.quick_cases("any-0.3", "dense-1.0", "open-3.3")
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 3.3])
 @pytest.mark.parametrize("cover", ["any", "dense", "open"])
 def test_the_ratio_of_canopy_and_ground_is_told_from_shared_light(ratio, cover):

@@ -4,9 +4,8 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import filter_antisymmetric, slope_taps
-from wavebatch.kernels.signal.runs import highest_samples, list_samples, run_moments, walk_down
+from wavebatch.kernels.signal.runs import find_runs, highest_samples, list_samples, run_moments, walk_down
 
 
 @pytest.fixture(params=[1, 2, 17])

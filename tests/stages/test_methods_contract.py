@@ -41,6 +41,7 @@ def call(name, parameters, block, system):
     return STAGES[name].function(block, noise, system, *given, **parameters)
 
 
+@pytest.mark.quick_cases("1-gaussian-*", "2-short-*", "40-gaussian-detect*", "40-gaussian-decompose.[!r]*")
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
 @pytest.mark.parametrize("system", ["gaussian", "learned", "short"])
 @pytest.mark.parametrize("s", [1, 2, 40])
@@ -51,6 +52,7 @@ def test_variants_keep_the_contract_on_any_waveforms(name, parameters, s, system
         check_echoes(table, block, SYSTEMS[system], fitted=name.startswith("decompose"))
 
 
+@pytest.mark.quick_cases("detect*", "decompose.asdf*", "decompose.skewed-*11", "decompose.adaptive*", "*reference-*18")
 @pytest.mark.parametrize(("name", "parameters"), VARIANTS)
 def test_variants_give_the_same_bits_for_any_block_size(name, parameters):
     block = scene_blocks()["mixed"].rows(slice(0, 29))

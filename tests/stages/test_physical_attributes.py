@@ -483,6 +483,11 @@ def test_the_energy_of_each_pulse_is_divided_out():
         assert values[there] == pytest.approx(plain[name][there], rel=1e-5)
         # What is known of each shot is no scatter from shot to shot.
         assert (done.attributes[f"{name}_err"][there] < 0.02 * values[there]).all()
+    measured = replace(block, pulse_energy=energy, pulse_energy_err=np.full(40, 0.05))
+    done = run(measured, brighter, known, *names)
+    for name in names:
+        relative = done.attributes[f"{name}_err"] / done.attributes[name]
+        assert relative[there] == pytest.approx(0.05 / energy[there], rel=0.05)
 
 
 LEARNED = replace(SYSTEM, sigma_ref=1.35, components=((1.0, 0.0, 1.2), (0.2, 2.5, 1.8)))

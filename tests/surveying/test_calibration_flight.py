@@ -55,6 +55,7 @@ def flight(tmp_path_factory):
     return folder, done.stderr
 
 
+@pytest.mark.slow
 def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight):
     folder, _ = flight
     rows = {(row.strip[0], row.digitizer): row for row in load_calibration(folder / "cal.toml").strips}
@@ -69,6 +70,7 @@ def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight
         assert 0 < rows[name, 1].drift_error < 0.002
 
 
+@pytest.mark.slow
 def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(flight):
     first, second = load_calibration(flight[0] / "cal.toml").channels
     assert first.relative_error == pytest.approx(np.hypot(0.03, np.std(np.log([1, 1.08, 0.95]), ddof=1)), rel=0.02)
@@ -93,6 +95,7 @@ def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     assert (folder / "cal.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_every_strip_is_run_with_its_own_constant(tmp_path, flight):
     folder, _ = flight
     done = call("run", folder / "b.las", folder / "c.las", "-o", tmp_path, "--calibration", folder / "cal.toml")
@@ -187,6 +190,7 @@ def clouds(flight, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "ratio"), [("own", 0.0), ("mean", 1 / 1.08 - 1)])
 def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
     done = call("compare", clouds / kind / "a.laz", clouds / kind / "b.laz", "--overlap", "--json")
@@ -199,6 +203,7 @@ def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
     assert abs(found["height"]["median"]) < 0.003
 
 
+@pytest.mark.slow
 def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
     import laspy
 

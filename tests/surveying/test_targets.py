@@ -187,6 +187,7 @@ def two_channels(tmp_path_factory, edit_points):
     return copy
 
 
+@pytest.mark.slow
 def test_every_digitizer_gets_its_constant_and_is_run_with_it(tmp_path, two_channels):
     cloud = laspy.read(two_channels)
     x, y = float(np.median(cloud.x)), NORTH

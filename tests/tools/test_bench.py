@@ -54,6 +54,7 @@ def find_row(document, name):
     return next(row for row in document["scenes"][0]["rows"] if row["name"] == name)
 
 
+@pytest.mark.slow
 def test_document_has_a_row_per_chain_and_peer(document):
     assert document["schema"] == command.SCHEMA
     names = [row["name"] for row in document["scenes"][0]["rows"]]
@@ -97,6 +98,7 @@ def test_stiff_cases_count_failures_by_kind(document):
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
 
 
+@pytest.mark.slow
 def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(timed_here):
     small = replace(SMALL, peers=False, stability=False, pulses=0, waveforms=1200)
     rows = [run_bench(replace(small, seed=seed))["scenes"][0]["rows"] for seed in (5, 5, 6)]
@@ -299,10 +301,11 @@ def GaussianDecomposition(y, thres):
 """
 
 
+@pytest.mark.slow
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 1.5)
+    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
@@ -324,6 +327,7 @@ def checkout(tmp_path):
     return root
 
 
+@pytest.mark.slow
 def test_two_checkouts_take_turns(tmp_path, checkout):
     options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "--json", "-o", str(tmp_path / "out")]
     missing = CliRunner().invoke(main, ["bench", "--against", str(tmp_path), *options])
@@ -337,6 +341,7 @@ def test_two_checkouts_take_turns(tmp_path, checkout):
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "UNIT_POINTS", 1000)
     options = ["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")]
@@ -353,6 +358,7 @@ def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     assert "waveforms are fewer than 10 units" in warning and warning in text and parts["work"] >= 0
 
 
+@pytest.mark.slow
 def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
     """Of a strip that two jobs cannot share, what a waveform costs is no-data; no cost is negative."""
     monkeypatch.setattr(jobs.Worker, "call", _call_slow_starter)
@@ -411,6 +417,7 @@ def test_a_small_strip_that_fails_is_no_time(tmp_path):
         jobs.run_small(broken, tmp_path / "small")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["--real", "--jobs-model"])
 def test_every_mode_takes_a_log_file(mode, tmp_path):
     log = tmp_path / "night.log"
@@ -433,6 +440,7 @@ def test_the_slowest_part_bounds_many_jobs():
     assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 1 + 5 + 0.2)
 
 
+@pytest.mark.slow
 def test_of_two_checkouts_the_slower_one_is_seen(tmp_path, checkout):
     start = checkout / "wavebatch" / "__init__.py"
     start.write_text(start.read_text() + "\nimport time\nwhile time.process_time() < 5:\n    pass\n")

@@ -54,6 +54,7 @@ def level_solver(**system):
     return Solver(survey, choose_chain(survey))
 
 
+@pytest.mark.slow
 def test_strong_echoes_are_found_and_weak_ones_are_not(report):
     rows = {row.low: row for row in report.quiet_by_sigma}
     assert rows[10.0].recall > 0.99 and rows[20.0].recall > 0.99 and rows[5.0].recall > 0.95
@@ -91,6 +92,7 @@ def test_noise_and_templates_are_those_that_were_simulated(report):
     assert report.templates.fwhm == pytest.approx(report.survey.fwhm, rel=0.05)
 
 
+@pytest.mark.slow
 def test_seed_decides_all_and_json_holds_it(strip):
     few = {"injections": 300, "stability": False, "waveforms": 1200}
     one, same, other = (replace(measure_real(strip, seed=seed, **few), seconds={}) for seed in (1, 1, 2))
@@ -99,6 +101,7 @@ def test_seed_decides_all_and_json_holds_it(strip):
     assert "misses a goal" in format_report(one)
 
 
+@pytest.mark.slow
 def test_a_wrong_survey_is_seen(strip, report, monkeypatch):
     def deaf(blocks):
         survey = survey_blocks(blocks)
@@ -144,6 +147,7 @@ def test_signal_is_added_as_if_the_digitizer_had_seen_it():
     assert clipped.max() == 60
 
 
+@pytest.mark.slow
 def test_gaps_of_fill_are_seen_and_left_alone(strip):
     samples = np.rint(20 + correlated(50, 100)).astype(np.uint8)
     samples[:25, 40:60] = 0
@@ -169,6 +173,7 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     assert 0 < len(made) <= 150 and not made.near.any()
 
 
+@pytest.mark.slow
 def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp_path):
     assert report.clipped is None
     path = tmp_path / "shore.las"
@@ -216,6 +221,7 @@ def test_wrong_usage_is_one_line(words, message):
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_real_strips(riegl, leica):
     for path in (riegl, leica):
         found = measure_real(path, injections=3000, stability=False)

@@ -73,7 +73,7 @@ def test_the_command_that_is_shown_makes_the_cloud_again(tiny_strip, tmp_path, m
     words = ["run", "a strip.las", "--columns", "+amplitude_normalized", "--where", "amplitude > 20 and not 'z' == 3",
              "--drop-flags", "WEAK,AT_BOUND", "--classes", "0,1,2", "--bbox", box, "--polygon", "area.json",
              "--points", "returns", "--attenuation", "0.3", "--attenuation-error", "0.1",
-             "--pulse-energy", "energy.txt"]  # fmt: skip
+             "--energy", "energy.txt"]  # fmt: skip
     first = _make(words, "one")
     again = shlex.split(describe_file(Path("one/a strip.laz"))["provenance"][0]["command"])
     assert again[:2] == ["wavebatch", "run"] and again[3:5] == ["-o", "DIR"]

@@ -96,6 +96,7 @@ def test_the_page_of_a_flight_names_strips_that_do_not_belong(tiny_strip, tmp_pa
     assert "Strips" in shown.headings and shown.text.count("belongs to the others") == 2
 
 
+@pytest.mark.slow
 def test_the_page_of_a_benchmark(timed_here, tmp_path):
     found = _run("bench", "--scene", "open", "--waveforms", 600, "--pulses", 0, "--no-peers", "--no-stability",
                  "--repeat", 1, "--json", "--html", tmp_path / "b.html")  # fmt: skip
@@ -253,7 +254,7 @@ def test_a_real_browser_shows_the_page_sorts_its_table_and_complains_about_nothi
     command = [BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage",
                f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]  # fmt: skip
     for path in (flight / "run.html", tmp_path / "run.html"):
-        shown = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=90)
+        shown = subprocess.run([*command, path.as_uri()], capture_output=True, text=True, timeout=300)
         assert shown.returncode == 0 and "CONSOLE" not in shown.stderr, shown.stderr
     sums = json.loads((flight / "run.json").read_text())["strips"]
     points = f"{sums[0]['counts']['points_in'] or sums[1]['counts']['points_in']:,}"

@@ -379,6 +379,7 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
             assert not box.overlaps(other)
 
 
+@pytest.mark.slow
 def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, tmp_path):
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
         drawn = [

@@ -64,9 +64,14 @@ class StripJob:
         return replace(system, attenuation=value, attenuation_error=error)
 
     @property
+    def energy(self) -> str | None:
+        """Where the energy of each emitted pulse comes from; see `find_pulse_energy`."""
+        return None if self.options.energy is None else str(self.options.energy)
+
+    @property
     def energy_file(self) -> Path | None:
-        """The file of --pulse-energy; None where that names an extra byte."""
-        file = None if self.options.pulse_energy is None else Path(self.options.pulse_energy)
+        """The file of --energy; None where that names an extra byte."""
+        file = None if self.energy is None else Path(self.energy)
         return file if file is not None and file.is_file() else None
 
     @property
@@ -78,8 +83,8 @@ class StripJob:
         """Return the job with absolute paths, for processes that work in another folder."""
         file = self.sensor.trajectory
         sensor = replace(self.sensor, trajectory=None if file is None else file.absolute())
-        energy = self.options.pulse_energy if self.energy_file is None else str(self.energy_file.absolute())
-        options = replace(self.options, pulse_energy=energy)
+        energy = self.energy if self.energy_file is None else str(self.energy_file.absolute())
+        options = replace(self.options, energy=energy)
         return replace(self, path=self.path.absolute(), sensor=sensor, options=options)
 
     def open(self) -> StripReader:

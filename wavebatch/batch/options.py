@@ -160,9 +160,10 @@ class RunOptions:
     wavelength: Annotated[float | None, Range(300.0, 2500.0)] = option(
         None, "Wavelength of the laser [nm], for --visibility.", AIR, "NM", unset="1064"
     )
-    pulse_energy: Path | str | None = option(
-        None, "Energy of each emitted pulse: an extra byte of the strips, or a text file with columns time (GPS time "
-        "of the points) and energy. Backscatter and normalized amplitudes are divided by it.", AIR, "NAME|FILE",
+    energy: Path | str | None = option(
+        None, "Energy of each emitted pulse, which backscatter and normalized amplitudes are divided by: an extra byte "
+        "of the strips, or a text file with columns time (GPS time of the points) and energy; none: not divided.",
+        AIR, "COLUMN|FILE|none", unset="the extra byte pulse_energy, where it is there",
     )  # fmt: skip
     where: Condition | str | None = option(
         None, "Write only points that meet this, e.g. \"number_of_returns == 2 and not (classification == 7 or "

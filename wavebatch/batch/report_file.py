@@ -63,7 +63,7 @@ def describe_job(job: StripJob, fingerprint: Mapping[str, Any]) -> dict[str, Any
     """
     saved, sensor = job.request.system, job.sensor
     trajectory = None if sensor.trajectory is None else take_fingerprint(sensor.trajectory)
-    energy = job.options.pulse_energy if job.energy_file is None else take_fingerprint(job.energy_file)
+    energy = job.energy if job.energy_file is None else take_fingerprint(job.energy_file)
     # The hash is that of the flight's survey also for a strip that does not belong to it: another survey may take it.
     flight = {"survey": "flight"} if job.request.flight else {}
     return {

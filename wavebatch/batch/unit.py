@@ -28,6 +28,7 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
+from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Choice, try_chain
 from wavebatch.surveying.flat_ground import choose_radius
 from wavebatch.surveying.prepare import prepare
@@ -148,8 +149,7 @@ def prepare_strip(job: StripJob) -> Prepared:
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
             job = replace(job, chain=_set_radius(reader, scan, job.chain))
-            energy = job.options.pulse_energy
-            energy = None if energy is None else find_pulse_energy(reader, scan, str(energy))
+            energy = find_pulse_energy(reader, scan, job.energy) if needs_sensor(job.chain) else None
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()
             units = reader.unit_count()

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
                       required=False)
 @shared.chain_options
 @shared.system_option
+@shared.declared("energy")
 @shared.sensor_options
 @shared.declared("direction")
 @shared.html_option
@@ -119,7 +120,7 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
 
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)
-    names = ("attenuation", "divergence", "reflectance_error", "direction")
+    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy")
     figures = {name: options[name] for name in names}
     return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
 

@@ -194,7 +194,7 @@ def _find_type(name: str, kinds: Sequence[type], choices: Sequence[Any] | None, 
         return (click.IntRange if int in kinds else click.FloatRange)(low, high)
     if name == "output":
         return OutputPath(file_okay=False, path_type=Path)
-    is_path = Path in kinds and form != "NAME|FILE"
+    is_path = Path in kinds and name != "energy"
     return click.Path(path_type=Path) if is_path else str
 
 
@@ -324,9 +324,14 @@ def from_options(kind: type[_Options], options: Mapping[str, Any], **more: Any) 
     return kind(**{**given_options(options, [field.name for field in fields(kind)]), **more})
 
 
-def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
-    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
-    if len(paths) == 1:
+def for_each(
+    paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False, alone: bool = False
+) -> tuple[list[Any], int]:
+    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr.
+
+    alone: a single one that fails is such a line too.
+    """
+    if len(paths) == 1 and not alone:
         return [work(paths[0])], 0
     results, failed = [], 0
     for path in paths:

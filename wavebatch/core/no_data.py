@@ -70,7 +70,7 @@ class NoData(IntEnum):
         "its width was fitted with another pulse than mode compares it with",
         'fit the pulse of the survey (decompose.adaptive), or Gaussians with mode = "pulse"',
     )
-    NO_PULSE_ENERGY = 18, "the energy of its pulse is not known", "complete the file of --pulse-energy, or leave it out"
+    NO_PULSE_ENERGY = 18, "the energy of its pulse is not known", "complete the file of --energy, or leave it out"
     NO_LEVEL = (
         19,
         "the width of an echo that no slope widens is not known: too few points of the strip lie on planes",

@@ -97,6 +97,8 @@ class WaveformBlock:
     """
     pulse_energy: np.ndarray | None = None
     """Energy of each emitted pulse over the mean of the strip, float64 (n,), NaN where unknown; None without any."""
+    pulse_energy_err: np.ndarray | None = None
+    """Standard deviation of the energy, float64 (n,); None where it is not known."""
 
     def __len__(self) -> int:
         """Number of waveforms."""
@@ -173,7 +175,8 @@ class WaveformBlock:
             returns = ReturnTable(at[keep], returns.time[keep], returns.point[keep], returns.xyz[keep])
         samples = self.samples[index]
         samples.flags.writeable = False
-        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy")
+        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy",
+                 "pulse_energy_err")  # fmt: skip
         given = {name: getattr(self, name) for name in names}
         parts = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first

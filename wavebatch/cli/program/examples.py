@@ -25,6 +25,14 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
         ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
     ),
+    "import": (
+        ("wavebatch import flight.pls -o flight.las", "flight.las and flight.wdp, and flight.system.toml"),
+        ("wavebatch import archive/ -o strips --resume", "all files of a folder; go on after an interruption"),
+    ),
+    "export": (
+        ("wavebatch export strip.las -o repaired.laz", "packets as the LAS specification has them"),
+        ("wavebatch export strip.las -o strip.npz", "waveforms with their geometry as arrays"),
+    ),
     "stages": (
         ("wavebatch stages", "list all algorithms"),
         ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),

@@ -43,7 +43,7 @@ SIMILAR = 0.74
 """Least similarity of a variable that no command reads to one that is read, for a warning: JBOS to JOBS is 0.75."""
 
 OLD_NAMES = {"--bounds": "--bbox", "--polygons": "--polygon", "--flags-with": "--flags",
-             "--flags-without": "--drop-flags"}  # fmt: skip
+             "--flags-without": "--drop-flags", "--pulse-energy": "--energy"}  # fmt: skip
 """Names of earlier versions, and what they are now."""
 
 _INPUTS = ("strips", "strip", "clouds", "files", "cloud", "a")

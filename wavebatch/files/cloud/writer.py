@@ -94,7 +94,7 @@ class CloudWriter(PointFile):
             if packets.internal:
                 self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
-            packet_file = self.target.with_suffix(".wdp")
+            packet_file = self.target.with_suffix(packets.file.suffix.lower())
             with protecting(self._inputs):
                 draft = Draft(packet_file, overwrite=self.draft.overwrite)
             self.drafts.insert(0, draft)

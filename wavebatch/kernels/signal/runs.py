@@ -1,12 +1,36 @@
 """Runs of samples and flanks of peaks: highest samples, moments, and where a flank crosses a level.
 
-Used by stages/detect; `lobe_edges` also by the pulse models. Runs come from `find_runs` in kernels/fit/cluster: starts
-and ends (one after the last) as waveform * s + sample.
+Used by stages/detect; `lobe_edges` also by the pulse models. A run is given by its start and its end
+(one after the last sample) as waveform * s + sample.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def find_runs(smoothed: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Runs of samples above a level.
+
+    Parameters
+    ----------
+    smoothed : float32 (s, n), count
+        Signal, usually smoothed.
+    level : float (n,), count
+        Level of each waveform.
+
+    Returns
+    -------
+    starts, ends : int64 (k,)
+        First sample and one after the last, as waveform * s + sample; both sorted. A run ends with its waveform.
+    """
+    s, n = smoothed.shape
+    above = np.zeros((n, s + 2), np.int8)
+    above[:, 1:-1] = (smoothed > level).T
+    edge = np.diff(above, axis=1).ravel()
+    starts = np.flatnonzero(edge == 1)
+    ends = np.flatnonzero(edge == -1)
+    return starts - starts // (s + 1), ends - ends // (s + 1)
 
 
 def list_samples(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

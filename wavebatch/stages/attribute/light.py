@@ -17,6 +17,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.pulse_tables import BROADEST, describe_echoes, model_parameters, pulse_shape, shape_limits
 
@@ -115,7 +116,7 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     amplitude, sigma = echoes.amplitude.astype(np.float64), echoes.sigma.astype(np.float64)
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing, most=BROADEST)
     if not shape.components:
-        return amplitude * sigma * area_factor(system, echoes) / np.exp(0.5 * system.kappa**2)
+        return amplitude * sigma * area_factor(system, echoes) / exp(0.5 * system.kappa**2)
     whole = np.stack([amplitude, np.zeros(len(sigma)), sigma / block.spacing], axis=1)
     height, _, width = model_parameters(shape, limits, whole).T
     facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)), np.zeros((1, 2)))
@@ -139,10 +140,10 @@ def area_factor(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """
     if "power" in echoes.attributes:
         power = echoes.attributes["power"].astype(np.float64)
-        half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
+        half_width = 2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA
         return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width / SQRT_2PI
     skew = np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
-    return np.broadcast_to(np.exp(0.5 * skew**2), len(echoes))
+    return np.broadcast_to(exp(0.5 * skew**2), len(echoes))
 
 
 def light_error(echoes: EchoTable) -> np.ndarray:
@@ -249,7 +250,7 @@ def normalize_amplitude(
     away = np.hypot(system.sensor_error, _fit_range_error(echoes))
     relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
-    beyond = 2.0e-4 * np.log(10.0) * system.attenuation_error * np.abs(distance - reference)
+    beyond = 2.0e-4 * log(10.0) * system.attenuation_error * np.abs(distance - reference)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
@@ -269,7 +270,8 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     n = len(block)
     if block.pulse_energy is None:
         return np.ones(n), np.full(n, system.shot_error)
-    return block.pulse_energy, np.zeros(n)
+    error = np.zeros(n) if block.pulse_energy_err is None else block.pulse_energy_err / block.pulse_energy
+    return block.pulse_energy, error
 
 
 def without_calibration(system: SystemPulse) -> SystemPulse:

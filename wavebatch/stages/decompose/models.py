@@ -11,6 +11,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
@@ -23,8 +24,8 @@ from wavebatch.stages.decompose.solve import (
     fit_candidates,
     fit_gaussian,
     make_settings,
-    samples_of,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
@@ -183,7 +184,7 @@ def half_width_factor(power: float) -> float:
     float
         1 for a Gaussian.
     """
-    return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
+    return float(2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
 @stage("decompose", fits=fit_gaussian)

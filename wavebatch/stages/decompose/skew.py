@@ -22,8 +22,8 @@ from wavebatch.stages.decompose.solve import (
     describe_solution,
     fit_candidates,
     make_settings,
-    samples_of,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape
 
 UNKNOWN_SPREAD = 0.15

@@ -10,8 +10,8 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.closed_form import estimate_starts
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_antisymmetric,
@@ -19,7 +19,7 @@ from wavebatch.kernels.signal.filters import (
     filter_symmetric,
     slope_taps,
 )
-from wavebatch.kernels.signal.runs import highest_samples, run_moments, walk_down
+from wavebatch.kernels.signal.runs import find_runs, highest_samples, run_moments, walk_down
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
 from wavebatch.stages.detect.candidates import candidate_table, signal_above
@@ -70,7 +70,7 @@ def threshold(
     time = first - (inside - trigger) / rise
     if correct_walk:
         top = smoothed[peak, waveform]
-        time += _smoothed_width(ref) * np.sqrt(2 * np.log(np.maximum(top / trigger, 1.0)))
+        time += _smoothed_width(ref) * np.sqrt(2 * log(np.maximum(top / trigger, 1.0)))
         time = np.minimum(time, ends - waveform * s)
     return candidate_table(block, system, waveform, time, amplitude, width)
 
@@ -169,7 +169,7 @@ def constant_fraction(
     top = smoothed[sample, waveform]
     height = np.clip(height, top, 1.2 * top)
     edge = walk_down(smoothed, waveform, sample, np.minimum(fraction * height, 0.999 * top), -1)
-    time = edge + _smoothed_width(ref) * np.sqrt(-2 * np.log(fraction))
+    time = edge + _smoothed_width(ref) * np.sqrt(-2 * log(fraction))
     return candidate_table(block, system, waveform, time, amplitude, width)
 
 

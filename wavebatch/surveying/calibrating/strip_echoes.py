@@ -15,6 +15,7 @@ import numpy as np
 
 from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
@@ -46,6 +47,7 @@ class EchoSource:
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse
     sensor: SensorSource
+    energy: PulseEnergy | None = None
 
     @property
     def path(self) -> Path:
@@ -57,7 +59,7 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in self.reader.all_blocks(self.scan, _BLOCK):
+        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
             near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
             if len(near):
                 part = self.sensor.fill(block.rows(near))
@@ -73,6 +75,7 @@ def open_source(
     request: Request,
     attenuation: float,
     direction: str,
+    energy: str | None,
 ) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
@@ -87,6 +90,8 @@ def open_source(
         Of the air, one way [dB/km].
     direction : str
         Where packet vectors point: auto, toward or away.
+    energy : str or None
+        Of each emitted pulse; see `find_pulse_energy`.
 
     Yields
     ------
@@ -101,7 +106,8 @@ def open_source(
         setup = prepare(reader, scan, chain or widest_chain(), request, sensor=sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(setup.system, attenuation=attenuation, sensor_error=0.0)
-        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor)
+        sent = find_pulse_energy(reader, scan, energy)
+        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, sent)
 
 
 def with_energy(chain: Chain) -> Chain:

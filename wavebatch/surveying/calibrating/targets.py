@@ -55,6 +55,8 @@ class CalibrationOptions:
     """Standard deviation of the targets' reflectances, relative."""
     direction: str = "auto"
     """Where packet vectors point: auto, toward or away."""
+    energy: str | None = None
+    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
 
 
 def open_strip_source(path: Path, options: CalibrationOptions):
@@ -66,6 +68,7 @@ def open_strip_source(path: Path, options: CalibrationOptions):
         request=options.request,
         attenuation=options.attenuation,
         direction=options.direction,
+        energy=options.energy,
     )
 
 

@@ -20,6 +20,7 @@ from wavebatch.batch.selection import build_selection
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
+from wavebatch.files.pulse_energy import NONE
 from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
@@ -179,11 +180,11 @@ def _check_use(chain: Chain, job: StripJob) -> None:
     sensor = job.sensor
     _check_trajectory(sensor)
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": job.calibration,
-             "--attenuation": job.attenuation, "--pulse-energy": job.options.pulse_energy}  # fmt: skip
+             "--attenuation": job.attenuation, "--energy": None if job.energy == NONE else job.energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
         stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
-                  "--pulse-energy": "amplitude_normalized"}  # fmt: skip
+                  "--energy": "amplitude_normalized"}  # fmt: skip
         stage = f"attribute.{stages.get(option, 'range')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
 
