@@ -1,7 +1,9 @@
 """What many tests need: a seeded generator, the real files, tiny strips."""
 
 import fnmatch
+import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +13,8 @@ import pytest
 from child_signals import give_children_default_signals
 from hypothesis import HealthCheck, settings
 
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.tools.simulate import simulate_strip
 
 give_children_default_signals()
@@ -47,6 +51,18 @@ def pytest_runtest_setup(item):
 def rng():
     """The same random numbers in every run."""
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def paper_stages():
+    """The plug-in of examples/papers, for one test: other tests list the stages of wavebatch alone."""
+    before = dict(STAGES), dict(MODELS)
+    yield importlib.import_module("paper_stages")
+    for known, stages in zip((STAGES, MODELS), before, strict=True):
+        known.clear()
+        known.update(stages)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "paper_stages"]:
+        del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

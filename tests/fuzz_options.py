@@ -25,7 +25,7 @@ SOUND = {
     "voxelize": "voxelize {base}/strip.las -o {out}/a.npz --size 1",
     "grid": "grid {base}/cloud.laz --column z -o {out}/a.tif",
     "calibrate": "calibrate {base}/strip.las --targets {base}/targets.csv -o {out}/a.toml --flight-height 500",
-    "bench": "bench --scene flat --waveforms 100 --pulses 0 --repeat 1 --no-peers --no-stability -o {out}",
+    "bench": "bench --scene flat --waveforms 100 --pulses 0 --repeat 1 -o {out}",
     "plot waveform": "plot waveform {base}/strip.las -o {out}/a.csv --echoes --profile fast",
     "plot histogram": "plot histogram {base}/cloud.laz --column amplitude -o {out}/a.svg",
     "plot map": "plot map {base}/cloud.laz --column amplitude -o {out}/a.png",

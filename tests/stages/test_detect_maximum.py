@@ -71,3 +71,15 @@ def test_the_second_derivative_has_the_threshold_of_its_noise_and_a_least_height
     high = [(w, i) for w, i in peaks if smoothed[i, w] > 2.0 * 100 * gain(naive.smooth_121)]
     hold(detect("second_derivative", block, level=2.0), high)
     assert len(high) < len(peaks)
+
+
+@pytest.mark.parametrize("sigma", [2.0, 5.0, 10.0])
+def test_candidates_have_the_height_and_width_of_their_echo(sigma):
+    """Broad pulses are smoothed by a Gaussian first, which makes them lower and wider."""
+    y = 1200 + 5000 * np.exp(-0.5 * ((np.arange(160) - 80.3) / sigma) ** 2)
+    block = WaveformBlock.from_samples(np.rint(y[None]).astype(np.uint16))
+    noise = Noise(np.full(1, 1200, np.float32), np.full(1, 100, np.float32))
+    found = STAGES["detect.maximum"].function(block, noise, SystemPulse(sigma, baseline=1200.0, noise_std=100.0))
+    assert len(found) == 1 and found.time[0] == pytest.approx(80.3, abs=0.05)
+    assert found.amplitude[0] == pytest.approx(5000, rel=0.1 if sigma < 4 else 0.02)
+    assert found.sigma[0] == pytest.approx(sigma, rel=0.1 if sigma < 4 else 0.02)

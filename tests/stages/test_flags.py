@@ -19,7 +19,7 @@ def table(rng):
     """Up to five echoes in each of 120 waveforms, many of them close, with errors and some flags."""
     number = rng.integers(0, 6, N)
     m = number.sum()
-    time = rng.uniform(0, S - 1, m) ** 0.9
+    time = rng.uniform(0, S - 1, m)
     close = rng.random(m) < 0.5
     time[1:][close[1:]] = time[:-1][close[1:]] + rng.uniform(0, 4, close[1:].sum())
     sigma = rng.uniform(1.3, 4, m)
@@ -46,8 +46,9 @@ def test_flags_are_those_of_a_loop(table, rng):
     missing = np.zeros((N, S), bool)
     missing[::3, 25:33] = True
     block = replace(block, missing=missing)
-    strong = rng.random(len(table)) < 0.05
-    table = replace(table, amplitude=np.where(strong, 5000, table.amplitude).astype(np.float32))
+    strong = rng.random(len(table)) < 0.15
+    amplitude = np.where(strong, rng.uniform(1400, 1900, len(table)), table.amplitude)
+    table = replace(table, amplitude=amplitude.astype(np.float32))
     noise = Noise(np.full(N, 20, np.float32), rng.uniform(0.8, 3, N).astype(np.float32))
     system = SystemPulse(2.0, baseline=20.0, noise_std=1.0, saturation=255.0, ringing=0.1)
     found = flag_echoes(block, noise, system, replace(table, flags=np.zeros(len(table), np.uint16)))

@@ -13,7 +13,6 @@ from wavebatch.stages.pulse_tables import error_factors
 PULSE = "0 0.1 0.4 0.9 0.8 0.5 0.2 0.1"
 VARIANTS = [
     ("detect.threshold", {"correct_walk": False}),
-    ("detect.zero_crossing", {"derivative": "second"}),
     ("detect.correlation", {"reference": "given", "pulse": PULSE}),
     ("detect.asdf", {"rule": "paper", "interpolation": "parabola"}),
     ("detect.asdf", {"reference": "system"}),
@@ -21,11 +20,9 @@ VARIANTS = [
     ("detect.wavelet", {"wavelet": "mexican_hat"}),
     ("detect.wavelet", {"scale": 4.0}),
     ("detect.richardson_lucy", {"reference": "given", "pulse": PULSE, "iterations": 3}),
-    ("decompose.asdf_only", {"mode": "mixed"}),
     ("decompose.asdf_only", {"describe": "detector"}),
     ("decompose.skewed", {"kappa": 0.2}),
     ("decompose.skewed", {"kappa": "free"}),
-    ("decompose.log_normal", {"origin": "waveform"}),
     ("decompose.residual_loop", {"model": "skewed"}),
     ("decompose.residual_loop", {"model": "generalized"}),
     ("decompose.residual_loop", {"model": "learned", "t_diff": 0.1, "t_unit": "amplitude"}),

@@ -150,6 +150,14 @@ def test_the_insensitive_channel_stands_for_saturated_segments(tmp_path, rng):
     assert np.allclose([tops[k] for k in range(60)], heights + 2, rtol=0.06, atol=3)
 
 
+def test_channels_of_unknown_gain_are_all_kept(tmp_path):
+    others = [replace(ECHO, channel=k) for k in (1, 2)]
+    pulses = [Pulse([[(2000, bell(50, 12, 90, 2))] for _ in range(3)]) for _ in range(9)]
+    found = import_file(_make(tmp_path, pulses, (ECHO, *others)), tmp_path / "o.las", ImportOptions())
+    assert found.points == found.packets == 27 and found.covered == found.replaced == 0 and found.descriptors == 3
+    assert any("all of its segments are kept" in note for note in found.notes)
+
+
 def test_lengths_beyond_the_descriptors_of_las_are_padded(tmp_path, rng):
     pulses = [Pulse([[(2000, bell(20 + k, 9, 90, 2, level=3))]]) for k in range(300)]
     found = import_file(_make(tmp_path, pulses, (ECHO,)), tmp_path / "o.las", ImportOptions())
@@ -172,6 +180,18 @@ def test_degrees_become_utm_and_standard_time_that_of_las(tmp_path):
     assert np.allclose(xyz[0], [500_000, 10_000_000 - 0.9996 * 4_984_944.378, 1000 - 1010 * C], atol=0.01)
     assert facts.header.global_encoding & 1 and points["gps_time"][0] == pytest.approx(2e8 + 5)
     assert "32732" in facts.crs
+
+
+def test_geocentric_coordinates_stay_so(tmp_path):
+    keys = struct.pack("<8H", 1, 1, 0, 1, 1024, 0, 1, 3)
+    place = (4_201_000_000, 168_000_000, 1_780_000_000)
+    pulse = Pulse([[(2000, bell(40, 10, 90, 2))]], anchor=tuple(v - 2**31 + 1000 for v in place),
+                  target=tuple(v - 2**31 + 1000 - 100_000 for v in place))  # fmt: skip
+    path = _make(tmp_path, [pulse], (ECHO,), offsets=(2_147_482.648,) * 3,
+                 records=[("PulseWaves_Proj", 34735, keys)])  # fmt: skip
+    found = import_file(path, tmp_path / "o.las", ImportOptions())
+    assert "geocentric and stay so" in found.notes[0]
+    assert np.allclose(_points(tmp_path / "o.las")[2][0], [v / 1000 - 101.0 for v in place], atol=0.01)
 
 
 def test_utm_agrees_with_a_published_point():

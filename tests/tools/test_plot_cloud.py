@@ -23,6 +23,7 @@ from wavebatch.tools.plots import raster, values
 from wavebatch.tools.plots.histogram import count_flags, count_values, place_edges
 from wavebatch.tools.plots.raster import grid_values
 from wavebatch.tools.plots.values import Selection, robust_limits
+from wavebatch.tools.rasters import tiles
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def cloud(tmp_path_factory):
     return write_cloud(
         path,
         amplitude=(amplitude, np.array([-9999.0]), None, "peak above the baseline [DN]"),
-        echo_flags=(flags, None, None, "see the table of flags [bits]"),
+        echo_flags=(flags, None, None, "flags: docs/columns.md [bits]"),
         **{"Pulse width": (width, None, 0.1, "Full width at half maximum [ns]")},
         comment=(rng.normal(size=POINTS).astype("f8"), None, None, "no unit here"),
     )
@@ -93,7 +94,9 @@ def test_nothing_depends_on_the_size_of_the_pieces(cloud, monkeypatch, size):
     total = np.zeros(again.values.size)
     x, y, _, _ = read_plainly(cloud)
     known = ~np.isnan(amplitude)
-    cell = again.grid.place(x[known], y[known])
+    row, column, inside = again.grid.place(x[known], y[known])
+    assert inside.all()
+    cell = row * again.grid.columns + column
     for at, value in zip(cell, good, strict=True):
         total[at] += value
     count = np.bincount(cell, minlength=len(total))
@@ -308,13 +311,14 @@ def test_flags_select_and_are_counted(cloud):
 
 @pytest.mark.parametrize("statistic", raster.STATISTICS)
 def test_map_is_that_of_a_loop_over_cells(cloud, monkeypatch, statistic):
-    monkeypatch.setattr(raster, "_BUCKET_POINTS", 700)
+    monkeypatch.setattr(tiles, "HELD", 700)
     found = grid_values([cloud], Selection("amplitude"), statistic, size=2.5)
     x, y, amplitude, _ = read_plainly(cloud)
     grid = found.grid
-    assert (grid.x % 2.5, grid.y % 2.5) == (0, 0) and found.values.shape == (grid.rows, grid.columns)
+    west, _, south, _ = grid.extent
+    assert (west % 2.5, south % 2.5) == (0, 0) and found.values.shape == (grid.rows, grid.columns)
     known = ~np.isnan(amplitude)
-    row, column = np.floor((y - grid.y) / 2.5).astype(int), np.floor((x - grid.x) / 2.5).astype(int)
+    row, column = np.floor((y - south) / 2.5).astype(int), np.floor((x - west) / 2.5).astype(int)
     whole = {"mean": np.mean, "median": np.median, "min": np.min, "max": np.max}
     for r in range(grid.rows):
         for c in range(grid.columns):

@@ -15,6 +15,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
+from wavebatch.stages.decompose.rebuild import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
@@ -51,6 +52,16 @@ MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
 
+def _name_model(prepared: Prepared) -> list[str]:
+    """The pulse that a residual loop takes from the survey where the chain names none."""
+    step = prepared.job.chain.steps[2]
+    model = step.effective().get("model")
+    if model != "auto":
+        return []
+    fitted = loop_model(prepared.system, model)
+    return [f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"']
+
+
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     """Find what a user should know about a strip that is written.
 
@@ -72,6 +83,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
+    lines += _name_model(prepared)
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())

@@ -123,8 +123,8 @@ class RunOptions:
         False, "Use the survey of --system also where bits, noise or echo width of the strip contradict it.", CHAIN
     )
     survey: Literal["each", "flight"] = option(
-        "each", "Survey each strip by itself, or all strips once: kept as DIR/flight.system.toml, used again with "
-        "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.", CHAIN,
+        "each", "Survey each strip alone, or all strips once: kept as DIR/flight.system.toml, used again with "
+        "--resume and for later strips; a strip that does not fit it is named and surveyed alone.", CHAIN,
     )  # fmt: skip
     calibration: Path | str | None = option(
         None, "Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",

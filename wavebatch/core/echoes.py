@@ -109,7 +109,7 @@ _COLUMNS = (
     Column("relative_cross_section_err", "f4", "DN ns m4", "one standard deviation of relative_cross_section"),
     Column("relative_reflectance_err", "f4", "DN ns m2", "one standard deviation of relative_reflectance"),
     Column("pulse_deviation", "f4", "-", "Gauss-Hermite deviation from the system pulse, sqrt(h3^2 + h4^2)"),
-    Column("echo_flags", "u2", "bits", "see the table of flags", no_data=None),
+    Column("echo_flags", "u2", "bits", "flags: docs/columns.md", no_data=None),
     Column("skew", "f4", "-", "skew of the echo's log-normal; 0 is a Gaussian"),
     Column("skew_err", "f4", "-", "one standard deviation of skew"),
     Column("x", "f8", "m", "easting of the echo", extra_bytes=False),

@@ -214,7 +214,7 @@ class Noise:
 
     @property
     def for_fits(self) -> np.ndarray:
-        """The same as `kernels.fit.cluster.cut_windows` takes it, float32 (n,) or (n, s)."""
+        """The same as `kernels.fit.decompose.Samples` takes it, float32 (n,) or (n, s)."""
         return self.baseline if self.of_sample is None else self.of_sample
 
     def rows(self, rows: np.ndarray) -> Noise:

@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.build_kernels import LIBRARY, compile_library, is_outdated
+from wavebatch.core.errors import InputError
+from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, is_outdated, is_whole
 
 _POINTER = ctypes.c_void_p
 
 FUNCTIONS = (
     "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
-    "logarithms", "solve_equations",
+    "logarithms", "solve_equations", "decode_packets",
 )  # fmt: skip
 """What the library offers; each returns an int64, below 0 where there is no memory."""
 
@@ -139,6 +140,8 @@ class Samples(NamedTuple):
             raise ValueError(f"gaps do not have the shape of {n} waveforms of {s} samples")
         if not (np.isfinite(baseline).all() and np.isfinite(std).all() and (std > 0).all()):
             raise ValueError("levels and noise must be finite, and the noise above 0")
+        if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
+            raise ValueError("samples must be finite where they are not missing")
         flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
         gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
         return Samples(np.ascontiguousarray(counts), *flat, gaps)
@@ -161,22 +164,33 @@ def load() -> ctypes.CDLL:
 
     Raises
     ------
-    ImportError
-        It was not built, or for another machine.
+    InputError
+        It cannot be built, is missing or damaged, or was built for another machine.
     """
+    in_checkout = SOURCES.is_dir()
     try:
         if is_outdated():
             compile_library()
-        library = ctypes.CDLL(str(LIBRARY))
     except (OSError, RuntimeError) as error:
-        reason = f"cannot be loaded ({error})" if LIBRARY.exists() else f"were not built ({error})"
-        raise ImportError(
-            f"{LIBRARY}: the compiled kernels {reason}; install wavebatch again on this machine: "
-            "python -m pip install --force-reinstall --no-cache-dir wavebatch"
-        ) from None
-    for name in FUNCTIONS:
-        getattr(library, name).restype = ctypes.c_int64
+        raise InputError(f"{LIBRARY}: cannot be built from its C sources: {error}") from error
+    try:
+        if not is_whole(LIBRARY):
+            raise OSError("its end is missing")
+        library = ctypes.CDLL(str(LIBRARY))
+        for name in FUNCTIONS:
+            getattr(library, name).restype = ctypes.c_int64
+    except (OSError, AttributeError) as error:
+        again = "remove it, it is then built again" if in_checkout else "install wavebatch again on this machine"
+        raise InputError(
+            f"{LIBRARY}: cannot be loaded ({_reason(error)}): it is missing, damaged or of another machine; {again}"
+        ) from error
     return library
+
+
+def _reason(error: Exception) -> str:
+    """What the system says, without the path that the message begins with."""
+    text = getattr(error, "strerror", None) or str(error)
+    return text.removeprefix(f"{LIBRARY}: ")
 
 
 def call(name: str, *arguments: ctypes.Structure | ctypes._SimpleCData | np.ndarray) -> int:

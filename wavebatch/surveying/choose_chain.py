@@ -44,7 +44,7 @@ class Request:
     system: SavedSurvey | None = None
     """A saved survey; None: the strip is surveyed."""
     flight: bool = False
-    """The saved survey is that of the strip's flight, or will be made before the run: the strip is held against it."""
+    """The saved survey is that of the strip's flight, or will be made before the run: the strip is compared with it."""
     force: bool = False
     """Use the saved survey also where the strip contradicts it."""
 

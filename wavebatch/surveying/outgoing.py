@@ -14,6 +14,7 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA, QUANTISATION_STD
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.learn_pulse import PulseFit, Stack, fit_gaussians, stack_pulse
 from wavebatch.kernels.signal.outgoing import Reference, measure_outgoing
 from wavebatch.surveying import Decision, Survey
@@ -97,7 +98,7 @@ def _align(
     pulse, slope = np.zeros_like(lag), np.zeros_like(lag)
     for weight, delay, sigma in components:
         away = (lag - delay) / sigma
-        bell = weight * np.exp(-0.5 * away**2)
+        bell = weight * exp(-0.5 * away**2)
         pulse += bell
         slope += bell * away / sigma
     slope *= height[:, None]
@@ -112,7 +113,7 @@ def _align(
 def _describe(stack: Stack, fit: PulseFit, spacing: float, pulses: int) -> OutgoingShape:
     """Width and after-pulses of a fit."""
     lag = np.linspace(stack.lag[0], stack.lag[-1], _GRID) - fit.datum
-    value = sum(weight * np.exp(-0.5 * ((lag - delay) / sigma) ** 2) for weight, delay, sigma in fit.components)
+    value = sum(weight * exp(-0.5 * ((lag - delay) / sigma) ** 2) for weight, delay, sigma in fit.components)
     top = int(np.argmax(value))
     low = value < 0.5 * value[top]
     left, right = lag[top - int(np.argmax(low[top::-1]))], lag[top + int(np.argmax(low[top:]))]

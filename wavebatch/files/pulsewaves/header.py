@@ -28,6 +28,8 @@ WAVES_SIGNATURE, WAVES_HEADER_SIZE = b"PulseWavesWaves\0", 60
 OUTGOING, RETURNING = 1, 2
 MOST_SEGMENTS = 255
 """Segments of a sampling: sensors record up to a few, more are damage."""
+LEAST_SPACING = 0.001
+"""Least time between samples [ns]: LAS counts picoseconds."""
 MOST_PULSE_BYTES = 4096
 """Longest pulse record: 48 bytes and attributes."""
 
@@ -228,7 +230,7 @@ def _read_descriptor(path: Path, index: int, payload: bytes) -> Descriptor:
         raise damaged(path, f"descriptor {index} has {len(payload)} bytes")
     # Writers fill what follows the scanner with text; only the samplings say whether samples are compressed.
     size, _, _, extra, count, unit, scanner, _ = _COMPOSITION.unpack_from(payload)
-    if not 0 < unit <= MAX_SPACING or not count:
+    if not LEAST_SPACING <= unit <= MAX_SPACING or not count:
         raise damaged(path, f"descriptor {index} has {count} samplings and units of {unit:g} ns")
     samplings, at = [], max(size, _COMPOSITION.size)
     for number in range(count):
@@ -246,7 +248,7 @@ def _read_sampling(path: Path, index: int, payload: bytes, at: int) -> Sampling:
         raise refuse_compressed(path)
     widths = duration_bits in _INTEGERS and segment_bits in _INTEGERS[:3] and length_bits in _INTEGERS[:3]
     counts = (segment_bits or segments <= MOST_SEGMENTS) and (length_bits or samples <= MAX_SAMPLES)
-    times = abs(scale) < LARGEST_OFFSET and abs(offset) < LARGEST_OFFSET and 0 < spacing <= MAX_SPACING
+    times = abs(scale) < LARGEST_OFFSET and abs(offset) < LARGEST_OFFSET and LEAST_SPACING <= spacing <= MAX_SPACING
     if not widths or not counts or not times or bits not in _INTEGERS[1:]:
         raise InputError(
             f"{path}: descriptor {index} has a sampling of {segments} segments of {samples} samples of {bits} bits, "

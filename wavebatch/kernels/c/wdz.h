@@ -138,8 +138,8 @@ static void begin_packet(Decoder *d, const uint8_t *from, const uint8_t *end, ui
 
 /* Decodes n packets of `samples` samples of `bytes` (1 or 2) bytes into `out`; packet i lies in data[start[i]] to
    data[end[i] - 1]. good[i]: whether it is whole; a broken one has zeros from where it breaks. */
-EXPORT void decode_packets(const uint8_t *data, int64_t n, const int64_t *start, const int64_t *end, int64_t samples,
-                           int64_t bytes, uint8_t *out, uint8_t *good)
+EXPORT int64_t decode_packets(const uint8_t *data, int64_t n, const int64_t *start, const int64_t *end,
+                              int64_t samples, int64_t bytes, uint8_t *out, uint8_t *good)
 {
     Decoder d;
     const int32_t range = 1 << (8 * bytes);
@@ -166,4 +166,5 @@ EXPORT void decode_packets(const uint8_t *data, int64_t n, const int64_t *start,
         }
         good[i] = samples < 2 || !d.broken;
     }
+    return 0;
 }

@@ -88,8 +88,11 @@ def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tupl
     """The same as the library reads them; raises ValueError where it would read outside of them."""
     n, s = samples.counts.shape
     waveform, low, high, first, number = clusters
+    m = len(candidates.time)
+    if {len(column) for column in clusters} != {len(number)} or {len(column) for column in candidates[1:]} != {m}:
+        raise ValueError("the columns of clusters or candidates differ in length")
     inside = (waveform >= 0) & (waveform < n) & (low >= 0) & (low < high) & (high <= s)
-    if not (inside & (number > 0) & (first >= 0) & (first + number <= len(candidates.time))).all():
+    if not (inside & (number > 0) & (first >= 0) & (first + number <= m)).all():
         raise ValueError("a window lies outside of its waveform, or its candidates outside of their table")
     if not all(np.isfinite(column).all() for column in candidates[1:]):
         raise ValueError("candidates must be finite")
@@ -104,6 +107,8 @@ def _as_structure(settings: Settings) -> library.Settings:
     shape = settings.shape
     components = np.array(shape.components, np.float64).reshape(-1, 3)
     rows = (np.zeros(2, np.float32),) * 2 if shape.table is None else (shape.table.value, shape.table.slope)
+    if not 0 < settings.width_ref < np.inf or not 2 <= len(rows[0]) == len(rows[1]):
+        raise ValueError("the width of the pulse must be above 0, and its table have a slope for each of its rows")
     first, step = (0.0, 1.0) if shape.table is None else shape.table[:2]
     pulse = library.Pulse(
         _kind(shape), shape.kappa, shape.power, len(components), place(components, np.float64),

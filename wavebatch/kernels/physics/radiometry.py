@@ -59,43 +59,6 @@ def attenuation_of_visibility(visibility: float, wavelength: float) -> float:
     return 10.0 / math.log(10.0) * 3.912 / visibility * (wavelength / 550.0) ** -exponent
 
 
-def calibrate_echoes(
-    reflectance: np.ndarray | float,
-    incidence: np.ndarray | float,
-    distance: np.ndarray,
-    amplitude: np.ndarray,
-    sigma: np.ndarray,
-    attenuation: float,
-) -> np.ndarray:
-    """Calibration constant C' from each echo of a Lambertian reference of known reflectance.
-
-    Parameters
-    ----------
-    reflectance : float
-        Of the reference.
-    incidence : float, rad
-        Angle of incidence.
-    distance : float (m,), m
-        Sensor to echo.
-    amplitude, sigma : float (m,), count, ns
-        Of the echo.
-    attenuation : float, dB/km
-        Of the air, one way.
-
-    Returns
-    -------
-    float64 (m,), 1/(m2 count ns)
-        C_cal is C' pi divergence^2 / 4.
-
-    References
-    ----------
-    Wagner et al. (2010); docs/algorithms.md 5.
-    """
-    distance = known_distance(distance)
-    light = distance * distance * np.asarray(amplitude, np.float64) * np.asarray(sigma, np.float64)
-    return 4.0 * np.asarray(reflectance) * np.cos(incidence) * transmit(distance, attenuation) / _positive(light)
-
-
 def backscatter(
     constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
 ) -> np.ndarray:
@@ -104,9 +67,13 @@ def backscatter(
     Parameters
     ----------
     constant : float, 1/(m2 count ns)
-        C' of `calibrate_echoes`.
-    distance, amplitude, sigma, attenuation
-        As for `calibrate_echoes`.
+        Calibration constant C' (docs/algorithms.md 5).
+    distance : float (m,), m
+        Sensor to echo.
+    amplitude, sigma : float (m,), count, ns
+        Of the echo.
+    attenuation : float, dB/km
+        Of the air, one way.
 
     Returns
     -------

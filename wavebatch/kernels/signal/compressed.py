@@ -6,7 +6,7 @@ import ctypes
 
 import numpy as np
 
-from wavebatch.kernels.library import load, place
+from wavebatch.kernels.library import call
 
 MOST_BYTES = 5
 """Most bytes that a sample takes: 15 bits for its length, 15 coded and 8 plain ones, and carries."""
@@ -45,8 +45,6 @@ def decode_packets(
     if width not in (1, 2) or n_samples < 1 or len(start) != len(end) or not inside.all():
         raise ValueError("packets must lie inside the bytes and have samples of 1 or 2 bytes")
     samples, good = np.empty((len(start), n_samples), f"<u{width}"), np.zeros(len(start), np.uint8)
-    pointers = (ctypes.c_void_p(place(array, array.dtype)) for array in (data, start, end, samples, good))
-    bytes_of, starts, ends, out, whole = pointers
     n, s, w = (ctypes.c_int64(number) for number in (len(start), n_samples, width))
-    load().decode_packets(bytes_of, n, starts, ends, s, w, out, whole)
+    call("decode_packets", np.ascontiguousarray(data, np.uint8), n, start, end, s, w, samples, good)
     return samples, good.astype(bool)

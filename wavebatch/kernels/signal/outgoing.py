@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.kernels.elementary import exp, log
 
 QUIET = 3.5
 """Widths before the peak up to which samples show the level; what comes behind it may hold after-pulses."""
@@ -137,11 +138,11 @@ def measure_outgoing(samples: np.ndarray, reference: Reference) -> OutgoingPulse
     level, variance = _find_levels(values, peak, reference)
     values -= level.astype(np.float32)[:, None]
     three = np.stack([values[rows, np.clip(peak + step, 0, s - 1)] for step in (-1, 0, 1)]).astype(np.float64)
-    low, top, high = np.log(np.maximum(three, 0.5 * reference.noise))
+    low, top, high = log(np.maximum(three, 0.5 * reference.noise))
     bend = low + high - 2 * top
     shift = np.where(bend < 0, 0.5 * (low - high) / np.minimum(bend, -1e-9), 0.0)
     shift = np.clip(shift, -1.0, 1.0)
-    amplitude = np.exp(top - 0.25 * (low - high) * shift)
+    amplitude = exp(top - 0.25 * (low - high) * shift)
     time = peak + shift
     lag = place - time.astype(np.float32)[:, None]
     weight = np.clip(lag + np.float32(BEFORE * reference.width + 0.5), 0, 1)

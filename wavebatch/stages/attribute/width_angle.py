@@ -43,7 +43,7 @@ def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     """Refuse decomposers whose widths never are those of one pulse."""
     decomposer = chain.steps[2]
     name = decomposer.stage.name
-    if name == "decompose.log_normal" or decomposer.effective().get("kappa") == "free":
+    if "skew" in decomposer.stage.makes or decomposer.effective().get("kappa") == "free":
         return f"{name} fits a skew per echo, which takes part of the width; use decompose.adaptive"
     return ""
 

@@ -64,7 +64,7 @@ class Plan:
     ratios: dict[int, float]
     """By other channel: gain of the primary one over its gain."""
     unknown: tuple[int, ...]
-    """Other channels whose gain is not known: they are used only where the primary one recorded nothing."""
+    """Other channels whose gain is not known: nothing tells that they see the same, so all of them is kept."""
     noise: float
     """Of a sample of the primary channel [count]."""
     digitizers: dict[int, Digitizer]

@@ -5,14 +5,13 @@ Packets need metres in all three directions, so pulses in degrees are projected.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from wavebatch.files.las.geotiff_wkt import build_utm, find_code
+from wavebatch.files.las.geo_keys import GeoKeys
+from wavebatch.files.las.geotiff_wkt import build_utm
 from wavebatch.files.las.header import GEOTIFF_ID, Vlr
-from wavebatch.files.pulsewaves.header import PulseHeader
 from wavebatch.files.pulsewaves.reader import Piece, PulseReader
 from wavebatch.tools.archives.utm import find_zone, project_utm
 
@@ -21,8 +20,6 @@ SCALE = 0.001
 ROUND = 1000.0
 """Offsets of coordinates are multiples of this [m]."""
 
-_MODEL, _GEOGRAPHIC, _GEOGRAPHIC_CODE = 1024, 2, 2048
-_GEOCENTRIC = 3
 _ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
 """EPSG code of zone 0 north by the code of the geographic CRS."""
 
@@ -57,32 +54,27 @@ class Frame:
 def find_frame(reader: PulseReader) -> Frame:
     """Decide on the coordinates of a file from its GeoTIFF keys and its first pulse."""
     header = reader.header
-    keys = _read_keys(header)
+    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
+    keys = GeoKeys.parse(directory)
     first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
-    zero = _ZONES.get(keys.get(_GEOGRAPHIC_CODE, 4326))
-    if keys.get(_MODEL) == _GEOGRAPHIC and zero is not None:
+    zero = _ZONES.get(keys.code or 4326)
+    if keys.kind == "geographic" and zero is not None:
         zone, south = find_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
         code = zero + zone + (100 if south else 0)
         note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
         frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
         first = frame._project(first)
     else:
-        code = find_code(header.projection)
+        code = keys.sure_code
         scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
         wkt, notes = (build_utm(code) if code else None), _note(keys)
         frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
     return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
 
 
-def _read_keys(header: PulseHeader) -> dict[int, int]:
-    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
-    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
-    return {key: value for key, place, _, value in rows[1 : rows[0][3] + 1] if place == 0} if rows else {}
-
-
-def _note(keys: dict[int, int]) -> tuple[str, ...]:
-    if keys.get(_MODEL) == _GEOCENTRIC:
+def _note(keys: GeoKeys) -> tuple[str, ...]:
+    if keys.kind == "geocentric":
         return ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
-    if keys.get(_MODEL) == _GEOGRAPHIC:
+    if keys.kind == "geographic":
         return ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
-    return () if keys else ("the file names no CRS",)
+    return () if keys.keys else ("the file names no CRS",)

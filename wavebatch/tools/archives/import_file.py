@@ -189,7 +189,7 @@ def _note(header: PulseHeader, plan: Plan, counts: Counts) -> list[str]:
         notes.append("all pulses have the same time; they get times 0.1 ms apart")
     if plan.unknown:
         names = ", ".join(map(str, plan.unknown))
-        notes.append(f"channel {names}: its gain is not known; it is used only where channel {plan.primary} is silent")
+        notes.append(f"channel {names}: its gain over channel {plan.primary} is unknown; all of its segments are kept")
     for channel, ratio in plan.ratios.items():
         notes.append(
             f"channel {channel} is {ratio:.2f} times less sensitive than channel {plan.primary}: its counts are "

@@ -60,8 +60,6 @@ def choose_segments(piece: Piece, plan: Plan, counts: Counts) -> np.ndarray:
     first, second = find_partners(segments, plan.primary, returning)
     drop = np.zeros(len(segments), bool)
     known = np.isin(segments.channel[second], list(plan.ratios))
-    drop[second[~known]] = True
-    counts.covered += int(np.count_nonzero(~known))
     for a, b in group_rows(segments, first[known], second[known]):
         over = piece.samples(a).max(axis=1) >= SATURATED * plan.top
         drop[a[over]], drop[b[~over]] = True, True
@@ -91,6 +89,7 @@ def build_points(
         sample.append(at)
         height.append(samples[found, np.round(at).astype(np.int64)])
     if not owner:
+        counts.without_returns += len(piece.pulses)
         return np.empty(0, writer.dtype)
     owner, sample, height = (np.concatenate(part) for part in (owner, sample, height))
     order = np.lexsort((sample, owner))

@@ -36,7 +36,8 @@ def project_utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, *, south
     n = _FLATTENING / (2 - _FLATTENING)
     eccentricity = np.sqrt(_FLATTENING * (2 - _FLATTENING))
     away = np.radians((longitude - (6 * zone - 183) + 180) % 360 - 180)
-    sine = np.sin(np.radians(latitude))
+    # The poles themselves have no place in the series.
+    sine = np.clip(np.sin(np.radians(latitude)), -1 + 1e-15, 1 - 1e-15)
     conformal = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))
     xi = np.arctan2(conformal, np.cos(away))
     eta = np.arcsinh(np.sin(away) / np.hypot(conformal, np.cos(away)))

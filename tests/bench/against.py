@@ -1,11 +1,16 @@
-"""Run time and memory of whole runs, of this wavebatch and of another checkout, side by side.
+"""Run time and memory of whole runs, of this wavebatch and of another version, side by side.
 
-`cli/bench` calls it. Speeds of a shared machine change by tens of percent from minute to minute, ratios of runs that
-follow each other hardly do: so both take turns, and every round gives one ratio.
+    PYTHONPATH=tests python -m bench.against DIR [STRIP...] [-o OUT]
+
+`make bench BASE=REV` installs revision REV into DIR and calls it. Speeds of a shared machine change by tens of percent
+from minute to minute, ratios of runs that follow each other hardly do: so both take turns, and every round gives one
+ratio.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import subprocess
 import sys
@@ -20,8 +25,11 @@ import numpy as np
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.memory import ONE_THREAD
+from wavebatch.tools.bench.report import write_texts
 from wavebatch.tools.bench.scenes import find_bench_scene
 from wavebatch.tools.simulate import simulate_strip
+
+SCENES = ("mixed", "open", "forest", "empty")
 
 WHERE = "import wavebatch, sys; sys.stdout.write(wavebatch.__file__)"
 """Asks a process which wavebatch it imports."""
@@ -71,7 +79,7 @@ class Paired:
 
 
 def find_package(root: Path) -> Path:
-    """The folder that holds the package `wavebatch` of a checkout.
+    """The folder that holds the package `wavebatch` of another version.
 
     Raises
     ------
@@ -84,7 +92,7 @@ def find_package(root: Path) -> Path:
     )
     found = Path(answer.stdout or ".").resolve().parent.parent
     if answer.returncode or found != root.resolve():
-        raise InputError(f"{root}: holds no wavebatch that Python can import; name the top folder of a checkout")
+        raise InputError(f"{root}: holds no wavebatch that Python can import; name the folder that the package lies in")
     return found
 
 
@@ -95,13 +103,13 @@ def compare_runs(
 
     Parameters
     ----------
-    other : top folder of the other checkout.
+    other : folder that holds the other package.
     strips : paths by the name that the table shows.
     rounds : how often each is run, after one round that does not count.
     arguments : more arguments of `wavebatch run`.
     say : gets a line for each strip.
     """
-    here, there = Path(__file__).resolve().parents[4], find_package(other)
+    here, there = Path(__file__).resolve().parents[2], find_package(other)
     found = []
     with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as folder:
         for name, strip in strips.items():
@@ -126,7 +134,9 @@ def simulate_strips(scenes: Sequence[str], pulses: int, seed: int, folder: Path)
 
 
 def _environment(root: Path) -> dict[str, str]:
-    return {**os.environ, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": str(root.resolve())}
+    """One thread, this wavebatch first, and compiled modules kept: pip compiles those of the other version."""
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**kept, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": str(root.resolve())}
 
 
 def _run(root: Path, strip: Path, folder: Path, arguments: Sequence[str]) -> Lap:
@@ -158,7 +168,7 @@ def format_paired(other: Path, found: Sequence[Paired]) -> str:
 
 
 def to_document(other: Path, found: Sequence[Paired]) -> dict[str, Any]:
-    """The same for `--json`."""
+    """The same as plain values."""
     names = ("cpu", "wall", "peak")
     return {
         "against": str(other),
@@ -167,3 +177,30 @@ def to_document(other: Path, found: Sequence[Paired]) -> dict[str, Any]:
             for pair in found
         },
     }
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Times the strips, or simulated scenes, by both; prints the table and writes against.txt and against.json."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("other", type=Path, metavar="DIR", help="holds the other package `wavebatch`")
+    parser.add_argument("strips", type=Path, nargs="*", metavar="STRIP", help="default: simulated scenes")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for against.txt and against.json")
+    parser.add_argument("--scene", action="append", help=f"default: {', '.join(SCENES)}; may be repeated")
+    parser.add_argument("--pulses", type=int, default=200_000, help="of a simulated scene")
+    parser.add_argument("--repeat", type=int, default=5, help="rounds")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(words)
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as folder:
+        strips = {path.name: path for path in given.strips}
+        strips = strips or simulate_strips(given.scene or SCENES, given.pulses, given.seed, Path(folder))
+        found = compare_runs(given.other, strips, given.repeat, say=lambda text: print(text, file=sys.stderr))
+    text, document = format_paired(given.other, found), to_document(given.other, found)
+    print(text)
+    print(write_texts(given.output, {"against.txt": text, "against.json": json.dumps(document)}), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"error: {error}")

@@ -1,6 +1,6 @@
 """The figures that each release promises, compared with those of a benchmark document.
 
-`wavebatch bench --promises` calls `judge` and prints `format_promises`. The limits stand in the tables SPEEDS, SHARES
+`release` calls `judge` and prints `format_promises`. The limits stand in the tables SPEEDS, SHARES
 and STABLE, and in `_scene_promises` and `_system_promises` where they hold for all scenes or chains.
 """
 

@@ -1,7 +1,7 @@
 """Other decomposers on the same waveforms: gdecomp where it is installed, and scipy's leastsq as the baseline.
 
-`command` calls `run_peer`. Peers run in a Worker process, because gdecomp crashes or hangs on some waveforms: it writes
-its results to a memory-mapped file, and is started again after the waveform that stopped it.
+`release` calls `measure_peers`. Peers run in a Worker process, because gdecomp crashes or hangs on some waveforms: it
+writes its results to a memory-mapped file, and is started again after the waveform that stopped it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import os
 import tempfile
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +22,16 @@ from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.noise import pooled
+from wavebatch.tools.bench.accuracy import Group, Tally
+from wavebatch.tools.bench.command import make_row
+from wavebatch.tools.bench.speed import Laps
 from wavebatch.tools.bench.worker import Worker, WorkerDied
+from wavebatch.tools.simulate import Scene
+
+PEER_GROUPS = 6
+"""Groups of which peers get a part: they are slow."""
+
+PEER_WAVEFORMS = 2_000
 
 MOST = 12
 """Most echoes per waveform that a peer may report."""
@@ -42,6 +53,26 @@ class PeerResult:
     """Waveforms that it finished."""
     failures: int
     """Waveforms on which it crashed or hung."""
+
+
+def measure_peers(
+    scene: Scene, groups: list[Group], progress: Callable[[str], None], waveforms: int = PEER_WAVEFORMS
+) -> list[dict[str, Any]]:
+    """Rows of the benchmark for the peers, on part of the groups; waveforms: in all."""
+    groups = groups[:PEER_GROUPS]
+    n = min(max(waveforms // len(groups), 1), len(groups[0].block))
+    parts = [group.cut(n) for group in groups]
+    rows = []
+    for name in list_peers():
+        progress(f"{scene.name}: {name} on {n * len(parts)} waveforms")
+        tally, times, failures = Tally(), [], 0
+        for part in parts:
+            result = run_peer(name, part.block, part.system)
+            tally.add(part, result.found)
+            times.append(1e6 * result.seconds / max(result.waveforms, 1))
+            failures += result.failures
+        rows.append({**make_row(name, "peer", tally, Laps(kernels=times)), "crashed_or_hung": failures})
+    return rows
 
 
 def list_peers() -> list[str]:

@@ -1,6 +1,6 @@
 """The stability section of the benchmark: every chain on every stiff case of `cases`, with a count of failures.
 
-`command` calls `measure_stability`. Surveys come from ordinary scenes with the receiver of the case, not from the case:
+`release` calls `measure_stability`. Surveys come from ordinary scenes with the receiver of the case, not from the case:
 a chain must survive a waveform that its survey did not prepare it for.
 """
 
@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from bench.cases import CASES, Case, make_scene
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.accuracy import Group, Tally, derive_seed, describe_found, make_group
-from wavebatch.tools.bench.cases import CASES, Case, make_scene
 from wavebatch.tools.bench.chains import AUTO, find_twin
 from wavebatch.tools.simulate import Recording, Scene, find_scene, simulate_blocks
 from wavebatch.tools.simulate.draws import LogUniform, Mixture
@@ -133,7 +133,7 @@ def _measure(chains: list[Chain], groups: list[Group]) -> dict[str, Any]:
 
 def _is_useful(name: str) -> bool:
     """Lengths and reported errors mean little where echoes are hard on purpose."""
-    return not name.startswith("rmse") and "calibration" not in name
+    return not name.startswith("rmse") and "calibration" not in name and name != "hidden"
 
 
 def count_failures(found: EchoTable, system: SystemPulse) -> dict[str, int]:

@@ -1,4 +1,6 @@
-"""`wavebatch bench --jobs-model`: what each part of a run costs in each process, and what many jobs then reach.
+"""What each part of a run costs in each process, and what many jobs then reach.
+
+    PYTHONPATH=tests python -m bench.jobs_model [STRIP] -o OUT
 
 The parts are processor seconds of runs with one and two jobs that take turns; other load of the machine changes them
 far less than it changes elapsed time. A machine of 64 cores is not needed to see what would bound 64 jobs: what one
@@ -7,9 +9,12 @@ process does alone, and what it does per waveform.
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.against import simulate_strips
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.unit import prepare_strip
@@ -25,6 +31,7 @@ from wavebatch.batch.workers.processes import Workers
 from wavebatch.core.errors import InputError
 from wavebatch.files.strip.reader import UNIT_POINTS
 from wavebatch.tools.api.run import plan_run
+from wavebatch.tools.bench.report import write_texts
 from wavebatch.tools.bench.worker import Worker
 
 JOBS = (1, 2, 4, 16, 64)
@@ -34,6 +41,8 @@ MANY = 1000
 FEWEST_UNITS, MANY_UNITS = 2, 10
 """Units of a strip below which nothing is predicted, and below which a warning is given: fixed costs of a process
 differ by a tenth of a second from run to run, which is much of the work then."""
+PULSES, SMALL_PULSES = 600_000, 1_000
+"""Of the simulated strip, more than ten units; and of the strips that show what a strip costs, however small."""
 SMALL_STRIPS = 20
 """Strips of a batch that measures what each costs the process that writes."""
 _IMPORTS = "import resource, wavebatch.tools.api.run, wavebatch.cli.run; r = resource.getrusage(resource.RUSAGE_SELF)"
@@ -220,7 +229,7 @@ def _usage() -> tuple[float, float, float]:
     try:
         import resource
     except ImportError as error:
-        raise InputError("--jobs-model: this system does not say what processes used; run it on Linux") from error
+        raise InputError("this system does not say what processes used; run it on Linux") from error
     own, children = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return time.perf_counter(), own.ru_utime + own.ru_stime, children.ru_utime + children.ru_stime
 
@@ -274,7 +283,7 @@ def _list_elapsed(laps: Sequence[Lap]) -> str:
 
 
 def to_document(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> dict[str, Any]:
-    """The same for `--json`."""
+    """The same as plain values."""
     known = () if parts.is_short else JOBS
     predicted = {str(jobs): {"strip_s": parts.predict(jobs), "many_s": parts.predict(jobs, MANY)} for jobs in known}
     runs = {str(jobs): [asdict(lap) for lap in of] for jobs, of in laps.items()}
@@ -283,3 +292,34 @@ def to_document(strip: str, parts: Parts, laps: dict[int, list[Lap]]) -> dict[st
         "strips": MANY, "predicted": predicted, "most_jobs": None if parts.is_short else parts.most,
         "runs": runs, "warnings": list_warnings(parts),
     }  # fmt: skip
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Measures a strip, or a simulated one; prints the tables and writes jobs.txt and jobs.json."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("strip", type=Path, nargs="?", metavar="STRIP", help="default: a simulated scene")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for jobs.txt and jobs.json")
+    parser.add_argument("--scene", default="mixed")
+    parser.add_argument("--pulses", type=int, default=PULSES, help="of the simulated strip")
+    parser.add_argument("--repeat", type=int, default=3, help="rounds")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args(words)
+    with tempfile.TemporaryDirectory(prefix="wavebatch-bench-") as name:
+        folder = Path(name)
+        (folder / "small").mkdir()
+        small = simulate_strips([given.scene], SMALL_PULSES, given.seed, folder / "small")[given.scene]
+        strip = given.strip or simulate_strips([given.scene], given.pulses, given.seed, folder)[given.scene]
+        say = (lambda text: print(text, file=sys.stderr)) if sys.stderr.isatty() else (lambda text: None)
+        found = measure_jobs(strip, small, folder / "out", given.repeat, say)
+    text, document = format_jobs(strip.name, *found), to_document(strip.name, *found)
+    print(text)
+    print(write_texts(given.output, {"jobs.txt": text, "jobs.json": json.dumps(document)}), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    from bench.jobs_model import main  # worker processes find functions by the name of this module, not as __main__
+
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"error: {error}")
