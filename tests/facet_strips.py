@@ -71,6 +71,8 @@ class Sensor:
     """Of the flight, clockwise from north [deg]."""
     start: tuple[float, float] = (0.0, 0.0)
     time: float = START
+    falloff: float = 0.0
+    """Share of the light that is missing at the edge of the swath; it grows with the square of the scan angle."""
 
 
 def path_of(sensor: Sensor, seconds: np.ndarray) -> np.ndarray:
@@ -107,6 +109,8 @@ def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int
     energy = np.array([sensor.gains[number] for number in channel]) * (
         1 + sensor.energy_spread * rng.standard_normal(pulses)
     )
+    phase = (seconds * sensor.line_rate) % 1.0
+    energy *= 1 - sensor.falloff * (1.0 - 2.0 * phase) ** 2
     wave = _render(distance / C_AIR - first[:, None], strength * energy[:, None], sensor)
     clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
     samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)

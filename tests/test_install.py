@@ -14,7 +14,7 @@ from wavebatch.kernels.build_kernels import LIBRARY, find_compiler
 
 ROOT = Path(__file__).resolve().parent.parent
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="needs sh and make")]
-TOOLS = ("make", "sh", "env", "rm", "mkdir", "touch", "cp", "uname", "dirname")
+TOOLS = ("make", "sh", "echo", "env", "rm", "mkdir", "touch", "cp", "uname", "dirname")
 """What the Makefile calls, with Python."""
 
 

@@ -299,6 +299,7 @@ def test_the_page_has_every_table_and_picture(load, tmp_path, monkeypatch):
     tables = [{"title": "one <table>", "rows": rows}]
     monkeypatch.setattr(page, "measure", lambda script, *rest: (tables, script != "s2_jutzi"))
     monkeypatch.setattr(page, "run_command", lambda words, folder: _fake(words, folder))
+    monkeypatch.setattr(page, "draw_figure", lambda name, folder, seed, target: target.write_bytes(b"x") and "")
     parts, fine = page.build(None, 1000, 0)
     assert not fine, "a script whose figures are not accepted is a failure"
     page.write_page(tmp_path / "papers.html", "Papers", parts)
@@ -361,6 +362,30 @@ def test_an_older_page_is_replaced_and_another_file_is_kept(load, tmp_path, monk
         page.main()
 
 
+def test_long_tables_are_folded_unless_a_figure_is_not_accepted(load):
+    page = load("page")
+    row = ["a", "-", "-", "1", "0..2", "ok"]
+    short, long = ({"title": "t", "rows": [row] * n} for n in (3, 20))
+    assert "<details" not in page.fold(short) and page.fold(long).startswith("<details><summary>t: 20 figures<")
+    wrong = page.fold({"title": "t", "rows": [row] * 19 + [[*row[:-1], "FAIL"]]})
+    assert wrong.startswith("<details open><summary>t: 20 figures, 1 not accepted<")
+
+
+@pytest.mark.parametrize("name", ["draw_cases", "draw_coefficients", "draw_record"])
+def test_figures_are_drawn(name, load, tmp_path):
+    pytest.importorskip("matplotlib")
+    target = tmp_path / "p.png"
+    assert load("page").draw_figure(name, tmp_path, 1, target) == ""
+    assert target.read_bytes().startswith(b"\x89PNG") and target.stat().st_size > 20_000
+
+
+def test_every_picture_has_a_command_or_a_function(load):
+    pictures = [picture for paper in load("page").PAPERS for picture in paper.pictures]
+    drawn = {picture.command for picture in pictures if not picture.option}
+    figures = load("figures")
+    assert drawn == {name for name in vars(figures) if name.startswith("draw_")}
+
+
 def _fake(words, folder):
     if "cube" in words[:2]:
         return "error: no <pulse>"
@@ -372,7 +397,7 @@ def _fake(words, folder):
 def test_commands_of_the_page_are_those_of_wavebatch(load):
     from wavebatch.cli import main
 
-    for picture in [picture for paper in load("page").PAPERS for picture in paper.pictures]:
+    for picture in [picture for paper in load("page").PAPERS for picture in paper.pictures if picture.option]:
         words = shlex.split(picture.command)
         command = main
         while hasattr(command, "commands") or command is main:

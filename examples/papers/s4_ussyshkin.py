@@ -19,7 +19,8 @@ from table import Table, main, scatter
 import wavebatch as wb
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse
-from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
+from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.detect.maximum import maximum
 from wavebatch.tools.return_stats.returns import ReturnStats, count_returns
@@ -50,8 +51,13 @@ def fly(stand: str, dead_zone: float, number: int, seed: int) -> ReturnStats:
     """The result of `wavebatch stats` for `wavebatch simulate canopy.STAND --sensor discrete --dead-zone METRES`."""
     with TemporaryDirectory() as folder:
         cloud = Path(folder) / "cloud.las"
-        simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))
+        fly_cloud(stand, cloud, dead_zone, number, seed)
         return count_returns([cloud])[1]
+
+
+def fly_cloud(stand: str, cloud: Path, dead_zone: float, number: int, seed: int) -> None:
+    """The cloud of that command."""
+    simulate_returns(f"canopy.{stand}", cloud, pulses=number, seed=seed, receiver=DiscreteReceiver(dead_zone))
 
 
 def table_of_numbers(number: int, seed: int) -> Table:
@@ -117,7 +123,7 @@ def table_of_the_equation() -> Table:
     for distance in (300.0, 800.0, 3000.0):
         section = spread_cross_section(np.array(0.3), np.array(distance), 7e-4)
         power = receive_power(section, np.array(distance), divergence=7e-4, **figures)
-        through = pass_atmosphere(distance, figures["attenuation"])
+        through = transmit(0.5 * distance, figures["attenuation"])
         short = 4000 * 0.1**2 * 0.3 * 0.4 * through**2 / (4 * distance**2)
         table.near(f"over P D^2 rho Q T^2 / (4 R^2), {distance:g} m", power / short, 1.0, share=1e-6)
         half = receive_power(section, np.array(distance), divergence=3.5e-4, **figures)

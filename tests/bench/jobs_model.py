@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from bench.against import simulate_strips
+
 from wavebatch.batch.options import RunOptions
 from wavebatch.batch.run import BatchResult, run_batch
 from wavebatch.batch.unit import prepare_strip

@@ -17,6 +17,7 @@ from bench.promises import format_promises, judge
 from bench.stability import FAILURES, measure_stability
 from bench.stability_tables import format_stability
 from bench.system import measure_system
+
 from wavebatch.tools.bench.chains import choose_chains, list_methods, load_chains
 from wavebatch.tools.bench.command import BenchOptions, Progress, run_bench
 from wavebatch.tools.bench.report import format_document, write_outputs

@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-
 from bench.cases import CASES, Case, make_scene
+
 from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import Chain

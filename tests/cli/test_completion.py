@@ -70,8 +70,8 @@ def test_every_shell_has_its_script(shell):
     [
         ("wavebatch run a --drop-flags weak,ring", 4, ["weak,RINGING_SUSPECT"]),
         ("wavebatch plot map a --drop-flags NO_E", 5, ["NO_ECHO"]),
-        ("wavebatch run a --columns +ran", 4, ["+range", "+range_err"]),
-        ("wavebatch run a --columns +range,+rang", 4, ["+range,+range_err"]),
+        ("wavebatch run a --columns +ran", 4, ["+range", "+range_err", "+range_error"]),
+        ("wavebatch run a --columns +range,+rang", 4, ["+range,+range_err", "+range,+range_error"]),
         ("wavebatch grid a --column echo_w", 4, ["echo_width", "echo_width_err"]),
         ("wavebatch stages decompose.resid", 2, ["decompose.residual_loop"]),
         ("wavebatch simulate fore", 2, ["forest"]),

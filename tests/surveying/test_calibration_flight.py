@@ -9,7 +9,7 @@ from click.testing import CliRunner
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
 from wavebatch.cli import main
-from wavebatch.surveying.calibrating.adjust_flight import adjust_constants
+from wavebatch.surveying.calibrating.adjust_flight import Anchors, adjust_constants
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
 from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, measure_ties
 
@@ -128,7 +128,7 @@ def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
     constants = np.array([0.0, 0.3, -0.2, 0.1])
     ties = make_ties(rng, constants, 2000, outliers=0.1)
     given = np.array([0.0, np.nan, np.nan, np.nan])
-    found = adjust_constants(ties, given, np.full(4, 0.01))
+    found = adjust_constants(ties, Anchors(given, np.full(4, 0.01)))
     assert np.abs(found.value - constants).max() < 0.01
 
 
@@ -138,20 +138,20 @@ def test_the_errors_of_the_adjustment_hold_its_errors(rng):
     for _ in range(60):
         ties = make_ties(rng, constants, 120)
         given = np.array([rng.normal(0, 0.01), np.nan, rng.normal(-0.2, 0.02)])
-        found = adjust_constants(ties, given, np.array([0.01, np.nan, 0.02]))
+        found = adjust_constants(ties, Anchors(given, np.array([0.01, np.nan, 0.02])))
         ratios += list((found.value - constants) / found.error)
     assert 0.55 < np.mean(np.abs(ratios) < 1) < 0.8
 
 
 def test_sources_without_ties_stay_unknown(rng):
     ties = make_ties(rng, np.zeros(2), 5)
-    found = adjust_constants(ties, np.array([0.0, np.nan, 0.4]), np.full(3, 0.01))
+    found = adjust_constants(ties, Anchors(np.array([0.0, np.nan, 0.4]), np.full(3, 0.01)))
     assert np.isfinite(found.value).tolist() == [True, False, True]
 
 
 def test_channels_without_any_tie_have_the_constants_of_their_targets():
     nothing = measure_ties(np.zeros(0, TIE), 5.0)
-    found = adjust_constants(nothing, np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02]))
+    found = adjust_constants(nothing, Anchors(np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02])))
     assert found.value[[0, 2]].tolist() == pytest.approx([0.1, 0.4], rel=1e-9) and np.isnan(found.value[1])
     assert found.error[[0, 2]] == pytest.approx([0.01, 0.02], rel=0.35)
 

@@ -540,3 +540,16 @@ def test_real_clouds(riegl, leica, tmp_path):
     assert values.Clouds([riegl], Selection("amplitude")).facts.unit == "dB"
     assert run("map", riegl, "--column", "z", "--statistic", "max", "-o", tmp_path / "r.png").exit_code == 0
     assert grid_values([leica], Selection("intensity")).total.values == 999
+
+
+def test_small_groups_are_one_series(tmp_path):
+    """Two echoes of a class made bins of 50 %; the picture says that they stand together."""
+    group = np.repeat([1, 2, 3, 4, 5], [4000, 900, 2, 19, 79]).astype("u1")
+    path = write_cloud(tmp_path / "c.las", n=5000, group=(group, None, None, "-"))
+    found = count_values([path], Selection("z"), by="group")
+    assert found.names == ("group 1", "group 2", "group 5", "group with fewer than 20 points each")
+    assert found.values.tolist() == [4000, 900, 79, 21]
+    assert (found.counts.sum(axis=1) + found.below + found.above).tolist() == [4000, 900, 79, 21]
+    alone = np.repeat([1, 2], [4995, 5]).astype("u1")
+    lone = write_cloud(tmp_path / "d.las", n=5000, group=(alone, None, None, "-"))
+    assert count_values([lone], Selection("z"), by="group").names == ("group 1", "group 2"), "one has no company"

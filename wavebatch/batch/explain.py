@@ -48,6 +48,12 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 FASTEST = 120.0
 """Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
 
+JETS = 5000.0
+"""Height of a sensor above the points from which a speed beyond FASTEST is believed where a CRS says metres [m]."""
+
+MOST_ABOVE_ONE = 0.03
+"""Share of the reflectances above 1 from which a warning is printed."""
+
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
 
@@ -124,6 +130,7 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _find_nothing(prepared, report)
     lines += _doubt_pulse(prepared, report)
     lines += () if choice.doubted else _doubt_fits(prepared, report)
+    lines += _doubt_reflectance(report)
     if not choice.doubted or not echoes:
         return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
@@ -185,6 +192,17 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
         )
 
 
+def _doubt_reflectance(report: RunReport) -> Iterator[str]:
+    """More reflectances above 1 than metal, signs and wet roofs explain."""
+    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
+    if report.above_one > MOST_ABOVE_ONE * known > 0:
+        share = f"{100 * report.above_one / known:.0f} %"
+        yield (
+            f"{share} of the reflectances exceed 1, that of a white matt surface: the calibration is of another sensor "
+            "or setting, a target's reflectance is wrong, or coordinates are not in metres"
+        )
+
+
 def _name_height(prepared: Prepared) -> Iterator[str]:
     """A flight height that was not needed."""
     height, sensor = prepared.job.sensor.height, prepared.sensor
@@ -218,12 +236,14 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
 def _doubt_units(prepared: Prepared) -> Iterator[str]:
     """An aircraft that is too fast: its strip may be in feet without saying so."""
     facts = dict(prepared.sensor.facts)
-    named = any(unit.horizontal is not None or unit.kind is not None for unit in prepared.facts.units)
-    if prepared.sensor.kind != "trajectory" and not named and facts.get("speed_m_s", 0.0) > FASTEST:
+    named = any(unit.horizontal is not None for unit in prepared.facts.units)
+    if named and facts.get("height_m", 0.0) > JETS:
+        return
+    if prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST:
         yield (
             f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
-            f"{facts['height_m']:.0f} m above the points; no CRS says so: are they in feet? Then ranges are 3.28 times "
-            "too long: project the strip to metres"
+            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
+            "3.28 times too long: project the strip to metres"
         )
 
 

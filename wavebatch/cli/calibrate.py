@@ -5,6 +5,7 @@ Only reads options and prints; the work is in `wavebatch.surveying.calibrating.t
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
               help="Attenuation of the air, one way [dB/km].")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
+@click.option("--scan-angle", is_flag=True,
+              help="Fit how the light falls with the scan angle, where strips overlap; `run` takes it off.")
 @shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
                       required=False)
 @shared.output_option("Also draw drifts and overlaps of the strips (PNG, SVG or PDF).", "FILE", "--plot",
@@ -107,6 +110,9 @@ def calibrate(
         talk(line)
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
         talk(line)
+    if found.swath:
+        edge = math.expm1(-sum(found.swath[1:]))
+        talk(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
     if len(found.channels) > 1:
         numbers = f"constants of {len(found.channels)} channels"
@@ -120,7 +126,7 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
 
     asked = shared.from_options(RunOptions, options)
     chain, request = find_request(asked)
-    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy")
+    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy", "scan_angle")
     figures = {name: options[name] for name in names}
     return CalibrationOptions(sensor=read_sensor(asked), chain=chain, request=request, **figures)
 

@@ -68,6 +68,7 @@ def prepare(
     sensor: SensorRequest | None = None,
     positions: Positions = Positions.IF_NEEDED,
     calibration: Calibration | None = None,
+    air: float | None = None,
     extend: Callable[[Chain], Chain] | None = None,
 ) -> Setup:
     """Choose pulse and chain of a strip, find its sensor, and see whether its calibration fits.
@@ -83,6 +84,8 @@ def prepare(
         Where positions shall come from; by default from the strip.
     positions : Positions
     calibration : Calibration, optional
+    air : float, optional
+        Attenuation during the flight [dB/km]; None: that of the calibration.
     extend : callable, optional
         Adds stages to a chain that the request chose.
 
@@ -107,7 +110,7 @@ def prepare(
         source = _find_sensor(reader, scan, sensor or SensorRequest(), positions)
     if calibration is None:
         return Setup(choice, source, stranger=stranger, forced=forced)
-    fitted = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain)
+    fitted = match_strip(calibration, reader, scan, choice.survey.system, source, choice.chain, air)
     return Setup(choice, source, fitted.calibration, fitted.warnings, stranger, forced)
 
 

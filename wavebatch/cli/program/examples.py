@@ -88,6 +88,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "calibrate": (
         ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
          "for `run --calibration cal.toml`"),
+        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
+         "with light that falls across the swath"),
     ),
     "bench": (
         ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
@@ -98,7 +100,7 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
 
 GROUPS: dict[str, tuple[str, ...]] = {
     CHAIN: ("waveforms", "divergence"),
-    AIR: ("reflectance_error",),
+    AIR: ("reflectance_error", "scan_angle"),
     WHICH: ("flags", "packets", "point_numbers", "times", "most", "random", "limit"),
     OUTPUT: ("column", "html_file", "report", "as_json", "plot"),
     RUNNING: ("dry_run", "progress", "verbose", "quiet", "log_path", "log_level", "debug", "help"),

@@ -182,7 +182,7 @@ def backscatter_error(
 
 
 def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
-    """Relative error of a reflectance for which a surface of unknown slope was taken as level.
+    """Relative error of a reflectance for which a surface of unknown slope was taken as level, of its value.
 
     Parameters
     ----------
@@ -194,14 +194,17 @@ def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
     Returns
     -------
     float64 (m,)
-        Root mean square over the directions of cos(true angle) / cos(incidence) - 1.
+        Root mean square over the directions of cos(incidence) / cos(true angle) - 1; for slopes that some rays graze
+        it is large, not infinite.
 
     Notes
     -----
     A surface of slope d whose steepest direction is turned by p from the ray has cos(true angle) = cos(a) cos(d) -
-    sin(a) sin(d) cos(p), a the angle to level ground.
+    sin(a) sin(d) cos(p), a the angle to level ground; the true reflectance is the value times cos(a) / cos(true angle).
     """
-    return np.hypot(1.0 - math.cos(slope), np.tan(incidence) * (math.sin(slope) / math.sqrt(2.0)))
+    mean, turning = math.cos(slope), np.tan(incidence) * math.sin(slope)
+    square = np.maximum(mean * mean - turning * turning, 0.01)
+    return np.sqrt(np.maximum(mean / square**1.5 - 2.0 / np.sqrt(square) + 1.0, 0.0))
 
 
 def reflectance_error(relative: np.ndarray, incidence: np.ndarray, incidence_err: np.ndarray) -> np.ndarray:

@@ -71,25 +71,6 @@ def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return echoes.count(len(block))[echoes.waveform] == 1
 
 
-def level_angle(block: WaveformBlock) -> np.ndarray:
-    """Compute the angle at which each ray strikes level ground.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        n waveforms with directions.
-
-    Returns
-    -------
-    float64 array, shape (n,)
-        Angle [rad].
-    """
-    x, y, z = block.direction.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        down = -z / np.sqrt(x * x + y * y + z * z)
-    return np.arccos(np.clip(down, -1.0, 1.0))
-
-
 def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Measure the energy of each echo as the amplitude times sigma of a Gaussian.
 
@@ -166,6 +147,14 @@ def light_error(echoes: EchoTable) -> np.ndarray:
     return np.where(np.isnan(fitted), lone, fitted)
 
 
+AIR_DOUBT = 0.5
+"""Relative error of the attenuation of the air where none is given: clear air has 0.1 to 0.5 dB/km."""
+
+BOUND_ERROR = 0.5
+"""Least relative error of the light of an echo whose fit ended at a bound: what it lacks its neighbours have, so that
+sums over a pulse stay right."""
+
+
 class Light(NamedTuple):
     """What m echoes of a block return; arrays (m,)."""
 
@@ -174,6 +163,8 @@ class Light(NamedTuple):
     gamma: np.ndarray
     relative_error: np.ndarray
     """Of a quantity that grows with R^power."""
+    bound: np.ndarray
+    """Whether the fit ended at a bound: the light is an estimate."""
     cases: Cases
     """Why gamma may be missing."""
 
@@ -201,22 +192,22 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
     energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
-    light = np.where(guess | bound, np.nan, echo_light(block, system, echoes))
+    light = np.where(guess, np.nan, echo_light(block, system, echoes))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(constant, distance, light, 1.0, system.attenuation) / energy
-    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
+    away = np.hypot(system.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(
         np.hypot(light_error(echoes), shot_error), distance, away, constant_err, system.attenuation,
         power=power, attenuation_err=system.attenuation_error,
     )  # fmt: skip
+    relative = np.where(bound, np.hypot(relative, BOUND_ERROR), relative)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NOT_CALIBRATED, np.isnan(constant)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
         (NoData.SATURATED, guess),
-        (NoData.UNSETTLED, bound),
     )
-    return Light(distance, gamma, relative, cases)
+    return Light(distance, gamma, relative, bound, cases)
 
 
 def normalize_amplitude(
@@ -247,10 +238,11 @@ def normalize_amplitude(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, system.attenuation) / energy
         fit = echoes.amplitude_err.astype(np.float64) / amplitude
-    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
+    away = np.hypot(system.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
-    beyond = 2.0e-4 * log(10.0) * system.attenuation_error * np.abs(distance - reference)
+    air_error = system.attenuation_error or AIR_DOUBT * system.attenuation
+    beyond = 2.0e-4 * log(10.0) * air_error * np.abs(distance - reference)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
@@ -260,7 +252,7 @@ def normalize_amplitude(
     return value, np.hypot(relative, beyond), cases
 
 
-def _fit_range_error(echoes: EchoTable) -> np.ndarray:
+def fit_range_error(echoes: EchoTable) -> np.ndarray:
     """Error of the range by the fit [m], f8 (m,); 0 where no stage has computed it."""
     return echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
 
@@ -276,7 +268,7 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
 
 def without_calibration(system: SystemPulse) -> SystemPulse:
     """Replace the calibration by a constant of exactly 1, for quantities in units of the strip."""
-    return replace(system, calibration=1.0, calibration_err=0.0, channels={})
+    return replace(system, calibration=1.0, calibration_err=0.0, channels={}, swath=())
 
 
 def add_column(

@@ -20,6 +20,7 @@ from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
 from wavebatch.surveying.calibrating.strip_channels import SCANNERS
 from wavebatch.surveying.choose_chain import Choice, Request
 from wavebatch.surveying.prepare import Positions, prepare
@@ -27,9 +28,10 @@ from wavebatch.surveying.sensor import SensorRequest, SensorSource
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"),
+    ("channel", "<i4"), ("time", "<f8"),
 ])  # fmt: skip
-"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel."""
+"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
+time [s]."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
@@ -47,6 +49,7 @@ class EchoSource:
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse
     sensor: SensorSource
+    setting: Setting
     energy: PulseEnergy | None = None
 
     @property
@@ -106,8 +109,11 @@ def open_source(
         setup = prepare(reader, scan, chain or widest_chain(), request, sensor=sensor, positions=Positions.REQUIRED)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(setup.system, attenuation=attenuation, sensor_error=0.0)
+        setting = measure_setting(reader, scan, setup.sensor, attenuation)
         sent = find_pulse_energy(reader, scan, energy)
-        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, sent)
+        if energy is not None and sent is not None:
+            check_energies(reader, scan, sent)
+        yield EchoSource(reader, scan, setup.choice, with_energy(setup.chain), system, setup.sensor, setting, sent)
 
 
 def with_energy(chain: Chain) -> Chain:
@@ -132,6 +138,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["light"] = echoes.attributes[_LIGHT]
     rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
+    rows["time"] = block.gps_time[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]

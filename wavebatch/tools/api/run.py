@@ -25,7 +25,7 @@ from wavebatch.kernels.physics.radiometry import attenuation_of_visibility
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
-from wavebatch.surveying.calibration import needs_sensor
+from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -172,6 +172,8 @@ def read_air(options: RunOptions) -> tuple[float, float] | None:
     given = options.attenuation
     if options.visibility is not None:
         given = attenuation_of_visibility(options.visibility, options.wavelength or 1064.0)
+    if given is not None:
+        check_attenuation(given)
     return None if given is None else (float(given), float(options.attenuation_error or 0.0))
 
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from wavebatch import __version__
 from wavebatch.core.units import format_relative
+from wavebatch.core.waveforms import swath_columns
 from wavebatch.surveying.calibrating.calibrate_flight import FlightCalibration
 from wavebatch.surveying.calibrating.calibration_file import format_calibration
 from wavebatch.surveying.calibration import Calibration
@@ -40,6 +43,8 @@ def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
                     for one in found.channels]  # fmt: skip
         head = ["digitizer", "scanner channel", "echoes", "constant", "error %", "spread %"]
         yield markup.section("Channels", markup.table(head, channels))
+    if found.swath:
+        yield markup.section("Scan angle", figures([_draw_swath(found.swath)]))
     if found.strips:
         yield _list_strips(found)
     if flight.pairs:
@@ -50,6 +55,14 @@ def _parts(flight: FlightCalibration, found: Calibration) -> Iterator[str]:
         yield markup.section("Overlaps", markup.table(head, pairs, sortable=True))
     provenance = {"wavebatch": __version__, "strip": found.strip, "date of the strip": found.date}
     yield markup.section("Provenance", markup.facts(provenance), markup.code(format_calibration(found)))
+
+
+def _draw_swath(swath: tuple[float, ...]) -> str:
+    """How the light falls with the scan angle, which the calibration takes off."""
+    angles = np.linspace(0.0, swath[0], 7)
+    light = 100 * np.exp(-swath_columns(angles, swath[0]) @ swath[1:])
+    names = [f"{angle:.1f}" for angle in np.degrees(angles)]
+    return draw_values(names, light, np.zeros(7), title=f"Light from 0 to {names[-1]} deg", label="% of straight down")
 
 
 def _list_targets(found: Calibration) -> str:
