@@ -12,9 +12,9 @@ from collections.abc import Iterator
 import click
 from fuzz_damage import _damage_text, apply_edits
 
+from wavebatch.batch.options import EXCLUSIVE
 from wavebatch.cli import COMMANDS, main
 from wavebatch.cli.options import OutputPath
-from wavebatch.cli.program.settings import EXCLUSIVE
 
 SOUND = {
     "run": "run {base}/strip.las -o {out} --profile fast", "info": "info {base}/strip.las",
