@@ -60,10 +60,10 @@ def total_until(profile, time, spacing):
 
 
 def slope_error(incidence, slope, directions=3600):
-    """Root mean square of cos(true angle) / cos(incidence) - 1 over surfaces that slope in any direction."""
+    """Root mean square of cos(incidence) / cos(true angle) - 1 over surfaces that slope in any direction."""
     ray = np.array([np.sin(incidence), 0.0, np.cos(incidence)])
     off = []
     for turn in 2 * np.pi * np.arange(directions) / directions:
         normal = np.array([np.sin(slope) * np.cos(turn), np.sin(slope) * np.sin(turn), np.cos(slope)])
-        off.append(ray @ normal / ray[2] - 1)
+        off.append(ray[2] / (ray @ normal) - 1)
     return np.sqrt(np.mean(np.square(off)))

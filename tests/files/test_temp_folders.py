@@ -130,8 +130,8 @@ def test_without_a_place_the_spool_says_so(tmp_path, monkeypatch):
         spool.seal()
 
 
-RUN = """
-import os, signal, sys
+EVERY_PROCESS = """
+import os, signal
 from wavebatch.batch import strip_task
 from wavebatch.files.disk import spool
 from wavebatch.files.strip import reader
@@ -140,13 +140,10 @@ spool.KEPT, reader.UNIT_POINTS = 0, 500
 def kill(task, workers):
     os.kill(os.getpid(), signal.SIGKILL)
 
-if "--resume" not in sys.argv:
+if "TEST_KILLS" in os.environ:
     strip_task.StripTask._open = kill  # the scan of the strip is done, its spool is there
-if __name__ == "__main__":
-    sys.argv[0] = "wavebatch"
-    from wavebatch.cli import main
-    main()
 """
+"""As sitecustomize: workers do not run the script of the user."""
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
@@ -157,11 +154,11 @@ def test_the_next_run_clears_up_after_one_that_was_killed(tmp_path, edit_points,
     simulate_strip("urban", tmp_path / "b.las", pulses=3000, seed=2)
     order = np.random.default_rng(1)
     edit_points(tmp_path / "b.las", strips / "b.las", lambda points: order.permutation(points))
-    script = tmp_path / "run.py"
-    script.write_text(RUN)
-    command = [sys.executable, str(script), "run", str(strips), "-o", str(out), "--profile", "fast", "-q"]
-    environment = {**os.environ, "TMPDIR": str(temporary)}
-    run = subprocess.run([*command, "--jobs", jobs], env=environment)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(EVERY_PROCESS)
+    command = [sys.executable, "-m", "wavebatch", "run", str(strips), "-o", str(out), "--profile", "fast", "-q"]
+    environment = {**os.environ, "TMPDIR": str(temporary), "PYTHONPATH": str(tmp_path / "site")}
+    run = subprocess.run([*command, "--jobs", jobs], env=environment | {"TEST_KILLS": "1"})
     assert run.returncode == -signal.SIGKILL
     assert list(temporary.rglob("spool"))
     deadline = time.monotonic() + 300

@@ -104,7 +104,7 @@ def test_every_number_of_the_system_has_a_key():
     fields |= {"correlation", "tail_misfit", "pattern"}
     # Of a calibration and of the sensor's position, which come with files of their own.
     elsewhere = {"calibration", "calibration_err", "channels", "attenuation", "sensor_error", "shot_error"}
-    elsewhere |= {"attenuation_error"}
+    elsewhere |= {"attenuation_error", "swath"}
     # Set by a chain while it runs.
     elsewhere |= {"other_pulse"}
     assert fields | elsewhere == set(SystemPulse.__dataclass_fields__)

@@ -386,7 +386,7 @@ def test_equal_shares_count_the_returns_that_a_thinned_cloud_lacks(cloud, tmp_pa
     assert return_light.share_equally(np.array([2, 2, 4, 0, 0]), starts) == pytest.approx([0.5, 0.5, 0.25, 0.5, 0.5])
     words = ("-o", tmp_path / "x.las", "--intensity", "reflectance", "--sensor-height", 1200, "--overwrite")
     said = run(tmp_path / "first.las", *words, "--shares", "equal")
-    assert "equal shares count the returns that the points state" in said.stderr
+    assert "equal shares use number_of_returns, including missing returns" in said.stderr
     assert "shares of incomplete pulses" not in said.stderr  # they are not those of the points that are there
     given = add_columns(tmp_path / "first.las", tmp_path / "g.las", footprint=np.full(len(las.points), 0.3))
     said = run(given, *words, "--shares", "footprint")
