@@ -1,10 +1,11 @@
 # A bare machine needs Python 3.11 or later (with venv) and make: everything else is installed into .venv.
 #   make demo      simulate a forest strip, run it, compare the result with the truth
-#   make test      the fast tests          make test-all   all of them
+#   make test      the fast tests          make test-all   all of them, each with its own surveys
 #   make papers    the tables and pictures of five papers on simulated data: papers.html
 #   make bench     error against run time  make docs       the documentation as a site, in site/
 #   make readers   other programs' LAS readers, from PyPI and npm as far as these have them, for `make test`
-#   make bench BASE=REV                    run times of this checkout and of revision REV, in turn
+#   make bench BASE=REV                    run times of this checkout and of revision REV, in turn; more options of
+#                  either, as --pulses or --scene: BENCH_OPTIONS="--scene open" (tests/bench/against.py, release.py)
 #   make man       the manual pages, in build/man
 #   make fuzz      damaged inputs of every kind, MINUTES=10 SEED=1; failures go to tests/fuzz_regressions.jsonl
 #   make attack    signals to running commands and their workers at random instants, RUNS=1000 SEED=1
@@ -52,17 +53,17 @@ demo: $(VENV)/.run
 	$(BIN)/wavebatch info $(DEMO)/forest.laz
 	$(BIN)/wavebatch run $(DEMO)/forest.laz -o $(DEMO)/out --profile accurate --overwrite -v
 	$(BIN)/wavebatch compare $(DEMO)/out/forest.laz --truth $(DEMO)/truth.npz
-	@echo
-	@echo "cloud:  $(DEMO)/out/forest.laz"
-	@echo "report: $(DEMO)/out/forest.report.json"
+	@$(BIN)/wavebatch compare $(DEMO)/out/forest.laz --truth $(DEMO)/truth.npz --json > $(DEMO)/compare.json
+	@$(BIN)/python examples/demo.py $(DEMO)
 
 readers: $(VENV)/.test
 	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: copclib
 	-command -v npm >/dev/null && npm install --silent --no-save --no-audit --no-fund --prefix $(VENV)/npm \
 	  copc@0.0.8 laz-perf@0.0.7 @loaders.gl/core@4.4.5 @loaders.gl/las@4.5.1
 
+# A file at a time for each process: its strips and surveys are then made once.
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q -n auto -m 'not slow'
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m 'not slow'
 
 test-all: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto
@@ -71,14 +72,15 @@ papers: $(VENV)/.plot
 	$(BIN)/python examples/papers/page.py -o papers.html
 
 bench: $(VENV)/.test
-	@mkdir -p $(BENCH)
-	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
+	@rm -rf $(BENCH)/base $(BENCH)/source && mkdir -p $(BENCH)/source
 ifdef BASE
-	@rm -rf $(BENCH)/base && git worktree prune && git worktree add --quiet --detach $(BENCH)/base $(BASE)
-	$(BIN)/wavebatch bench --against $(BENCH)/base --pulses 200000 --repeat 5 -o $(BENCH); \
-	  status=$$?; git worktree remove --force $(BENCH)/base; exit $$status
+	git archive $(BASE) | tar -x -C $(BENCH)/source
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target $(BENCH)/base $(BENCH)/source
+	@rm -rf $(BENCH)/source
+	PYTHONPATH=tests $(BIN)/python -m bench.against $(BENCH)/base -o $(BENCH) $(BENCH_OPTIONS)
 else
-	$(BIN)/wavebatch bench --scene mixed --scene open --scene forest --scene empty --promises -o $(BENCH)
+	-@$(BIN)/python -c 'import gdecomp' 2>/dev/null || $(BIN)/python -m pip install --quiet gdecomp
+	PYTHONPATH=tests $(BIN)/python -m bench.release -o $(BENCH) $(BENCH_OPTIONS)
 endif
 
 fuzz: $(VENV)/.test
@@ -89,7 +91,7 @@ attack: $(VENV)/.test
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "site: site/index.html"
+	@echo "site: site/index.html; with its search: $(BIN)/python -m http.server --directory site"
 
 man: $(VENV)/.test
 	$(BIN)/wavebatch --man-pages build/man
@@ -99,4 +101,5 @@ lint: $(VENV)/.test
 
 clean:
 	rm -rf $(VENV) papers.html $(DEMO) $(BENCH) site build dist *.egg-info .pytest_cache .hypothesis .ruff_cache
+	rm -rf wavebatch/kernels/_kernels.* wavebatch/kernels/.build-*
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

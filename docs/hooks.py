@@ -6,6 +6,7 @@ mkdocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A line `
 
 from __future__ import annotations
 
+import html
 import inspect
 import pkgutil
 import re
@@ -27,7 +28,19 @@ from wavebatch.stages.chain_file import format_step
 def on_page_markdown(markdown: str, **_: object) -> str:
     """The page with the generated parts in their places."""
     makers = {"commands": commands, "stages": stages, "api": api, "modules": modules}
+    markdown = _name_links(markdown)
     return re.sub(r"(?m)^<!-- (\w+)((?: \w+)*) -->$", lambda found: makers[found[1]](*found[2].split()), markdown)
+
+
+def _name_links(markdown: str) -> str:
+    """Links that have the name of a page's file get its title."""
+
+    def name(found: re.Match) -> str:
+        page = Path(__file__).with_name(found[1])
+        title = page.read_text("utf-8").partition("\n")[0].removeprefix("# ") if page.exists() else found[1]
+        return f"[{title}]({found[2]})"
+
+    return re.sub(r"\[(?:docs/)?([\w-]+\.md)\]\(([^)]*)\)", name, markdown)
 
 
 def commands() -> str:
@@ -49,7 +62,7 @@ def _command(command: click.Command, parent: click.Context, name: str, level: in
     for heading, records in group_options(command, context):
         rows = [(names, text) for names, text in records if text and "--help" not in names]
         lines = [f"| {heading} | what it does |", "|---|---|"]
-        lines += [f"| `{_cell(names)}` | {_cell(_plain(text))} |" for names, text in rows]
+        lines += [f"| {_code(names)} | {_cell(_plain(text))} |" for names, text in rows]
         if rows:
             yield "\n".join(lines)
     examples = EXAMPLES.get(context.command_path.removeprefix("wavebatch "), ())
@@ -61,7 +74,12 @@ def _command(command: click.Command, parent: click.Context, name: str, level: in
 
 
 def _cell(text: str) -> str:
-    return re.sub(r"\s+", " ", text).replace("|", "\\|")
+    return re.sub(r"\s+", " ", text).replace("|", "&#124;")
+
+
+def _code(text: str) -> str:
+    """Text as code in a table: Markdown would end the cell at a bar, and show a backslash before it."""
+    return f"<code>{_cell(html.escape(text, quote=False))}</code>"
 
 
 def _paragraphs(text: str) -> str:
@@ -121,9 +139,10 @@ def _plain(text: str) -> str:
     """Text of a docstring as Markdown: characters that would be markup are kept as they are."""
     pieces = re.split(r"(`[^`]*`)", re.sub(r"\s+", " ", text.replace("``", "`")).strip())
     plain = "".join(
-        piece if piece.startswith("`") else re.sub(r"([*_\[\]<>#])", r"\\\1", piece) for piece in pieces
+        piece if piece.startswith("`") else re.sub(r"([*_\[\]#])", r"\\\1", html.escape(piece, quote=False))
+        for piece in pieces
     )
-    return re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[docs/\1](\1)", plain)
+    return _name_links(re.sub(r"docs/((?:algorithms|las-waveforms)\.md)", r"[\1](\1)", plain))
 
 
 def api() -> str:

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from child_signals import give_children_default_signals
 from click.testing import CliRunner
 
 import wavebatch
@@ -425,6 +426,7 @@ def _start() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after so long")
     options = parser.parse_args()
+    give_children_default_signals()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     failures = 0
     with tempfile.TemporaryDirectory() as folder:

@@ -1,19 +1,68 @@
 """What many tests need: a seeded generator, the real files, tiny strips."""
 
+import fnmatch
+import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import kept_surveys
 import numpy as np
 import pytest
+from child_signals import give_children_default_signals
+from hypothesis import HealthCheck, settings
 
+from wavebatch.stages.chain import STAGES
+from wavebatch.stages.decompose.rebuild import MODELS
 from wavebatch.tools.simulate import simulate_strip
+
+give_children_default_signals()
+
+
+def pytest_configure(config):
+    """The fast tests share surveys and draw fewer examples; examples are the same in every run, however slow."""
+    fast = config.option.markexpr == "not slow"
+    if fast:
+        kept_surveys.install()
+    unhurried = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    examples = 40 if fast else 200
+    settings.register_profile("wavebatch", derandomize=True, deadline=None, max_examples=examples,
+                              suppress_health_check=unhurried)  # fmt: skip
+    settings.load_profile("wavebatch")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """All cases but those that `quick_cases` names are slow."""
+    for item in items:
+        quick = item.get_closest_marker("quick_cases")
+        if quick and not any(fnmatch.fnmatchcase(item.callspec.id, name) for name in quick.args):
+            item.add_marker("slow")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Tests of surveys make their own."""
+    kept_surveys.active = "surveying" not in item.path.parts
 
 
 @pytest.fixture
 def rng():
     """The same random numbers in every run."""
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def paper_stages():
+    """The plug-in of examples/papers, for one test: other tests list the stages of wavebatch alone."""
+    before = dict(STAGES), dict(MODELS)
+    yield importlib.import_module("paper_stages")
+    for known, stages in zip((STAGES, MODELS), before, strict=True):
+        known.clear()
+        known.update(stages)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "paper_stages"]:
+        del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.strip.writer import FullwaveWriter
 
 C_AIR = 0.299792458 * 0.9997 / 2
@@ -55,6 +56,8 @@ class Sensor:
     noise: float = 0.6
     energy_spread: float = 0.0
     """Relative standard deviation of the energy of shots."""
+    store_energy: bool = False
+    """Write the energy of each shot as the extra byte `pulse_energy`."""
     bits: int = 16
     spacing: float = 1.0
     n_samples: int = 80
@@ -68,6 +71,8 @@ class Sensor:
     """Of the flight, clockwise from north [deg]."""
     start: tuple[float, float] = (0.0, 0.0)
     time: float = START
+    falloff: float = 0.0
+    """Share of the light that is missing at the edge of the swath; it grows with the square of the scan angle."""
 
 
 def path_of(sensor: Sensor, seconds: np.ndarray) -> np.ndarray:
@@ -104,11 +109,13 @@ def write_strip(path: Path, facets: Sequence[Facet], sensor: Sensor, pulses: int
     energy = np.array([sensor.gains[number] for number in channel]) * (
         1 + sensor.energy_spread * rng.standard_normal(pulses)
     )
+    phase = (seconds * sensor.line_rate) % 1.0
+    energy *= 1 - sensor.falloff * (1.0 - 2.0 * phase) ** 2
     wave = _render(distance / C_AIR - first[:, None], strength * energy[:, None], sensor)
     clean = np.rint(20.0 + wave + sensor.noise * rng.standard_normal(wave.shape))
     samples = np.clip(clean, 0, (1 << sensor.bits) - 1).astype(np.uint16 if sensor.bits > 8 else np.uint8)
     hit = (strength * distance).sum(axis=1) / strength.sum(axis=1)
-    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit)
+    _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy)
     return path
 
 
@@ -162,15 +169,17 @@ def _render(time: np.ndarray, strength: np.ndarray, sensor: Sensor) -> np.ndarra
     return wave
 
 
-def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit) -> None:
+def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit, energy) -> None:
     indices = [1] if sensor.scanners else list(sensor.gains)
     digitizers = [
         Digitizer(index, sensor.bits, sensor.n_samples, sensor.spacing, sensor.descriptor_gain) for index in indices
     ]
     kind = {"version": "1.4", "point_format": 9} if sensor.scanners else {"version": "1.3", "point_format": 4}
+    extra = [ExtraRecord.build("pulse_energy", "f4", "")] if sensor.store_energy else []
     with FullwaveWriter(
-        path, internal=True, digitizers=digitizers, offsets=(EAST, NORTH, 0.0), overwrite=True, **kind
-    ) as writer:
+        path, internal=True, digitizers=digitizers, offsets=(EAST, NORTH, 0.0), overwrite=True, extra_bytes=extra,
+        **kind,
+    ) as writer:  # fmt: skip
         used = np.ones(len(channel), int) if sensor.scanners else channel
         offset = np.zeros(len(channel), np.uint64)
         for index in indices:
@@ -181,6 +190,8 @@ def _write(path, sensor, origin, ray, seconds, channel, samples, first, hit) -> 
             points[name] = np.rint((origin + hit[:, None] * ray)[:, axis] / 0.001)
             points["xyz"[axis] + "_t"] = -ray[:, axis] * C_AIR / 1000.0
         points["gps_time"] = sensor.time + seconds
+        if extra:
+            points["pulse_energy"] = energy
         points["bit_fields"] = 1 | (1 << (4 if sensor.scanners else 3))
         heading = np.radians(sensor.heading)
         across = np.degrees(np.arctan2(ray @ [-np.cos(heading), np.sin(heading), 0.0], -ray[:, 2]))

@@ -1,4 +1,4 @@
-"""The fuzzer of `tests/fuzzing.py`: what it has found stays mended, it finds planted defects, and two minutes of it."""
+"""The fuzzer of `tests/fuzzing.py`: what it has found stays mended, it finds planted defects, and hundreds of cases."""
 
 import json
 import os
@@ -31,6 +31,7 @@ def test_what_failed_once_does_not_fail_again(fuzzer, case):
     assert fuzzer.run(case) == ""
 
 
+@pytest.mark.quick_cases("strip.las", "cloud.laz", "*.[!lw]*")
 @pytest.mark.parametrize("kind", sorted(COMMANDS))
 def test_sound_inputs_do_not_fail(fuzzer, kind):
     """Else the fuzzer would only see how commands refuse."""
@@ -165,7 +166,8 @@ def _drop(words):
 def test_the_fuzzer_sees_every_kind_of_failure(fuzzer, monkeypatch, what, why):
     monkeypatch.setattr(fuzzing, "main", _plant(what))
     monkeypatch.setattr(fuzzing, "MOST_SECONDS", 2)
-    monkeypatch.setattr(fuzzing, "MOST_WAITING", 3)
+    if "waits" in why:
+        monkeypatch.setattr(fuzzing, "MOST_WAITING", 3)
     monkeypatch.setattr(fuzzing, "MOST_MEMORY", 600 << 20)
     assert re.search(why, fuzzer.run(Case("strip.las", "survey {input} -o {out}/a.toml", [])))
 
@@ -185,11 +187,11 @@ def test_a_failing_case_is_made_small(fuzzer, monkeypatch):
 
 
 @pytest.mark.slow
-def test_two_minutes_of_damaged_inputs_break_no_promise(tmp_path):
+def test_hundreds_of_damaged_inputs_break_no_promise(tmp_path):
     seed = int(os.environ.get("FUZZ_SEED", "1"))
     said = []
-    assert list(fuzz(tmp_path, 120, seed, tell=said.append)) == []
-    assert int(said[-1].split()[0]) > 100  # cases
+    assert list(fuzz(tmp_path, float("inf"), seed, tell=said.append, most=600)) == []
+    assert int(said[-1].split()[0]) >= 600
     inside = {line.split()[0]: int(line.split()[-6]) for line in said[1:-1]}
     assert sum(number > 0 for number in inside.values()) > 0.6 * len(
         inside

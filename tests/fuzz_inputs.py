@@ -79,7 +79,7 @@ plot profile {input} -o {out}/a.svg
 """
 
 _VENDOR = """
-run {input} -o {out} --pulse-energy Energy --calibration {base}/cal.toml --profile fast
+run {input} -o {out} --energy Energy --calibration {base}/cal.toml --profile fast
 run {input} -o {out} --where Deviation>=3 --columns +range --profile fast -q
 run {input} -o {out} --points returns --where Energy<2 --no-data nan --profile fast -q
 run {input} -o {out} --trajectory {base}/degrees.txt --profile fast -q
@@ -127,7 +127,7 @@ calibrate {base}/strip.las --targets {base}/targets.csv -o {out}/a.toml --trajec
 voxelize {base}/strip.las -o {out}/a.npz --size 1 --calibration {base}/cal.toml --trajectory {input}
 """,
     "degrees.txt": "run {base}/strip.las -o {out} --trajectory {input} --crs EPSG:32632 -q",
-    "energy.txt": "run {base}/strip.las -o {out} --pulse-energy {input} --calibration {base}/cal.toml --profile fast",
+    "energy.txt": "run {base}/strip.las -o {out} --energy {input} --calibration {base}/cal.toml --profile fast",
     "targets.geojson": """
 calibrate {base}/strip.las --targets {input} -o {out}/c.toml --flight-height 500
 calibrate {base}/strip.las {base}/packed.laz --targets {input} -o {out}/c.toml --flight-height 500

@@ -25,7 +25,7 @@ SOUND = {
     "voxelize": "voxelize {base}/strip.las -o {out}/a.npz --size 1",
     "grid": "grid {base}/cloud.laz --column z -o {out}/a.tif",
     "calibrate": "calibrate {base}/strip.las --targets {base}/targets.csv -o {out}/a.toml --flight-height 500",
-    "bench": "bench --scene flat --waveforms 100 --pulses 0 --repeat 1 --no-peers --no-stability -o {out}",
+    "bench": "bench --scene flat --waveforms 100 --pulses 0 --repeat 1 -o {out}",
     "plot waveform": "plot waveform {base}/strip.las -o {out}/a.csv --echoes --profile fast",
     "plot histogram": "plot histogram {base}/cloud.laz --column amplitude -o {out}/a.svg",
     "plot map": "plot map {base}/cloud.laz --column amplitude -o {out}/a.png",
@@ -49,7 +49,7 @@ _TEXTS = {
     "column": "amplitude", "classes": "2,6-9", "drop_flags": "RINGING_SUSPECT,WEAK", "flags_with": "SATURATED,WEAK",
     "flags_without": "WEAK", "lever_arm": "0.1,-0.2,0.5", "crs": "EPSG:32632", "lines": "0:3", "packet": "0:3",
     "times": "0:20", "value_range": "0:100", "memory": "2G", "tolerance": "0.02m", "profile": "accurate",
-    "line": "300000,5000000,300100,5000100", "pulse_energy": "intensity", "no_data": "-9999.0", "gps_time": "1.5",
+    "line": "300000,5000000,300100,5000100", "energy": "intensity", "no_data": "-9999.0", "gps_time": "1.5",
     "by": "number_of_returns", "scene": "forest", "hazard": "H3", "area": "5",
 }  # fmt: skip
 _PLACES = [

@@ -53,6 +53,7 @@ def alone(echoes, n):
     return echoes.take(echoes.count(n)[echoes.waveform] == 1)
 
 
+@pytest.mark.quick_cases("*-noise known", "10-gaussian-*", "100-adaptive-*")
 @pytest.mark.parametrize("knowledge", ["noise known", "file to file"])
 @pytest.mark.parametrize("name", DECOMPOSERS)
 @pytest.mark.parametrize("snr", [10, 20, 100])
@@ -203,6 +204,7 @@ def run_scene(scene, profile, n=8192):
     return score(found, truth, n, noise_std=find_scene(scene).recording.recorded_noise)
 
 
+@pytest.mark.quick_cases("mixed-*")
 @pytest.mark.parametrize(
     ("scene", "profile", "exact", "completeness", "correctness"),
     [

@@ -37,7 +37,7 @@ def _plant(attacker, monkeypatch, code):
 
 def _begin(words, **how):
     """The process, once it does not die of the signal: on a busy machine that takes a while."""
-    process, deadline = _POPEN(words, **how), time.monotonic() + 60
+    process, deadline = _POPEN(words, **how), time.monotonic() + 300
     while process.poll() is None and not attacking._handles_signals(process.pid):
         assert time.monotonic() < deadline, "the program does not begin"
         time.sleep(0.01)
@@ -51,7 +51,7 @@ _POPEN = attacking.subprocess.Popen
     ("code", "why"),
     [
         ("sys.exit(7)", "exit code 7"),
-        ("time.sleep(6), time.sleep(6)", "hangs"),
+        ("time.sleep(60), time.sleep(60)", "hangs"),
         ("(out / 'a.toml').write_text('who'); sys.exit(130)", "not `interrupted`"),
         ("(out / 'a.toml').write_text('who'); print('interrupted', file=sys.stderr); sys.exit(130)", "is not that of"),
         ("(out / '.x.tmp').write_text(''); print('interrupted', file=sys.stderr); sys.exit(130)", "leaves"),
@@ -62,8 +62,8 @@ _POPEN = attacking.subprocess.Popen
     ],
 )
 def test_the_attacker_sees_every_kind_of_failure(attacker, monkeypatch, code, why):
-    monkeypatch.setattr(attacking, "LONGEST", 3.0)
-    monkeypatch.setattr(attacking, "STAY", 1.0)
+    monkeypatch.setattr(attacking, "LONGEST", 3.0 if why == "hangs" else 60.0)
+    monkeypatch.setattr(attacking, "STAY", 1.0 if why == "stay" else 15.0)
     _plant(attacker, monkeypatch, code)
     assert re.search(why, attacker.attack(Attack("survey", "TERM", 0.3)))
 

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from wavebatch.cli import COMMANDS, main
 from wavebatch.core.echoes import COLUMNS, FLAG_MEANINGS, EchoFlag
+from wavebatch.kernels.build_kernels import LIBRARY
 from wavebatch.stages.chain import STAGES
 from wavebatch.stages.chain_file import list_profiles, parse_chain
 
@@ -174,13 +175,15 @@ def test_a_wheel_holds_all_and_works_outside_the_repository(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         archive.extractall(away)
-    assert "wavebatch/py.typed" in names
+    assert {"wavebatch/py.typed", f"wavebatch/kernels/{LIBRARY.name}"} <= names
+    assert not [name for name in names if name.startswith("wavebatch/kernels/c/")]  # it would be compiled once more
     assert {f"wavebatch/stages/profiles/{name}.toml" for name in list_profiles()} <= names
     assert any(name.endswith("/licenses/LICENSE") for name in names)
     assert not [name for name in names if not re.match(r"wavebatch(-[\w.]+\.dist-info)?/", name)]
     # Where the repository is installed as an editable package, its path must not come before the wheel's.
     code = (
         "import wavebatch, sys; from wavebatch.stages.chain_file import list_profiles, load_profile; "
+        "from wavebatch.kernels.library import load; load(); "
         "print(wavebatch.__file__); [load_profile(name) for name in list_profiles()]"
     )
     environment = {**os.environ, "PYTHONPATH": str(away)}

@@ -29,6 +29,7 @@ def test_example_chains_run(chain, tiny_strip, tmp_path):
     assert len(cloud) > 300
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_the_pipeline_makes_what_is_missing_only(tiny_strip, tmp_path):
     strips = tmp_path / "strips"

@@ -25,5 +25,5 @@ def test_damaged_inputs_and_what_failed_once():
 
 
 @pytest.mark.slow
-def test_two_minutes_of_damaged_inputs():
+def test_hundreds_of_damaged_inputs():
     _run("-m", "slow")

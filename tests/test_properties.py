@@ -116,6 +116,7 @@ def test_permuted_rows_permute_results(profile, scene, data):
     assert_same(back.take(np.argsort(back.waveform, kind="stable")), whole)
 
 
+@pytest.mark.quick_cases("fast-uint8", "balanced-uint16", "accurate-uint32")
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
 @pytest.mark.parametrize("profile", list_profiles())
 @fast

@@ -53,7 +53,7 @@ def _run(folder, text):
 def _opens_las(folder):
     """Whether CloudCompare reads LAS: Debian's package leaves that plugin out."""
     done = subprocess.run(["CloudCompare", "-SILENT", "-O", "strip.las"], cwd=folder, capture_output=True, text=True,
-                          env={**os.environ, "QT_QPA_PLATFORM": "offscreen"}, timeout=60)  # fmt: skip
+                          env={**os.environ, "QT_QPA_PLATFORM": "offscreen"}, timeout=300)  # fmt: skip
     return "unhandled file extension" not in done.stdout + done.stderr
 
 

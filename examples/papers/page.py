@@ -29,15 +29,19 @@ from wavebatch.tools.html.page import check_page, write_page
 FOLDER = Path(__file__).resolve().parent
 
 
+LONG = 8
+"""Tables with more rows are folded."""
+
+
 @dataclass(frozen=True)
 class Picture:
-    """A picture that a command makes."""
+    """A picture that a command makes, or a function of `figures`."""
 
     caption: str
     command: str
-    """Words after `wavebatch`; the file to write is added with `-o`."""
+    """Words after `wavebatch`, the file to write is added with `-o`; or the name of the function."""
     option: str = "-o"
-    """Option that takes the file."""
+    """Option that takes the file; empty for functions."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ _WAVES = "--profile balanced --echoes"
 
 PAPERS = (
     Paper("s0_wagner", "Wagner, Roncat, Melzer, Ullrich (2007)", "1, 3, 5", (
+        Picture("Figure 1: ground and roofs of a village as voxels of 1 m, with the energy that came back from each.",
+                "draw_voxels", ""),
         Picture("A waveform with its echoes: samples, fitted Gaussians and residual.",
                 f"plot waveform forest.laz --packet 19 {_WAVES} --show detector"),
         Picture("The square difference to a reference pulse of the waveform's height (ASDF), with the paper's rule of "
@@ -62,11 +68,12 @@ PAPERS = (
                 "plot waveform forest.laz --packet 19 --show asdf --chain asdf.toml"),
         Picture("Echoes of the forest from the side.", "plot section out/forest.laz --column amplitude --aspect 3"),
     )),
-    Paper("s1_wang", "Wang, Wang, Tseng", "1b, 5", (
-        Picture("A skewed pulse (kappa 0.23) and its fit: the model follows the falling edge.",
-                "plot waveform leica.laz --packet 40:42 --times all --echoes"),
-        Picture("Coefficients of the B3-spline wavelet, in which echoes are searched, with the threshold.",
-                "plot waveform forest.laz --packet 17:21 --profile balanced --show wavelet"),
+    Paper("s1_wang", "Wang, Wang, Tseng", "1b, 4, 5", (
+        Picture("Figures 1b and 5: the five cases without noise (dashed: their echoes), and the echoes that the B3 "
+                "wavelet finds at three scales.", "draw_cases", ""),
+        Picture("Figure 4: the coefficients at these scales, of case e in noise 1.", "draw_coefficients", ""),
+        Picture("A skewed pulse (kappa 0.1) and its fit by `decompose.skewed`: the model follows the falling edge.",
+                "plot waveform skewed.laz --packet 40:42 --times all --echoes --chain skewed.toml"),
     )),
     Paper("s2_jutzi", "Jutzi, Stilla (2005)", "6, 8", (
         Picture("The waveform deconvolved with the system pulse: the signal of the surfaces along the ray.",
@@ -79,7 +86,12 @@ PAPERS = (
         Picture("Length of the segments per height: the ground at 120 m, flat roofs at 124 m, slopes above.",
                 "plot profile segments.csv --column length --log"),
     )),
-    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "3, 4, 5, 6", (
+    Paper("s3_rhomberg_kauert", "Rhomberg-Kauert, Poeppl, Pfennigbauer, Mandlburger (2024)", "2A, 3, 4, 5, 6", (
+        Picture("Figures 2A and 3: the pulse h as printed and Carlsson's, and the width of the echo by angle, with "
+                "widths that were fitted to planes of 400,000 rays (bars: their spread at A/sn 100).",
+                "draw_widths", ""),
+        Picture("Figures 4 and 6B: angles from widths by angles from the normals of surfaces, and the histogram of "
+                "their differences.", "draw_angles", ""),
         Picture("Echo widths in plan: roofs of 0 to 60 degrees on level ground.",
                 "plot map out/village.laz --column echo_width --statistic median --size 2"),
         Picture("Angles of incidence from these widths.",
@@ -93,6 +105,10 @@ PAPERS = (
                 "incidence_angle_normals --where 'z > 123.5'"),
     )),
     Paper("s4_ussyshkin", "Ussyshkin, Theriault (2011)", "1, 2, 4, 6, 7", (
+        Picture("Figures 1 and 2: a pulse with four returns, and the waveform that `synthesize` models from them.",
+                "draw_record", ""),
+        Picture("Figures 4, 6 and 7: the same trees of 20 m by a receiver with a dead zone of 0.65 m and by one of 2 "
+                "m, and their returns by height.", "draw_canopy", ""),
         Picture("Amplitudes by the number of returns of the pulse.",
                 "plot histogram out/forest.laz --column amplitude --by number_of_returns"),
         Picture("Amplitudes by return number.", "plot histogram out/forest.laz --column amplitude --by return_number"),
@@ -120,6 +136,20 @@ stage = "attribute.incidence_angle"
 divergence = 1.1
 """
 
+_SKEWED = """[[chain]]
+stage = "noise.pooled"
+[[chain]]
+stage = "detect.maximum"
+[[chain]]
+stage = "decompose.skewed"
+[[chain]]
+stage = "attribute.amplitude"
+[[chain]]
+stage = "attribute.echo_width"
+[[chain]]
+stage = "attribute.position"
+"""
+
 _ASDF = """[[chain]]
 stage = "noise.pooled"
 [[chain]]
@@ -143,26 +173,42 @@ def run_command(words: Sequence[str], folder: Path) -> str:
 def prepare(folder: Path, pulses: int, seed: int) -> list[str]:
     """Simulates the strips of the pictures and makes their clouds; the errors."""
     (folder / "asdf.toml").write_text(_ASDF)
+    (folder / "skewed.toml").write_text(_SKEWED)
     (folder / "village.toml").write_text(_VILLAGE)
     more = ["--pulses", str(pulses), "--seed", str(seed)]
     # Scan lines have 2,000 pulses: the maps and the cube need many lines.
     many = ["--pulses", str(24 * pulses), "--seed", str(seed)]
     commands = [
         ["simulate", "forest", "-o", "forest.laz", *more], ["simulate", "village", "-o", "village.laz", *many],
-        ["simulate", "forest", "-o", "leica.laz", "--pulse", "leica", *more],
+        ["simulate", "forest", "-o", "skewed.laz", "--pulse", "skewed", *more],
         ["run", "forest.laz", "-o", "out", "--profile", "balanced", "-q"],
         ["run", "village.laz", "-o", "out", "--chain", "village.toml", "-q"],
+        ["voxelize", "village.laz", "--size", "1", "-o", "voxels.laz", "-q"],
         ["slice", "village.laz", "--most", "60", "--cube", "cube.npz", "-o", "segments.csv", "-q"],
     ]  # fmt: skip
     return [f"wavebatch {' '.join(words)}: {error}" for words in commands if (error := run_command(words, folder))]
 
 
-def draw(pictures: Sequence[Picture], folder: Path) -> Iterator[tuple[Picture, bytes | None, str]]:
+def draw(pictures: Sequence[Picture], folder: Path, seed: int) -> Iterator[tuple[Picture, bytes | None, str]]:
     """Draws pictures; each with its bytes, or with the error."""
     for number, picture in enumerate(pictures):
         target = folder / f"p{number}.png"
-        error = run_command([*shlex.split(picture.command), picture.option, target.name, "--overwrite"], folder)
+        if picture.option:
+            error = run_command([*shlex.split(picture.command), picture.option, target.name, "--overwrite"], folder)
+        else:
+            error = draw_figure(picture.command, folder, seed, target)
         yield picture, None if error else target.read_bytes(), error
+
+
+def draw_figure(name: str, folder: Path, seed: int, target: Path) -> str:
+    """Calls a function of `figures`; the error, or an empty text."""
+    import figures
+
+    try:
+        getattr(figures, name)(folder, seed, target)
+    except (ConfigError, InputError, OSError) as error:
+        return str(error)
+    return ""
 
 
 def measure(script: str, number: int | None, seed: int, folder: Path) -> tuple[list[dict], bool]:
@@ -188,9 +234,21 @@ def format_table(table: dict) -> str:
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
 
+def fold(table: dict) -> str:
+    """A table as HTML; a long one is folded, unless a figure of it is not accepted."""
+    rows, shown = table.get("rows", ()), format_table(table)
+    if len(rows) <= LONG:
+        return shown
+    missed = sum(row[-1] == "FAIL" for row in rows)
+    title = f"{table['title']}: {len(rows)} figures" + (f", {missed} not accepted" if missed else "")
+    opened = " open" if missed else ""
+    return f"<details{opened}><summary>{markup.text(title)}</summary>\n{shown}\n</details>"
+
+
 def format_picture(picture: Picture, image: bytes | None, error: str) -> str:
     """A picture with its caption and its command."""
-    command = markup.text(f"wavebatch {picture.command} {picture.option} picture.png")
+    ours = f"wavebatch {picture.command} {picture.option} picture.png"
+    command = markup.text(ours if picture.option else f"{picture.command} in examples/papers/figures.py")
     caption = markup.text(picture.caption)
     below = f"<figcaption>{caption}<br><code>{command}</code></figcaption>"
     if image is None:
@@ -229,20 +287,21 @@ def build(number: int | None, pulses: int, seed: int) -> tuple[list[str], bool]:
         for paper in PAPERS:
             print(f"== {paper.script}", flush=True)
             tables, accepted = measure(paper.script, number, seed, folder)
-            drawn = list(draw(paper.pictures, folder)) if drawing else []
+            drawn = list(draw(paper.pictures, folder, seed)) if drawing else []
             failed = sum(bool(error) for _, _, error in drawn)
             fine &= accepted and bool(tables) and not failed
             banded, inside = count_accepted(tables)
-            mark = markup.identifier(paper.script)
+            mark = paper.script
             link = markup.Cell(f'<a href="#{mark}">{markup.text(paper.title)}</a>')
             rows.append([link, banded, inside, len(drawn) - failed])
-            inner = [markup.paragraph(one) for one in notes.get(paper.script, ())]
-            inner += [format_table(table) for table in tables]
-            if not tables:
-                inner.append(markup.paragraph(f"{paper.script}.py printed no table; run it to see why", "warning"))
+            inner = []
             if drawn:
                 inner.append(markup.paragraph(f"In place of the paper's figures {paper.figures}, on simulated strips:"))
             inner += [format_picture(*one) for one in drawn]
+            inner += [markup.paragraph(one) for one in notes.get(paper.script, ())]
+            inner += [fold(table) for table in tables]
+            if not tables:
+                inner.append(markup.paragraph(f"{paper.script}.py printed no table; run it to see why", "warning"))
             parts.append(markup.section(paper.title, *inner, mark=mark))
     if not drawing:
         errors = ["no pictures: matplotlib is not installed (pip install matplotlib)"]

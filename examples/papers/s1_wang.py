@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 from published import PULSE_SIGMA, WANG_CASES, simulate_wang
-from table import Table, main
+from table import Table, main, scatter
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
@@ -68,10 +68,14 @@ CLASSES = {
 
 Skew and noise were chosen so that both E come out as the paper has them: two numbers in, two numbers out. What the
 tables show is that one skewed pulse in noise explains them, not that the paper's pulse was this one."""
-PULSES = {"gamma, k = 12": 12, "gamma, k = 24": 24}
-"""Pulses (t / tau)^k exp(-t / tau), which are no log-normals: their skew must be estimated."""
-LOOP = {"urban": (0.924, 0.947), "forest": (0.613, 0.707)}
-"""Completeness of maxima and fit, and of wavelet, fit and loop, in docs/algorithms.md 2.5."""
+PULSES = {"gamma, k = 12": (12, 0.197), "gamma, k = 24": (24, 0.318)}
+"""Pulses (t / tau)^k exp(-t / tau), which are no log-normals: their skew must be estimated. k, and E of the skewed
+fit over E of the Gaussian with 1000 waveforms, which scatters by 0.003."""
+LOOP = {"urban": (92.4, 94.7, 93.8, 95.6, 1.2), "forest": (61.3, 70.7, 63.5, 73.6, 6.1)}
+"""Completeness [%] of maxima and fit, and of wavelet, fit and loop, in docs/algorithms.md 2.5; ours of 4000 waveforms,
+which scatter by 0.4, and what the loop gains over its candidates [points]."""
+FULL = 4000
+"""Waveforms that the bands hold for."""
 
 
 def find_wavelet(block, noise, system) -> EchoTable:
@@ -130,13 +134,13 @@ def table_of_critical_distances() -> Table:
 
 def table_of_noise(number: int, seed: int) -> Table:
     """Shares of waveforms in which the exact number is found in noise."""
-    table = Table("figure 5 in noise: exact number of echoes [%]", 1)
+    table = Table("figure 5 in noise: exact number of echoes [%]", 1, scatter(number, FULL))
     rng = np.random.default_rng(seed)
     for std, shares in IN_NOISE.items():
         for case, expected in shares.items():
             found = 100 * (count_exact(find_wavelet, case, std, number, rng) == len(WANG_CASES[case])).mean()
-            low = 90 if case == "b" or (case == "e" and std <= 1) else -np.inf
-            table.add(f"{case}, noise {std:g}", found, low, 12 if case == "a" else np.inf, spec=expected)
+            # False echoes make more "exact" counts of case a here: our waveforms are longer (README.md).
+            table.near_share(f"{case}, noise {std:g}", found, expected, within=5.0 if case == "a" else 4.0)
     return table
 
 
@@ -166,13 +170,13 @@ def gamma_strip(k: int, number: int, rng: np.random.Generator) -> WaveformBlock:
 
 def table_of_estimates(number: int, seed: int) -> Table:
     """The same question with nothing given: pulses of another law, whose skew the survey estimates from the strip."""
-    table = Table("E with a skew that is estimated, not given", 4)
+    table = Table("E with a skew that is estimated, not given", 4, scatter(number, FULL // 4))
     rng = np.random.default_rng(seed)
-    for name, k in PULSES.items():
+    for name, (k, ratio) in PULSES.items():
         block = gamma_strip(k, max(number, 600), rng)
         system = survey_block(block).system
         # The third moment of the law over that of the log-normal: kappa near a third of the skewness 2 / sqrt(k + 1).
-        table.near(f"{name}: skew found", system.skew, 2 / np.sqrt(k + 1) / 3, share=0.2)
+        table.near(f"{name}: skew found", system.skew, 2 / np.sqrt(k + 1) / 3, share=0.07, digits=3)
         chain = "".join(f'[[chain]]\nstage = "{one}"\n' for one in ("noise.pooled", "detect.maximum", "decompose.{}"))
         shares = {}
         for model, lines in (("gaussian", ""), ("skewed", ""), ("skewed free", 'kappa = "free"\n')):
@@ -183,9 +187,10 @@ def table_of_estimates(number: int, seed: int) -> Table:
             shares[model] = np.nanmean(fit[found.count(len(block)) == 1])
             table.add(f"{name}: E, {model}", shares[model])
         for model in ("skewed", "skewed free"):
-            table.add(f"{name}: {model} over Gaussian", shares[model] / shares["gaussian"], 0.1, 0.5)
+            over = shares[model] / shares["gaussian"]
+            table.near(f"{name}: {model} over Gaussian", over, ratio, within=0.02, spec=None, digits=3)
         alone = measure_skew_of(block, system)
-        table.near(f"{name}: median of free skews less the strip's", alone - system.skew, 0.0, within=0.03)
+        table.near(f"{name}: median of free skews less the strip's", alone - system.skew, 0.0, within=0.005)
     return table
 
 
@@ -198,7 +203,7 @@ def measure_skew_of(block: WaveformBlock, system: SystemPulse) -> float:
 
 def table_of_models(number: int, seed: int) -> Table:
     """Tables 1 and 2: goodness of fit E of Gaussians and log-normals to 60 samples, skew and noise as in CLASSES."""
-    table = Table("tables 1, 2: E (inputs follow from the paper's E)", 5)
+    table = Table("tables 1, 2: E (inputs follow from the paper's E)", 4, scatter(number, FULL // 10))
     rng = np.random.default_rng(seed)
     for name, (kappa, share, *expected) in CLASSES.items():
         recording = fine_recording(100 * share, PULSE_SIGMA, n_samples=60, kappa=kappa)
@@ -210,14 +215,15 @@ def table_of_models(number: int, seed: int) -> Table:
         for place, (model, fit, skew) in enumerate((("Gaussian", gaussian, 0.0), ("log-normal", skewed, kappa))):
             value = misfit(fit(block, noise, system, start), y, skew)
             paper, spec = expected[place], expected[place + 2]
-            table.add(f"{name}, {model}", value, 0.9 * spec, 1.1 * spec, paper=paper, spec=spec)
+            # The specification has four decimals: 0.00005 of 0.0014 are 4 %.
+            table.near(f"{name}, {model}", value, spec, within=0.0001, share=0.04, paper=paper, spec=spec)
     return table
 
 
 def table_of_the_loop(number: int, seed: int) -> Table:
     """Echoes that are found with and without the residual loop."""
-    table = Table("residual loop: completeness and gain [%, points]", 1)
-    for name, spec in LOOP.items():
+    table = Table("residual loop: completeness and gain [%, points]", 1, scatter(number, FULL))
+    for name, (plain, looped, ours, ours_looped, gain) in LOOP.items():
         recording = find_scene(name).recording
         block, truth = simulate_block(name, number, np.random.default_rng(seed))
         noise, system = known_noise(recording, number), known_system(recording)
@@ -229,11 +235,12 @@ def table_of_the_loop(number: int, seed: int) -> Table:
         maxima = complete(gaussian(block, noise, system, maximum(block, noise, system)))
         single = complete(gaussian(block, noise, system, candidates))
         loop = complete(residual_loop(block, noise, system, candidates))
-        table.add(f"{name}: maxima, fit", maxima, spec=100 * spec[0])
+        table.near(f"{name}: maxima, fit", maxima, ours, within=1.5, spec=plain)
         table.add(f"{name}: wavelet, fit", single)
-        table.near(f"{name}: wavelet, fit, loop", loop, 100 * spec[1], within=4.0)
-        table.add(f"{name}: gain by the loop", loop - single, 0.2)
-        table.add(f"{name}: gain over the maxima", loop - maxima, 0.5, spec=100 * (spec[1] - spec[0]))
+        table.near(f"{name}: wavelet, fit, loop", loop, ours_looped, within=1.5, spec=looped)
+        table.near(f"{name}: gain by the loop", loop - single, gain, within=0.8, spec=None)
+        known = {"within": 1.0, "spec": looped - plain}
+        table.near(f"{name}: gain over the maxima", loop - maxima, ours_looped - ours, **known)
     return table
 
 

@@ -20,6 +20,8 @@ class Table:
 
     title: str
     digits: int = 2
+    room: float = 1.0
+    """Factor of the bands of `near`: a run with fewer waveforms scatters more, see `scatter`."""
     rows: list[list[str]] = field(default_factory=list)
     values: dict[str, float] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
@@ -31,15 +33,21 @@ class Table:
         low: float = -math.inf,
         high: float = math.inf,
         *,
-        paper: float | None = None,
+        paper: float | str | None = None,
         spec: float | None = None,
+        digits: int | None = None,
     ) -> None:
-        """Adds a figure that must lie from low to high; without limits it is only printed."""
+        """Adds a figure that must lie from low to high; without limits it is only printed.
+
+        paper: a range as text. digits: decimals, as many as the figure is known to; those of the table if None.
+        """
         ours = float(ours)
         bounded = math.isfinite(low) or math.isfinite(high)
         verdict = ("ok" if low <= ours <= high else "FAIL") if bounded else ""
-        cells = [self._format(value) for value in (paper, spec, ours)]
-        self.rows.append([name, *cells, self._format_band(low, high), verdict])
+        decimals = self.digits if digits is None else digits
+        printed = paper if isinstance(paper, str) else format_value(paper, decimals)
+        cells = [printed, *(format_value(value, decimals) for value in (spec, ours))]
+        self.rows.append([name, *cells, format_band(low, high, decimals), verdict])
         self.values[name] = ours
         if verdict == "FAIL":
             self.failures.append(name)
@@ -47,25 +55,51 @@ class Table:
     def near(
         self, name: str, ours: float, expected: float, *, within: float = 0.0, share: float = 0.0, **known
     ) -> None:
-        """Adds a figure that may deviate from the expected one by `within`, or by `share` of it if that is more."""
-        room = max(within, share * abs(expected))
-        self.add(name, ours, expected - room, expected + room, **(known or {"spec": expected}))
+        """Adds a figure that may deviate from the expected one by `within`, or by `share` of it if that is more.
 
-    def _format(self, value: float | None) -> str:
-        if value is None:
-            return "-"
-        text = f"{value:.{self.digits}f}"
-        return text if value == 0 or float(text) != 0 else f"{value:.1e}"
+        Both grow by `room`. known: paper, spec and digits as for `add`; without paper and spec the expected value is
+        the specification's.
+        """
+        room = self.room * max(within, share * abs(expected))
+        if not known.keys() & {"paper", "spec"}:
+            known["spec"] = expected
+        self.add(name, ours, expected - room, expected + room, **known)
 
-    def _format_band(self, low: float, high: float) -> str:
-        if math.isinf(low) and math.isinf(high):
-            return "-"
-        if math.isinf(high):
-            return f">= {self._format(low)}"
-        return f"<= {self._format(high)}" if math.isinf(low) else f"{self._format(low)}..{self._format(high)}"
+    def near_share(
+        self, name: str, ours: float, expected: float, *, within: float, whole: float = 100.0, **known
+    ) -> None:
+        """Adds a share as `near`, with a band that ends at 0 and at the whole."""
+        low, high = expected - self.room * within, expected + self.room * within
+        if not known.keys() & {"paper", "spec"}:
+            known["spec"] = expected
+        self.add(name, ours, max(low, 0.0), min(high, whole), **known)
 
     def __str__(self) -> str:
         return "\n".join(align([[self.title, *HEADS[1:]], *self.rows]))
+
+
+def scatter(number: int, full: int) -> float:
+    """How much more the figures of `number` waveforms scatter than those of `full`; 1 where there are as many."""
+    return max(math.sqrt(full / number), 1.0)
+
+
+def format_value(value: float | None, digits: int) -> str:
+    """A figure with its decimals; small ones as powers of ten, a dash where there is none."""
+    if value is None:
+        return "-"
+    text = f"{value:.{digits}f}"
+    return text if value == 0 or float(text) != 0 else f"{value:.1e}"
+
+
+def format_band(low: float, high: float, digits: int) -> str:
+    """The accepted band; a dash where there is none."""
+    if math.isinf(low) and math.isinf(high):
+        return "-"
+    if math.isinf(high):
+        return f">= {format_value(low, digits)}"
+    if math.isinf(low):
+        return f"<= {format_value(high, digits)}"
+    return f"{format_value(low, digits)}..{format_value(high, digits)}"
 
 
 def main(measure: Callable[[int, int], list[Table | str]], doc: str, number: int) -> int:

@@ -91,6 +91,7 @@ def test_resume_takes_the_kept_survey_also_for_later_strips(strips, flown, tmp_p
     assert later.exit_code == 4 and "exists already" in later.stderr
 
 
+@pytest.mark.slow
 def test_the_order_and_the_jobs_do_not_matter(strips, flown, tmp_path):
     folder, _ = flown
     result = _run(*(strips[name] for name in ("odd", "b", "a")), "-o", tmp_path, "--survey", "flight", "--jobs", 2)

@@ -1,6 +1,5 @@
 """Runs that end in the middle: killed, interrupted, a worker shot. Nothing half-written is taken for a cloud."""
 
-import functools
 import json
 import os
 import signal
@@ -16,7 +15,6 @@ from wavebatch.tools.simulate import simulate_strip
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 
 PROFILE = ["--profile", "fast"]
-DRAFT = ".wavebatch-[0-9]*.tmp"  # not the lock of a strip, which is there before its worker
 
 
 @pytest.fixture(scope="module")
@@ -50,33 +48,48 @@ def _contents(folder):
     return found
 
 
-def _wait_for(folder, pattern, process):
-    """Until a file like that is in the folder; False where the run ended before it was seen."""
-    deadline = time.monotonic() + 120
-    while not list(folder.glob(pattern)):
-        assert time.monotonic() < deadline, "the run does not begin"
-        if process.poll() is not None:
-            return False
-        time.sleep(0.002)
-    return True
+_AT = """
+import os, sys, time
+from wavebatch.core.interrupts import guard
+
+def act():
+    {act}
+
+def run():
+    from wavebatch.__main__ import _run
+    from wavebatch.files.disk.publish import Draft  # here, as in a run: `guard` has its say at the end after it
+
+    before = Draft.{method}
+
+    def here(self, *given, **options):
+        before(self, *given, **options)
+        if self.target.name.endswith({suffix!r}):
+            act()
+
+    Draft.{method} = here
+    _run()
+
+if __name__ == "__main__":
+    guard(run)
+"""
+DRAWN_UP = {"method": "__init__", "suffix": ".laz"}
+"""The temporary file of a cloud is there; workers are at work."""
+REPORTED = {"method": "publish", "suffix": "a.report.json"}
+"""The first strip is done."""
 
 
-def _disturb(strips, folder, pattern, number, *more):
-    """The output folder, exit code and stderr of a run that got a signal once a file like that was there.
+def _stage(strips, folder, script, act, *more, **event):
+    """The command of a run that acts at an event: nothing depends on when another process sees the event."""
+    script.write_text(_AT.format(act=act, **event))
+    return [sys.executable, str(script), *_command(strips, folder, *more)[3:]]
 
-    On a busy machine a run may end before this process sees the file: then another one is started.
-    """
-    deadline, attempt = time.monotonic() + 120, 0
-    while True:
-        assert time.monotonic() < deadline, "no run could be disturbed"
-        out, attempt = folder / str(attempt), attempt + 1
-        out.mkdir()
-        with subprocess.Popen(_command(strips, out, *more), stderr=subprocess.PIPE, text=True) as process:
-            if _wait_for(out, pattern, process):
-                process.send_signal(number)
-            _, said = process.communicate(timeout=120)
-        if process.returncode:
-            return out, process.returncode, said
+
+def _disturb(strips, out, event, number):
+    """The exit code and stderr of a run that gets a signal at an event."""
+    act = f"os.kill(os.getpid(), {int(number)})"
+    command = _stage(strips, out, out.with_suffix(".py"), act, "--jobs", "2" if event is DRAWN_UP else "1", **event)
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    return done.returncode, done.stderr
 
 
 def _children(pid):
@@ -101,9 +114,11 @@ def _is_tracker(pid):
         return False
 
 
-@pytest.mark.parametrize(("jobs", "pattern"), [("1", "a.report.json"), ("2", DRAFT)])
-def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, jobs, pattern):
-    out, code, _ = _disturb(strips, tmp_path, pattern, signal.SIGKILL, "--jobs", jobs)
+@pytest.mark.quick_cases("event1")
+@pytest.mark.parametrize("event", [REPORTED, DRAWN_UP])
+def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips, undisturbed, tmp_path, event):
+    out = tmp_path / "out"
+    code, _ = _disturb(strips, out, event, signal.SIGKILL)
     assert code == -signal.SIGKILL and _contents(out).keys() != undisturbed.keys()
     subprocess.run(_command(strips, out, "--resume"), check=True)
     assert _contents(out) == undisturbed
@@ -111,7 +126,8 @@ def test_killed_in_the_middle_resume_gives_what_an_undisturbed_run_gives(strips,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path, number):
-    out, code, said = _disturb(strips, tmp_path, DRAFT, number, "--jobs", "2")
+    out = tmp_path / "out"
+    code, said = _disturb(strips, out, DRAWN_UP, number)
     assert code == 130
     assert said.startswith("interrupted") and said.count("\n") == 1
     assert set(_contents(out)) <= set(undisturbed)
@@ -121,22 +137,23 @@ def test_an_interrupted_run_cleans_up_and_says_130(strips, undisturbed, tmp_path
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
 @pytest.mark.parametrize("stopped", [False, True])
-def test_workers_die_with_their_parent(tmp_path, stopped):
+def test_workers_die_with_their_parent(strips, tmp_path, stopped):
     """Also those that are stopped, and cannot see that it is dead."""
-    strips, out = tmp_path / "strips", tmp_path / "out"
-    strips.mkdir()
-    simulate_strip("flat", strips / "a.las", pulses=400_000, seed=1)  # long enough to be disturbed below
-    with subprocess.Popen(_command(strips, out, "--jobs", "2")) as process:
-        assert _wait_for(out, DRAFT, process), "the run ended before it could be disturbed"
-        children = _children(process.pid)
-        assert children
-        time.sleep(0.1)  # workers have begun
+    act = "print('at work', flush=True); time.sleep(600)"
+    command = _stage(strips, tmp_path / "out", tmp_path / "run.py", act, "--jobs", "2", **DRAWN_UP)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "at work\n"
+        children = [child for child in _children(process.pid) if not _is_tracker(child)]  # it ends when all others have
+        assert len(children) == 2
         for child in children if stopped else ():
             os.kill(child, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
-    children = [child for child in children if not _is_tracker(child)]  # it ends when all others have
-    deadline = time.monotonic() + 20
+    _wait_until_gone(children)
+
+
+def _wait_until_gone(children):
+    deadline = time.monotonic() + 300
     while any(_is_alive(child) for child in children):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.01)
@@ -148,23 +165,33 @@ def _ignores_ctrl_c(pid):
     return bool(ignored >> (signal.SIGINT - 1) & 1)
 
 
+_WAITS = """
+import time
+from wavebatch.batch.workers.processes import Workers
+
+if __name__ == "__main__":
+    with Workers(2) as workers:
+        workers.submit(time.sleep, 600)
+        print("started", flush=True)
+        time.sleep(600)
+"""
+
+
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="finds processes through /proc")
-def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_parent(strips, tmp_path):
+def test_a_worker_that_is_stopped_as_soon_as_our_code_runs_in_it_dies_with_its_parent(tmp_path):
     """The death signal comes first: one that ignores Ctrl-C has it."""
-    # Jobs that a shell has started in the background ignore Ctrl-C from the first.
-    listen = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)
-    with subprocess.Popen(_command(strips, tmp_path, "--jobs", "2"), preexec_fn=listen) as process:
+    script = tmp_path / "waits.py"
+    script.write_text(_WAITS)
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "started\n"
         worker = None
         while worker is None:
-            assert process.poll() is None, "the run ended before it could be disturbed"
+            assert process.poll() is None
             workers = [child for child in _children(process.pid) if not _is_tracker(child)]
             worker = next(filter(_ignores_ctrl_c, workers), None)
         os.kill(worker, signal.SIGSTOP)
         process.send_signal(signal.SIGKILL)
-    deadline = time.monotonic() + 20
-    while _is_alive(worker):
-        assert time.monotonic() < deadline, "a worker outlived its parent"
-        time.sleep(0.01)
+    _wait_until_gone([worker])
 
 
 def test_a_worker_asks_for_the_death_signal_before_all_else(monkeypatch):
@@ -204,12 +231,13 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_a_strip_at_which_a_worker_dies_is_tried_once_more_and_only_then_fails(strips, undisturbed, tmp_path):
     script = tmp_path / "shot.py"
     out = tmp_path / "out"
     places = {"strips": str(strips), "out": str(out), "once": str(tmp_path / "once")}
     script.write_text(_SHOT.format(tests=os.path.dirname(os.path.dirname(__file__)), **places))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=180)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     statuses, error = done.stdout.splitlines()
     assert statuses == "['written', 'failed', 'written']"

@@ -36,7 +36,7 @@ finally:
 def measure(*command, code=0):
     """Peak of the resident memory of a command [MB], and what it said."""
     done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM, *map(str, command)], capture_output=True, text=True, timeout=120,
+        [sys.executable, "-c", _PROGRAM, *map(str, command)], capture_output=True, text=True, timeout=300,
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == code, done.stderr
@@ -49,6 +49,7 @@ def write_noise(path, n, s):
     return make_raw(n, n_samples=s, bits=16).write(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "s"), [(1, 65536), (1000, 2000)])
 def test_long_waveforms_of_noise_stay_within_the_memory_limit(tmp_path, n, s):
     """Tables of candidates by samples took 7 GB."""
@@ -70,6 +71,7 @@ def test_a_block_of_long_waveforms_has_fewer_of_them():
         assert _block_size(unit, 1) == 1
 
 
+@pytest.mark.slow
 def test_simulated_waveforms_have_at_most_as_many_samples_as_are_read(tmp_path):
     peak, _ = measure("simulate", "flat", "-o", tmp_path / "a.las", "--pulses", "300", "--samples", "65536")
     assert peak < 500
@@ -78,8 +80,9 @@ def test_simulated_waveforms_have_at_most_as_many_samples_as_are_read(tmp_path):
     assert "n_samples must lie from 8 to 65536" in said
 
 
-def test_evlrs_of_a_hole_in_the_file_are_not_listed_for_ever(tmp_path):
-    """A count of 4 billion over zeros, each of which is an empty record."""
+@pytest.fixture
+def hole(tmp_path):
+    """A strip with a count of 4 billion EVLRs over zeros, each of which is an empty record."""
     raw = make_raw(30, point_format=9, internal=False, minor=4)
     raw.evlr = (0, 0)
     path = raw.write(tmp_path / "a.las")
@@ -88,9 +91,17 @@ def test_evlrs_of_a_hole_in_the_file_are_not_listed_for_ever(tmp_path):
         file.truncate(size + (200 << 20))
         file.seek(235)
         file.write(struct.pack("<QI", size, 2**32 - 1))
-    found, missing = find_evlrs(path, read_header(path))
+    return path
+
+
+def test_evlrs_of_a_hole_in_the_file_are_not_listed_for_ever(hole):
+    found, missing = find_evlrs(hole, read_header(hole))
     assert len(found) == MAX_EVLRS and len(found) + missing == 2**32 - 1
-    peak, _ = measure("run", path, "-o", tmp_path / "out", "--profile", "fast", "--format", "las")
+
+
+@pytest.mark.slow
+def test_evlrs_of_a_hole_take_no_memory_in_a_run(hole, tmp_path):
+    peak, _ = measure("run", hole, "-o", tmp_path / "out", "--profile", "fast", "--format", "las")
     assert peak < 400
     report = json.loads((tmp_path / "out" / "a.report.json").read_text())
     assert any("EVLRs" in line and str(MAX_EVLRS) in line for line in report["warnings"])
@@ -104,6 +115,7 @@ def test_keys_of_many_parts_are_refused_before_they_take_memory(tmp_path, text):
     assert peak < 150
 
 
+@pytest.mark.slow
 def test_the_account_of_many_digitizers_fits_into_the_cloud(tmp_path):
     """180 digitizers with a pulse each: 75 kB, more than a VLR holds."""
     n, s, k = 4500, 64, 180
@@ -139,7 +151,7 @@ def test_too_little_memory_is_an_error_with_a_remedy(tmp_path):
               "    resource.setrlimit(resource.RLIMIT_AS, (now + (60 << 20),) * 2)\ntry:")  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-c", code.strip(), "run", str(strip), "-o", str(tmp_path / "out")], text=True,
-        capture_output=True, timeout=120, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True, timeout=300, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 4, done.stderr
     assert "not enough memory" in done.stderr and "fewer --jobs" in done.stderr and "bug" not in done.stderr

@@ -79,6 +79,7 @@ def test_angles_of_known_surfaces(clouds, scene, terrain):
     assert counts["NO_PLANE"] > 0 and "NO_RAY" not in counts
 
 
+@pytest.mark.slow
 def test_plants_are_no_surface(tmp_path):
     simulate_strip("forest", tmp_path / "s.las", pulses=16_000, seed=2)
     run_strip(tmp_path / "s.las", tmp_path / "out")
@@ -90,6 +91,7 @@ def test_plants_are_no_surface(tmp_path):
     assert known[above > 1.0].mean() < 0.005
 
 
+@pytest.mark.quick_cases("batch1")
 @pytest.mark.parametrize("batch", [{"jobs": 2}, {"block_size": 700}])
 def test_the_same_bytes_for_any_jobs_and_blocks(strips, clouds, tmp_path, batch):
     run_strip(strips / "urban.las", tmp_path, batch=batch)
@@ -161,6 +163,7 @@ main(sys.argv[1:])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
 @pytest.mark.parametrize("method", ["take", pytest.param("rows", marks=pytest.mark.slow)])
 def test_killed_in_the_second_pass_resume_gives_what_an_undisturbed_run_gives(strips, clouds, tmp_path, method):
@@ -246,6 +249,7 @@ def test_any_tiles_give_the_same_bits_on_any_points(layout, tmp_path, monkeypatc
     assert counts_again == counts and again.tobytes() == whole.tobytes()
 
 
+@pytest.mark.slow
 def test_very_many_points_in_one_place_take_no_more_memory(layout, tmp_path, monkeypatch):
     monkeypatch.setattr(neighbour_pass, "PART_POINTS", 2000)
     monkeypatch.setattr(neighbour_pass, "SAMPLE", 1000)

@@ -132,6 +132,7 @@ def test_a_summary_that_cannot_be_written_is_told_and_is_not_a_failure_of_the_st
     assert again.exit_code == 3 and again.stderr.count("error: ") == 2
 
 
+@pytest.mark.quick_cases("full-options0", "closed-options1")
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
 @pytest.mark.parametrize("options", [["--report", "-"], ["--progress", "json"]])
 @pytest.mark.parametrize("target", ["full", "gone", "closed"])

@@ -194,6 +194,26 @@ def test_integer_columns_are_written_too(spoilt, monkeypatch, points, no_data, e
     prepared.scan.close()
 
 
+def test_echoes_of_several_blocks_are_in_the_order_of_their_packets(spoilt):
+    """Blocks of several digitizers, or of several lengths, have the packets of a unit in turn."""
+    prepared = prepare_strip(make_job(spoilt))
+    with StripReader(spoilt) as reader:
+        unit = reader.read_unit(0, prepared.scan)
+        blocks = list(reader.read_blocks(unit, 100, owned_only=True))
+    cuts = slice(0, None, 2), slice(1, None, 2)
+    halves = [(block.rows(cut), index[cut]) for block, index in blocks for cut in cuts]
+    chain, system = prepared.job.chain, prepared.system
+    whole, mixed = (
+        gather_echoes(unit, [(block, index, chain.run(block, system)) for block, index in parts])
+        for parts in (blocks, halves)
+    )
+    assert len(whole.table) > 100 and (np.diff(whole.table.waveform) >= 0).all()
+    for name in ("waveform", "time", "amplitude"):
+        np.testing.assert_array_equal(getattr(mixed.table, name), getattr(whole.table, name))
+    np.testing.assert_array_equal(mixed.nearest, whole.nearest)
+    prepared.scan.close()
+
+
 def test_counts_are_those_of_a_loop(spoilt, tmp_path):
     report = run_one(spoilt, tmp_path).report
     points, echoes, members, flags, _ = _read_packets(spoilt)

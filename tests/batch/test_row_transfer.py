@@ -19,7 +19,6 @@ from wavebatch.files.disk import shared_rows, temp_folders
 from wavebatch.files.disk.shared_rows import SharedRows, join_rows, read_rows, share_rows
 from wavebatch.files.las.header import STANDARD_DTYPES, LasHeader
 from wavebatch.files.las.write_points import PointFile
-from wavebatch.tools.simulate import simulate_strip
 
 DTYPE = STANDARD_DTYPES[6]
 
@@ -123,33 +122,40 @@ needs_memory = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="a place
 
 
 _ELSEWHERE = """
+import os, signal
 from pathlib import Path
-from wavebatch.files.disk import temp_folders
+from wavebatch.files.disk import shared_rows, temp_folders
 temp_folders.MEMORY_PLACE = Path({place!r})  # in the worker processes too, which run this script up to here
+shared_rows.LEAST = 0
+
+def kill(stream, rows):
+    assert list(Path({place!r}).glob("*/tmp*"))
+    os.kill(os.getpid(), signal.SIGKILL)
+
 if __name__ == "__main__":
     from wavebatch.__main__ import main
+    from wavebatch.batch.row_transfer import RowStream
+    RowStream.add = kill
     main()
 """
 
 
 @needs_memory
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
-def test_a_killed_run_leaves_nothing_in_memory(tmp_path):
+def test_a_killed_run_leaves_nothing_in_memory(tiny_strip, tmp_path):
     """Its workers remove it, even if no other run follows: this one has a place of its own."""
-    simulate_strip("flat", tmp_path / "a.las", pulses=400_000, seed=1)
     place = tmp_path / "memory"
     place.mkdir()
     script = tmp_path / "run.py"
     script.write_text(_ELSEWHERE.format(place=str(place)))
-    command = [sys.executable, str(script), "run", str(tmp_path / "a.las"), "-o", str(tmp_path / "out")]
-    deadline, killed = time.monotonic() + 100, False
-    while not killed:  # again if it ended before this process, on a busy machine, saw rows
-        assert time.monotonic() < deadline
-        process = subprocess.Popen([*command, "--profile", "fast", "--quiet", "--jobs", "2", "--overwrite"])
-        while not list(place.glob("*/tmp*")) and process.poll() is None:
-            time.sleep(0.001)
-        process.send_signal(signal.SIGKILL)
-        killed = process.wait() == -signal.SIGKILL
+    command = [sys.executable, str(script), "run", str(tiny_strip), "-o", str(tmp_path / "out")]
+    done = subprocess.run([*command, "--profile", "fast", "--quiet", "--jobs", "2"])
+    assert done.returncode == -signal.SIGKILL
+    _wait_until_empty(place)
+
+
+def _wait_until_empty(place):
+    deadline = time.monotonic() + 300
     while list(place.iterdir()):
         assert time.monotonic() < deadline, "the memory is never given back"
         time.sleep(0.01)
@@ -179,10 +185,7 @@ def test_workers_that_wait_for_calls_clean_up_before_they_end(tmp_path):
     script = tmp_path / "idle.py"
     script.write_text(_IDLE.format(place=str(place)))
     assert subprocess.run([sys.executable, str(script)]).returncode == -signal.SIGKILL
-    deadline = time.monotonic() + 60
-    while list(place.iterdir()):
-        assert time.monotonic() < deadline, "the memory is never given back"
-        time.sleep(0.01)
+    _wait_until_empty(place)
 
 
 @needs_memory
@@ -245,17 +248,17 @@ def test_processes_that_were_started_for_nothing_end_with_their_parent(tmp_path,
     """A run that finds its options wrong has started them already; also one that stands still does not keep it."""
     script = tmp_path / "early.py"
     script.write_text(EARLY)
-    start = time.monotonic()
-    done = subprocess.run([sys.executable, script, state], capture_output=True, text=True, timeout=60, check=True)
-    assert not done.stderr and time.monotonic() - start < 15
+    done = subprocess.run([sys.executable, script, state], capture_output=True, text=True, timeout=300, check=True)
+    assert not done.stderr
     children = [int(word) for word in done.stdout.split()]
     assert len(children) >= 2
+    deadline = time.monotonic() + 300
     while any(_is_alive(child) for child in children):  # one of them is multiprocessing's own, which ends by itself
-        assert time.monotonic() - start < 15
+        assert time.monotonic() < deadline, "a process stays"
         time.sleep(0.01)
 
 
 def test_wrong_options_end_a_run_of_several_jobs_as_usual(tmp_path):
     command = [sys.executable, "-m", "wavebatch", "run", "a.las", "-o", str(tmp_path), "--columns", "none"]
-    done = subprocess.run([*command, "--jobs", "3"], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([*command, "--jobs", "3"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr

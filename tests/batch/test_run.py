@@ -39,6 +39,7 @@ def reference(wide_strip, tmp_path_factory):
     return folder
 
 
+@pytest.mark.quick_cases("3-5000")
 @pytest.mark.parametrize(("jobs", "block_size"), [(1, 777), (3, 5000)])
 def test_same_bytes_for_any_jobs_and_block_size(wide_strip, reference, tmp_path, jobs, block_size):
     outcome = run_one(wide_strip, tmp_path, batch={"jobs": jobs, "block_size": block_size})
@@ -48,6 +49,7 @@ def test_same_bytes_for_any_jobs_and_block_size(wide_strip, reference, tmp_path,
     assert _files(tmp_path) == ["wide.laz", "wide.report.json"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("profile", "points"), [("accurate", "echoes"), ("balanced", "returns")])
 def test_real_strips_give_the_same_bytes_for_any_block_size(riegl, leica, tmp_path, profile, points):
     for strip in (riegl, leica):

@@ -136,6 +136,7 @@ def test_where_sees_the_numbers_without_dropped_echoes(riegl, full, tmp_path):
     assert sizes[np.isin(times, _whole_times(full[0]))].max() == 1
 
 
+@pytest.mark.quick_cases("options1")
 @pytest.mark.parametrize("options", [{"jobs": 2}, {"block_size": 77}])
 def test_the_same_bytes_for_any_jobs_and_blocks(wide_strip, tmp_path, options):
     chosen = {"where": "amplitude > 60", "drop_flags": "WEAK", "chain": "fast"}
@@ -275,6 +276,6 @@ def test_the_workers_of_a_cluster_need_not_see_the_polygons(tiny_strip, tmp_path
     path.write_text("time x y z\n0 0 0 900\n1 9 9 900\n")
     energy.write_text("time energy\n0 1\n1 1\n")
     with pytest.raises(ConfigError, match="stop"):
-        wb.run(tiny_strip, tmp_path, polygon=_area(tmp_path / "a.json", (0, 0, 1, 1)), pulse_energy=energy,
+        wb.run(tiny_strip, tmp_path, polygon=_area(tmp_path / "a.json", (0, 0, 1, 1)), energy=energy,
                sensor=wb.SensorRequest(trajectory=path), scheduler="tcp://there:8786")  # fmt: skip
     assert sorted(seen) == sorted([tiny_strip, path, energy])

@@ -108,3 +108,13 @@ def test_text_table_and_page_have_the_classes_and_the_numbers_of_echoes(strips, 
             assert rows[f"differences by {kind}", "", group, "time", "number"] == str(one["number"])
             row = next(row for row in shown.rows if row[:3] == [kind, group, "time"])
             assert row[3] == f"{one['number']:,}"
+
+
+def test_a_truth_is_compared_at_the_chosen_points(strips):
+    whole, some = (
+        json.loads(run(strips / "a.las", "--truth", strips / "a.npz", "--json", *more).stdout)
+        for more in ((), ("--where", "return_number == 1"))
+    )
+    assert some["echoes_b"] == whole["echoes_b"] and some["left_out_a"] > 0 == whole["left_out_a"]
+    assert 0 < some["echoes_a"] < whole["echoes_a"]
+    assert some["correctness"] >= whole["correctness"] - 0.01 and some["completeness"] < whole["completeness"]

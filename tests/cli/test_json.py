@@ -95,11 +95,9 @@ CASES = {
     "plot cube CUBE -o c.png -q": "plot-cube/1",
     "grid CLOUD --statistic density --size 5 -o d.tif -q": "grid/1",
     "grid CLOUD --column z --column echo_width --no-data nan --where z>0 -o w.tif -q": "grid/1",
-    "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --no-peers --hazard H5 --tolerance 2cm": "bench/1",
-    "bench --scene empty --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability": "bench/1",
-    "bench --real STRIP --no-stability": "bench-real/1",
-    "bench --against ROOT --scene flat --pulses 300 --repeat 1": "bench-against/1",
-    "bench --jobs-model --scene flat --pulses 300 --repeat 1": "bench-jobs/1",
+    "bench --scene flat --waveforms 500 --pulses 300 --repeat 1 --tolerance 2cm": "bench/1",
+    "bench --scene empty --waveforms 800 --pulses 0 --repeat 1": "bench/1",
+    "bench --real STRIP": "bench-real/1",
     "plot waveform STRIP -o w.png -q --profile fast": "plot-waveform/1",
     "stats CLOUD": "stats/1",
     "compare CLOUD STRIP": "compare/1",
@@ -112,17 +110,21 @@ CASES = {
     "survey STRIP --waveforms 200": "system/1",
     "stages": "stages/1",
     "simulate slope -o s.las --pulses 300 -q": "simulate/1",
+    "import PULSES -o i.las -q": "import/1",
+    "export STRIP -o e.npz -q": "export/1",
     "synthesize SIM -o y.las -q": "synthesize/1",
     "slice STRIP -o s.csv -q": "slice/1",
     "voxelize STRIP --size 3 -o v.npz -q": "voxelize/1",
 }
 
 
+@pytest.mark.quick_cases("[!b]*")
 @pytest.mark.parametrize("line", CASES)
 def test_documents_of_commands(folder, riegl, tmp_path, monkeypatch, line):
     monkeypatch.chdir(tmp_path)
-    names = {"STRIP": riegl, "CLOUD": folder / f"{riegl.stem}.laz", "ROOT": PAGE.parents[1],
-             "SIM": folder / "sim.las", "CUBE": folder / "cube.npz", "VOXELS": folder / "voxels.npz"}  # fmt: skip
+    names = {"STRIP": riegl, "PULSES": riegl.with_suffix(".pls"), "CLOUD": folder / f"{riegl.stem}.laz",
+             "ROOT": PAGE.parents[1], "SIM": folder / "sim.las", "CUBE": folder / "cube.npz",
+             "VOXELS": folder / "voxels.npz"}  # fmt: skip
     if line.startswith("grid"):
         pytest.importorskip("rasterio", reason="rasterio (extra gis) is not installed")
     found = _print(*(names.get(word, word) for word in line.split()))

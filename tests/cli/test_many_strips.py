@@ -35,6 +35,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.quick_cases("info-folder", "survey-folder", "run-list", "slice-list")
 @pytest.mark.parametrize("form", ["folder", "list"])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_folders_and_lists_with_a_bad_file(folder, tmp_path, monkeypatch, command, form):

@@ -43,8 +43,8 @@ _CASES = [
     "run s.las -o out -c chain.toml --report chain.toml",
     "run s.las -o out --system sys.toml --report sys.toml",
     "run @list.txt -o out --report list.txt",
-    "run s.las -o out --trajectory path.txt --pulse-energy energy.txt --report energy.txt",
-    "run s.las -o out --trajectory path.txt --pulse-energy energy.txt --report path.txt",
+    "run s.las -o out --trajectory path.txt --energy energy.txt --report energy.txt",
+    "run s.las -o out --trajectory path.txt --energy energy.txt --report path.txt",
     "run s.las -o out --polygon area.json --report area.json",
     "run @list.txt -o out --report s.las",
     "run s.las -o empty --report empty/s.laz",
@@ -106,6 +106,6 @@ def test_every_option_that_writes_is_known_as_such():
         "voxelize --profiles", "slice --overview", "slice --cube", "survey --angles", "compare --output",
         "section --output", "profile --output", "cube --output",
         "waveform --output", "histogram --output", "map --output", "calibrate --output", "calibrate --report",
-        "calibrate --plot", "bench --output",
+        "calibrate --plot", "bench --output", "import --output", "export --output",
         "grid --output", *(f"{command} --html" for command in ("run", "survey", "bench", "calibrate", "compare")),
     }  # fmt: skip

@@ -135,6 +135,12 @@ def test_a_bar_on_request(tiny_strip, tmp_path):
     assert result.exit_code == 0 and "100%" in result.stderr
 
 
+def test_verbose_says_what_the_automatic_chain_leaves_out_and_why(tiny_strip, tmp_path):
+    loud = _run(tiny_strip, "-o", tmp_path / "v", "-v")
+    assert "growth of fits: kept: of the " in loud.stderr and "censored fit: left out: " in loud.stderr
+    assert "left out: " not in _run(tiny_strip, "-o", tmp_path / "w").stderr
+
+
 def test_quiet_says_nothing_and_verbose_more(tiny_strip, tmp_path):
     assert _run(tiny_strip, "-o", tmp_path / "q", "-q", "--profile", "fast").output == ""
     loud = _run(tiny_strip, "-o", tmp_path / "v", "-v", "--profile", "fast")

@@ -23,8 +23,10 @@ def test_the_list_has_every_stage_with_its_summary():
         assert any(line.split()[0] == stage.name and stage.summary in line for line in lines)
 
 
-PARTNERS = {"decompose.asdf_only": {"detect": "detect.asdf"}, "attribute.skew": {"decompose": "decompose.log_normal"}}
+PARTNERS = {"decompose.asdf_only": {"detect": "detect.asdf"}, "attribute.skew": {"decompose": "decompose.skewed"}}
 """Stages that refuse a chain without another one; their texts say which."""
+MORE = {"attribute.skew": {"decompose": 'kappa = "free"\n'}}
+"""Parameters that it must have."""
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))
@@ -37,7 +39,10 @@ def test_one_stage_shows_parameters_defaults_and_an_example_that_loads(name):
     others = {kind: next(s for s in STAGES if s.startswith(kind)) for kind in ("noise", "detect", "decompose")}
     others |= PARTNERS.get(name, {})
     kind = name.split(".")[0]
-    tables = [example if k == kind else f'[[chain]]\nstage = "{other}"\n' for k, other in others.items()]
+    more = MORE.get(name, {})
+    tables = [
+        example if k == kind else f'[[chain]]\nstage = "{other}"\n{more.get(k, "")}' for k, other in others.items()
+    ]
     if kind == "attribute":
         makers = {s.name for column in Step(STAGES[name]).needs for s in STAGES.values() if column in s.makes}
         ordered = sorted(makers, key=lambda maker: maker != "attribute.position")

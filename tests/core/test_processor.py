@@ -33,6 +33,7 @@ def test_threads_are_no_other_kind():
     assert len(found) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux" or os.uname().machine != "x86_64", reason="kinds of x86 processors")
 def test_strips_differ_only_between_processors_that_the_probe_tells_apart(tmp_path):
     """Else `run --scheduler` would mix them."""

@@ -14,8 +14,9 @@ from wavebatch.cli import main
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import HALF_C
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
-from wavebatch.files.las.crs import METRES, CrsUnits, looks_geocentric, parse_geotiff, parse_wkt
+from wavebatch.files.las.crs import CrsUnits, looks_geocentric, parse_wkt
 from wavebatch.files.las.epsg_units import find_unit
+from wavebatch.files.las.geo_keys import METRES, GeoKeys
 from wavebatch.files.strip.ray_sample import measure_scale
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.stages.attribute.basic import position
@@ -38,6 +39,12 @@ THREE = (
     'LENGTHUNIT["metre",1]]'
 )
 GEODETIC = 'GEODCRS["WGS 84",DATUM["W",ELLIPSOID["e",6378137,298]],CS[{}],AXIS["a",north]]'
+
+
+def parse_geotiff(*records):
+    """Kind and units of GeoTIFF keys, as `read_crs` gives them."""
+    keys = GeoKeys.parse(*records)
+    return CrsUnits(keys.kind, *keys.read_units())
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,7 @@ def read_block(path):
         return block, survey_blocks(read_sample(reader, scan)).system
 
 
+@pytest.mark.quick_cases("255")
 @pytest.mark.parametrize("fill", [0, 255])
 def test_readers_mark_fill_and_put_quiet_counts_there(whole, tmp_path, fill):
     plain, _ = read_block(whole)
@@ -183,6 +184,7 @@ def away_from_gap(block, table, widths):
     return table.take(np.flatnonzero(distance > widths))
 
 
+@pytest.mark.quick_cases("0-detect.[!a]*")
 @pytest.mark.parametrize("name", DETECTORS)
 @pytest.mark.parametrize("shift", [0, 7])
 def test_detectors_find_nothing_in_gaps_and_at_their_edges(whole, tmp_path, name, shift):
@@ -210,6 +212,7 @@ def test_detectors_find_nothing_in_gaps_and_at_their_edges(whole, tmp_path, name
     assert abs(len(first) - len(second)) <= 0.03 * len(first)
 
 
+@pytest.mark.quick_cases("7-decompose.adaptive", "7-decompose.gaussian", "0-decompose.[!alg]*", "0-decompose.asdf_only")
 @pytest.mark.parametrize("name", DECOMPOSERS)
 @pytest.mark.parametrize("shift", [0, 7])
 def test_decomposers_find_the_same_echoes_as_without_a_gap(whole, tmp_path, name, shift):

@@ -5,7 +5,7 @@ import dataclasses
 import laspy
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from writer_tools import data_file, facts_of, plan_output, write_source, write_strip
 
@@ -123,7 +123,6 @@ def strip(tmp_path_factory):
     return path
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(changes=st.lists(st.tuples(st.integers(0, 700), st.integers(0, 255)), min_size=1, max_size=6))
 def test_any_damage_of_the_header_is_one_line_or_a_plan(strip, tmp_path, changes):
     data = bytearray(strip.read_bytes())

@@ -4,7 +4,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from strips import make_raw
 
@@ -56,7 +56,6 @@ def test_damaged_strips_read_or_are_refused(tmp_path, point_format, internal, su
     assert False in outcomes, "no damage was noticed"
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 28), st.binary(min_size=1, max_size=8)), max_size=20))
 def test_points_may_say_anything_about_their_packets(tmp_path, damage):
     """Packet fields of points are overwritten at will: whatever they say, all other points keep their samples."""

@@ -7,7 +7,7 @@ from fits import decompose, settings
 
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.decompose import Samples, decompose_clusters, promise_echoes
-from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape
+from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, PulseTable
 
 LENGTH = 48
 GROWING = {"grow": True, "prior_spread": 0.2, "tolerance": 1e-6, "max_iterations": 200}
@@ -155,9 +155,35 @@ def test_arrays_that_the_library_would_read_beyond_are_refused():
         ("baseline", np.full(2, np.nan, np.float32)),
         ("counts", np.zeros((2, 8))),
         ("missing", np.zeros((2, 7), bool)),
+        ("counts", np.full((2, 8), np.nan, np.float32)),
     ):
         with pytest.raises(ValueError):
             decompose_clusters(samples._replace(**{name: value}), start, good, settings())
+    shorter = (samples, start._replace(width=np.empty(0)), good), (samples, start, good._replace(low=np.zeros(2, int)))
+    for wrong in shorter:
+        with pytest.raises(ValueError, match="differ in length"):
+            decompose_clusters(*wrong, settings())
+    few = PulseShape(table=PulseTable(-1.0, 1.0, np.ones(1, np.float32), np.ones(1, np.float32)))
+    for options in ({"shape": few}, {"width_ref": np.nan}, {"width_ref": np.inf}, {"width_ref": 0.0}):
+        with pytest.raises(ValueError, match="width of the pulse must be above 0, and its table"):
+            decompose_clusters(samples, start, good, settings()._replace(**options))
+
+
+def test_samples_that_are_missing_may_be_anything():
+    gap = np.arange(16).reshape(2, 8) == 5
+    samples = Samples(np.where(gap, np.nan, 3).astype(np.float32), np.zeros(2, np.float32), np.ones(2, np.float32), gap)
+    start, clusters = Candidates(*(np.array([value]) for value in (0, 3.0, 5.0, 2.0))), (0, 0, 8, 0, 1)
+    found = decompose_clusters(samples, start, Clusters(*(np.array([value]) for value in clusters)), settings())
+    assert np.isfinite(found.parameters).all()
+
+
+def test_a_width_out_of_proportion_takes_no_memory():
+    """Three widths of a new echo would be 24 TB."""
+    y = np.rint(bell(20, 100) + bell(27, 60))[None].astype(np.float32)
+    samples = Samples(y, np.zeros(1, np.float32), np.ones(1, np.float32))
+    start, clusters = Candidates(*(np.array([value]) for value in (0, 20.0, 90.0, 2.0))), (0, 0, LENGTH, 0, 1)
+    broad = settings(**GROWING)._replace(width_ref=1e12)
+    assert decompose_clusters(samples, start, Clusters(*(np.array([v]) for v in clusters)), broad).number[0] >= 1
 
 
 def test_no_clusters_give_no_echoes():

@@ -24,6 +24,7 @@ def test_without_outliers_it_is_the_least_squares_plane(rng):
     assert facet.facing_error == pytest.approx(steep * error, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_error_of_a_plane_holds_its_error(rng):
     """Two scan lines at any distance, each a centimetre off: the angle's error in units of the stated one."""
     ratios = []

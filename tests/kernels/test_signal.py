@@ -4,7 +4,6 @@ import naive
 import numpy as np
 import pytest
 
-from wavebatch.kernels.fit.cluster import find_runs
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
     filter_energy,
@@ -12,6 +11,7 @@ from wavebatch.kernels.signal.filters import (
     gaussian_taps,
     refine_peaks,
 )
+from wavebatch.kernels.signal.runs import find_runs
 from wavebatch.kernels.signal.signal import (
     SMOOTH_GAIN,
     find_peaks,
@@ -111,6 +111,11 @@ def test_mean_without_quiet_samples_is_zero():
     mean, number = quiet_mean(np.full((5, 2), 9.0, np.float32), np.zeros((5, 2), bool))
     assert mean.tolist() == [0, 0]
     assert number.tolist() == [0, 0]
+
+
+def test_mean_of_a_single_quiet_sample_is_that_sample():
+    mean, number = quiet_mean(np.full((5, 1), 9.0, np.float32), np.arange(5)[:, None] == 3)
+    assert mean.tolist() == [9] and number.tolist() == [1]
 
 
 @pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4), np.array([1.0])])

@@ -13,7 +13,7 @@ from wavebatch.core.waveforms import Noise, WaveformBlock
 from wavebatch.kernels.fit import render
 from wavebatch.kernels.fit.bounds import crlb
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN
-from wavebatch.stages.chain import STAGES
+from wavebatch.stages.chain import STAGES, Step
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.simulate import Recording, known_noise, known_system, simulate_echoes
 
@@ -89,21 +89,6 @@ def test_asdf_without_a_fit_is_near_the_bound_and_says_its_errors(width, lost):
     assert np.median(found.sigma) == pytest.approx(width, rel=0.02)
     # What five samples make of a broad echo misses it by more than noise does.
     assert 0.8 < np.median(found.residual) < (1.1 if width == 2 else 1.4)
-
-
-def test_mixed_fits_only_where_detectors_disagree():
-    parts = [record(60, (60, 20), seed=2), record(60, (100, 20), (60, 26.0), seed=3)]
-    block = WaveformBlock.from_samples(np.concatenate([part[0].samples for part in parts]))
-    noise = Noise(np.full(120, 20, np.float32), np.full(120, STD, np.float32))
-    quick, fitted = decompose("asdf_only", block, noise), decompose("gaussian", block, noise)
-    mixed = decompose("asdf_only", block, noise, mode="mixed")
-    taken = np.zeros(2, int)
-    for w in range(120):
-        row = [table.take(np.flatnonzero(table.waveform == w)) for table in (mixed, quick, fitted)]
-        source = 1 if np.array_equal(row[0].time, row[1].time) else 2
-        assert_same(row[0], row[source])
-        taken[source - 1] += 1
-    assert taken.min() > 30
 
 
 def test_rendered_echoes_do_not_depend_on_their_parts(monkeypatch):
@@ -198,6 +183,20 @@ def test_the_loop_knows_other_pulses_than_gaussians(model):
     loop = STAGES["decompose.residual_loop"].function
     counted = {one: loop(block, noise, system, candidates, model=one).count(n) for one in ("gaussian", model)}
     assert (counted["gaussian"] > 1).mean() > 0.5 and (counted[model] == 1).mean() > 0.95
+
+
+@pytest.mark.parametrize(("given", "model"), [
+    ({}, "gaussian"), ({"kappa": 0.3}, "skewed"), ({"components": ((1.0, 0.0, 2.0), (0.15, 7.0, 2.0))}, "learned"),
+])  # fmt: skip
+def test_the_loop_fits_the_pulse_of_the_survey_unless_told_otherwise(given, model):
+    block, noise, _ = record(60, (100, 28), (60, 33))
+    system = replace(SYSTEM, **given)
+    candidates = STAGES["detect.maximum"].function(block, noise, system)
+    stage = STAGES["decompose.residual_loop"]
+    assert_same(stage.function(block, noise, system, candidates),
+                stage.function(block, noise, system, candidates, model=model))  # fmt: skip
+    step = Step(stage)
+    assert stage.fits(system, step.effective()) == stage.fits(system, {**step.effective(), "model": model})
 
 
 def test_the_unit_of_the_loops_threshold():

@@ -79,6 +79,7 @@ def test_errors_of_a_known_pulse_are_the_scatter_of_fits(width, apart, number):
     assert scatter(block, system, *truth, number) == pytest.approx(np.ones(3), abs=0.1)
 
 
+@pytest.mark.quick_cases("gaussian-2.0-0.0", "tailed-5.0-0.8")
 @pytest.mark.parametrize("rho", [0.0, 0.8])
 @pytest.mark.parametrize(("shape", "width"), [("gaussian", 2.0), ("gaussian", 6.0), ("tailed", 2.0), ("tailed", 5.0)])
 def test_the_survey_finds_the_colour_of_the_noise(shape, width, rho):

@@ -1,9 +1,157 @@
-"""Flags that depend on what became of the other echoes of a fit."""
+"""Flags and neighbours of echoes against loops over pairs: what is weak, cut, faint beside another one, or the same."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
-from wavebatch.stages.flags import clear_lone
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
+from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
+
+OVERLAPPED = int(EchoFlag.OVERLAPPED)
+S, N = 60, 120
+
+
+@pytest.fixture
+def table(rng):
+    """Up to five echoes in each of 120 waveforms, many of them close, with errors and some flags."""
+    number = rng.integers(0, 6, N)
+    m = number.sum()
+    time = rng.uniform(0, S - 1, m)
+    close = rng.random(m) < 0.5
+    time[1:][close[1:]] = time[:-1][close[1:]] + rng.uniform(0, 4, close[1:].sum())
+    sigma = rng.uniform(1.3, 4, m)
+    return EchoTable.build(
+        np.repeat(np.arange(N), number), np.clip(time, 0, S - 1), 4 * 10 ** rng.uniform(0, 2.2, m), sigma,
+        time_err=rng.uniform(0.05, 6, m), amplitude_err=rng.uniform(0.5, 4, m), sigma_err=rng.uniform(0.05, 0.4, m),
+        relative_energy_err=rng.uniform(0.01, 0.1, m), flags=rng.choice([0, OVERLAPPED], m, p=[0.3, 0.7]),
+    )  # fmt: skip
+
+
+def pairs(table):
+    """(echo, other echo of the same waveform, time from the other one to it)."""
+    for i in range(len(table)):
+        for j in range(len(table)):
+            if i != j and table.waveform[i] == table.waveform[j]:
+                yield i, j, table.time[i] - table.time[j]
+
+
+def test_flags_are_those_of_a_loop(table, rng):
+    samples = np.clip(rng.normal(20, 2, (N, S)), 0, 255)
+    for w, time, sigma in zip(table.waveform, table.time, table.sigma, strict=True):
+        samples[w] += 300 * (rng.random() < 0.3) * np.exp(-0.5 * ((np.arange(S) - time) / sigma) ** 2)
+    block = WaveformBlock.from_samples(np.clip(np.rint(samples), 0, 255).astype(np.uint8))
+    missing = np.zeros((N, S), bool)
+    missing[::3, 25:33] = True
+    block = replace(block, missing=missing)
+    strong = rng.random(len(table)) < 0.15
+    amplitude = np.where(strong, rng.uniform(1400, 1900, len(table)), table.amplitude)
+    table = replace(table, amplitude=amplitude.astype(np.float32))
+    noise = Noise(np.full(N, 20, np.float32), rng.uniform(0.8, 3, N).astype(np.float32))
+    system = SystemPulse(2.0, baseline=20.0, noise_std=1.0, saturation=255.0, ringing=0.1)
+    found = flag_echoes(block, noise, system, replace(table, flags=np.zeros(len(table), np.uint16)))
+    expected = []
+    for i in range(len(table)):
+        w, t, a, s = table.waveform[i], table.time[i], table.amplitude[i], table.sigma[i]
+        near = [abs(k - t) <= 1.5 * s and not missing[w, k] for k in range(S)]
+        clipped = any(block.samples[w, k] >= 255 for k in range(S) if near[k])
+        cut = min(t, S - 1 - t) < s or (w % 3 == 0 and max(24 - t, t - 33) < s)
+        flags = {
+            EchoFlag.WEAK: a < 5 * noise.std[w],
+            EchoFlag.NEAR_EDGE: cut,
+            EchoFlag.NARROW: s + 3 * table.sigma_err[i] < 2.0 and s < 0.93 * 2.0,
+            EchoFlag.SATURATED: clipped,
+            EchoFlag.AMPLITUDE_UNRELIABLE: clipped and 0.15 * a > 255 - 20,
+        }  # fmt: skip
+        expected.append(sum(int(flag) for flag, holds in flags.items() if holds))
+    for i, j, lag in pairs(table):
+        if 4.0 <= lag <= 24.0 and table.amplitude[i] < 0.12 * table.amplitude[j]:
+            expected[i] |= int(EchoFlag.RINGING_SUSPECT)
+    assert found.flags.tolist() == expected
+    for flag in EchoFlag.WEAK, EchoFlag.NEAR_EDGE, EchoFlag.NARROW, EchoFlag.RINGING_SUSPECT, EchoFlag.SATURATED:
+        assert 0 < np.count_nonzero(found.flags & int(flag)) < len(table), flag
+    assert 0 < np.count_nonzero(found.flags & int(EchoFlag.AMPLITUDE_UNRELIABLE)) < np.count_nonzero(strong)
+
+
+def test_echoes_that_an_error_of_the_pulse_explains_are_dropped_as_by_a_loop(table, rng):
+    faint = rng.random(len(table)) < 0.4
+    table = replace(table, amplitude=np.where(faint, 0.02 * table.amplitude, table.amplitude).astype(np.float32))
+    system = SystemPulse(2.0, components=((0.1, 6.0, 1.0),), tail_misfit=((-3.0, 0.01), (0.0, 0.02), (3.0, 0.05)))
+    lags, shares = np.array(system.tail_misfit).T
+    for top in (np.inf, 300.0):
+        dropped = set()
+        for i, j, lag in pairs(table):
+            share = 0.02 if abs(lag) <= max(4 * 2.0, 6.0 + 3 * 1.0) else 0.0
+            if table.amplitude[j] >= top:
+                share = max(share, 0.005)
+            if np.abs(lag - lags).min() <= 0.6 * 3.0:
+                share = max(share, 1.5 * np.interp(lag, lags, shares))
+            if table.amplitude[i] < share * table.amplitude[j]:
+                dropped.add(i)
+        kept = drop_unproven(table, system, top)
+        left = [i for i in range(len(table)) if i not in dropped]
+        np.testing.assert_array_equal(kept.time, table.time[left])
+        assert 10 < len(dropped) < len(table) // 2
+
+
+def test_the_weaker_of_two_echoes_in_one_place_is_dropped(table):
+    table = replace(table, time=np.round(table.time, 1))
+    table = table.take(np.lexsort((table.time, table.waveform)))
+    dropped = set()
+    for i in range(len(table) - 1):
+        same = table.waveform[i] == table.waveform[i + 1]
+        near = table.time[i + 1] - table.time[i] < 0.1 * min(table.sigma[i], table.sigma[i + 1])
+        if same and near and not table.flags[i] & table.flags[i + 1] & OVERLAPPED:
+            dropped.add(i if table.amplitude[i] < table.amplitude[i + 1] else i + 1)
+    left = [i for i in range(len(table)) if i not in dropped]
+    np.testing.assert_array_equal(drop_twins(table).amplitude, table.amplitude[left])
+    assert dropped
+
+
+def test_pairs_that_are_not_resolved_become_one_with_their_moments(table):
+    """One pair after the other from the left, again and again; the area, mean and variance of the light stay."""
+    table = replace(table, time_err=6 * table.time_err, flags=np.where(table.time < 50, OVERLAPPED, table.flags))
+    table = table.take(np.lexsort((table.time, table.waveform)))
+    names = ("waveform", "time", "amplitude", "sigma", "time_err", "amplitude_err", "sigma_err", "flags")
+    columns = {name: getattr(table, name).tolist() for name in names}
+    echoes = [{name: columns[name][i] for name in names} for i in range(len(table))]
+    merged = True
+    while merged:
+        merged, left, i = False, [], 0
+        while i < len(echoes):
+            if i + 1 < len(echoes) and _unresolved(echoes[i], echoes[i + 1]):
+                left.append(_merge(echoes[i], echoes[i + 1]))
+                merged, i = True, i + 2
+            else:
+                left.append(echoes[i])
+                i += 1
+        echoes = sorted(left, key=lambda echo: (echo["waveform"], echo["time"]))
+    found = merge_unresolved(table)
+    assert len(found) == len(echoes) < len(table) - 40
+    for name in names:
+        np.testing.assert_allclose(getattr(found, name), [echo[name] for echo in echoes], rtol=2e-5, err_msg=name)
+
+
+def _unresolved(a, b):
+    gap = b["time"] - a["time"]
+    together = a["flags"] & b["flags"] & OVERLAPPED and a["waveform"] == b["waveform"]
+    return together and gap < 2 * min(a["sigma"], b["sigma"]) and gap < 0.25 * np.hypot(a["time_err"], b["time_err"])
+
+
+def _merge(a, b):
+    both = (a, b)
+    area = sum(e["amplitude"] * e["sigma"] for e in both)
+    time = sum(e["amplitude"] * e["sigma"] * e["time"] for e in both) / area
+    square = sum(e["amplitude"] * e["sigma"] * (e["sigma"] ** 2 + e["time"] ** 2) for e in both) / area
+    sigma = np.sqrt(square - time**2)
+    return {
+        "waveform": a["waveform"], "time": time, "amplitude": area / sigma, "sigma": sigma,
+        "time_err": min(a["time_err"], b["time_err"]), "sigma_err": min(a["sigma_err"], b["sigma_err"]),
+        "amplitude_err": min(e["amplitude_err"] / e["amplitude"] for e in both) * area / sigma,
+        "flags": a["flags"] | b["flags"] | int(EchoFlag.MERGED),
+    }  # fmt: skip
 
 
 def test_an_echo_whose_companions_are_gone_is_not_overlapped():

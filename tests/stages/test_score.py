@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block, make_scene
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from wavebatch.core.echoes import EchoFlag, EchoTable
@@ -40,7 +40,6 @@ echoes = st.lists(st.tuples(st.integers(0, 4), st.integers(-20, 60).map(lambda k
 
 
 @given(echoes, echoes, st.sampled_from([0.25, 1.0, 1.5, 6.0]))
-@settings(max_examples=150, deadline=None)
 def test_matching_equals_the_naive_twin(found, truth, tolerance):
     """Times on a grid, so that ties are common."""
     found, truth = table(found), table(truth)

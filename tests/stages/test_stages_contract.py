@@ -53,6 +53,7 @@ def check(stage, result, block, system):
         assert len(result.attributes[name]) == len(result)
 
 
+@pytest.mark.quick_cases("1-gaussian", "2-noise grows", "2-learned", "9-skewed", "9-short", "64-gaussian")
 @pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS)
 @pytest.mark.parametrize("s", [1, 2, 9, 64])
 def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
@@ -69,6 +70,7 @@ def test_every_stage_keeps_the_contract_on_any_waveforms(s, system):
         np.testing.assert_array_equal(block.samples, before)
 
 
+@pytest.mark.quick_cases("1", "5", "40")
 @pytest.mark.parametrize("s", [1, 2, 5, 40, 150])
 def test_every_chain_keeps_the_contract_after_its_own_survey(s):
     chains = [load_profile(profile) for profile in PROFILES]
@@ -107,6 +109,7 @@ def scene(request):
     return replace(block, returns=returns), system
 
 
+@pytest.mark.quick_cases("mixed-*-survey-1", "stiff-*-learned-7", "stiff-*-survey-100")
 @pytest.mark.parametrize(
     ("system_name", "size"), [("survey", 1), ("survey", 7), ("survey", 100), ("learned", 7), ("skewed", 7)]
 )
@@ -123,6 +126,7 @@ def test_chains_give_the_same_bits_for_any_block_size(scene, profile, size, syst
     assert_same(EchoTable.concatenate(parts), whole)
 
 
+@pytest.mark.quick_cases("stiff-7", "mixed-1")
 @pytest.mark.parametrize("size", [1, 7])
 def test_stages_give_the_same_bits_for_any_block_size(scene, size):
     block, system = scene

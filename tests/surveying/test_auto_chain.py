@@ -105,6 +105,7 @@ def test_the_widest_chain_computes_what_accurate_does():
     assert widest_chain().steps[2].effective() == load_profile("accurate").steps[2].effective()
 
 
+@pytest.mark.quick_cases("flat", "forest")
 @pytest.mark.parametrize(
     ("scene", "grows"),
     [
@@ -136,3 +137,12 @@ def test_the_choice_depends_on_nothing_but_the_survey():
     block = make_block("flat", 3000, seed=3)[0]
     first, again = survey_block(block), survey_block(block.rows(np.arange(len(block))))
     assert chain_text(first) == chain_text(again)
+
+
+def test_angles_that_the_widths_allow_are_named_with_what_they_need():
+    """The beam's divergence is in no strip, so that no survey alone can add the stage."""
+    survey = Survey(SystemPulse(2.0), 8000, {}, (Decision("incidence angle", True, "60 % are wider"),))
+    text = chain_text(survey)
+    assert "# incidence angle: not in this chain: it needs the divergence of the beam" in text
+    assert "attribute.incidence_angle" not in [step.stage.name for step in parse_chain(text, "c").steps]
+    assert "incidence angle" not in chain_text(Survey(SystemPulse(2.0), 8000, {}, ()))

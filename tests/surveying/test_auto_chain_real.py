@@ -89,6 +89,7 @@ def test_leica(leica):
     assert found.matched.mean() >= 0.995
 
 
+@pytest.mark.quick_cases("leica")
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_the_chain_of_a_real_strip_is_the_same_every_time(strip, request):
     path = request.getfixturevalue(strip)

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 import wavebatch as wb
 from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, write_strip
 from wavebatch.cli import main
-from wavebatch.surveying.calibrating.adjust_flight import adjust_constants
+from wavebatch.surveying.calibrating.adjust_flight import Anchors, adjust_constants
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
 from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, measure_ties
 
@@ -55,6 +55,7 @@ def flight(tmp_path_factory):
     return folder, done.stderr
 
 
+@pytest.mark.slow
 def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight):
     folder, _ = flight
     rows = {(row.strip[0], row.digitizer): row for row in load_calibration(folder / "cal.toml").strips}
@@ -69,6 +70,7 @@ def test_strips_and_channels_without_a_target_get_their_constants_by_ties(flight
         assert 0 < rows[name, 1].drift_error < 0.002
 
 
+@pytest.mark.slow
 def test_a_channel_has_the_mean_constant_and_an_error_that_holds_the_drift(flight):
     first, second = load_calibration(flight[0] / "cal.toml").channels
     assert first.relative_error == pytest.approx(np.hypot(0.03, np.std(np.log([1, 1.08, 0.95]), ddof=1)), rel=0.02)
@@ -93,6 +95,7 @@ def test_drifts_and_overlaps_are_told_reported_and_drawn(flight):
     assert (folder / "cal.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_every_strip_is_run_with_its_own_constant(tmp_path, flight):
     folder, _ = flight
     done = call("run", folder / "b.las", folder / "c.las", "-o", tmp_path, "--calibration", folder / "cal.toml")
@@ -125,7 +128,7 @@ def test_the_adjustment_is_not_pulled_by_wet_or_moved_cells(rng):
     constants = np.array([0.0, 0.3, -0.2, 0.1])
     ties = make_ties(rng, constants, 2000, outliers=0.1)
     given = np.array([0.0, np.nan, np.nan, np.nan])
-    found = adjust_constants(ties, given, np.full(4, 0.01))
+    found = adjust_constants(ties, Anchors(given, np.full(4, 0.01)))
     assert np.abs(found.value - constants).max() < 0.01
 
 
@@ -135,20 +138,20 @@ def test_the_errors_of_the_adjustment_hold_its_errors(rng):
     for _ in range(60):
         ties = make_ties(rng, constants, 120)
         given = np.array([rng.normal(0, 0.01), np.nan, rng.normal(-0.2, 0.02)])
-        found = adjust_constants(ties, given, np.array([0.01, np.nan, 0.02]))
+        found = adjust_constants(ties, Anchors(given, np.array([0.01, np.nan, 0.02])))
         ratios += list((found.value - constants) / found.error)
     assert 0.55 < np.mean(np.abs(ratios) < 1) < 0.8
 
 
 def test_sources_without_ties_stay_unknown(rng):
     ties = make_ties(rng, np.zeros(2), 5)
-    found = adjust_constants(ties, np.array([0.0, np.nan, 0.4]), np.full(3, 0.01))
+    found = adjust_constants(ties, Anchors(np.array([0.0, np.nan, 0.4]), np.full(3, 0.01)))
     assert np.isfinite(found.value).tolist() == [True, False, True]
 
 
 def test_channels_without_any_tie_have_the_constants_of_their_targets():
     nothing = measure_ties(np.zeros(0, TIE), 5.0)
-    found = adjust_constants(nothing, np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02]))
+    found = adjust_constants(nothing, Anchors(np.array([0.1, np.nan, 0.4]), np.array([0.01, np.nan, 0.02])))
     assert found.value[[0, 2]].tolist() == pytest.approx([0.1, 0.4], rel=1e-9) and np.isnan(found.value[1])
     assert found.error[[0, 2]] == pytest.approx([0.01, 0.02], rel=0.35)
 
@@ -187,6 +190,7 @@ def clouds(flight, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "ratio"), [("own", 0.0), ("mean", 1 / 1.08 - 1)])
 def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
     done = call("compare", clouds / kind / "a.laz", clouds / kind / "b.laz", "--overlap", "--json")
@@ -199,6 +203,7 @@ def test_overlapping_clouds_show_their_difference(clouds, kind, ratio):
     assert abs(found["height"]["median"]) < 0.003
 
 
+@pytest.mark.slow
 def test_a_step_in_height_between_strips_is_found(clouds, tmp_path):
     import laspy
 

@@ -50,6 +50,7 @@ def known(cloud, name):
     return values[np.isfinite(values)]
 
 
+@pytest.mark.quick_cases("tail")
 @pytest.mark.parametrize("pulse", [RINGING, TAIL], ids=["after-pulses", "tail"])
 def test_a_strip_calibrates_and_runs_with_one_pulse_and_one_chain(tmp_path, pulse):
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], Sensor(pulse=pulse), 6000)
@@ -85,6 +86,7 @@ def test_the_saved_survey_is_used_by_calibrate(tmp_path):
     assert load_calibration(tmp_path / "cal.toml").channels[0].pulse_ns == pytest.approx(2.125 * 2.35482, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_another_decomposer_than_the_calibrations_is_named_and_widens_the_error(tmp_path):
     sensor = Sensor(pulse=TAIL)
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], sensor, 6000)
@@ -104,6 +106,7 @@ def tilted(slope, rho=0.3):
     return [Facet(rho, slope=slope, centre=(56.0, 0.0))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, 0.2), (-0.5, 0.6)])
 def test_the_angle_of_a_tilted_target_is_that_of_its_plane(tmp_path, slope):
     sensor = Sensor(**DENSE)
@@ -114,6 +117,7 @@ def test_the_angle_of_a_tilted_target_is_that_of_its_plane(tmp_path, slope):
     assert off < 0.005 and off < 4 * stated < 0.03
 
 
+@pytest.mark.quick_cases("slope1")
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.2, 0.1)])
 def test_a_target_of_one_scan_line_is_refused_by_name_and_needs_its_incidence(tmp_path, slope):
     # Scan lines are 2.4 m apart: one of them crosses a target 2 m wide. Its plane was taken for 88 deg before.
@@ -139,6 +143,7 @@ def tarp_strip(path, size, divergence):
     )
 
 
+@pytest.mark.slow
 def test_only_echoes_with_their_whole_footprint_on_the_target_count(tmp_path):
     strip, corners = tarp_strip(tmp_path / "s.las", 6.0, 1.5e-3)
     found = calibrate_strip(strip, [Target("t", 0.6, corners)], CalibrationOptions(divergence=1.5))
@@ -153,6 +158,7 @@ def test_a_target_as_small_as_the_footprint_is_refused_by_name(tmp_path):
         calibrate_strip(strip, [Target("t", 0.6, corners)], CalibrationOptions(divergence=1.5))
 
 
+@pytest.mark.slow
 def test_a_footprint_that_is_larger_than_stated_is_named_and_is_in_the_error(tmp_path):
     strip, corners = tarp_strip(tmp_path / "s.las", 4.0, 2.5e-3)
     found = calibrate_strip(strip, [Target("t", 0.6, corners)], CalibrationOptions(divergence=0.2))
@@ -160,6 +166,7 @@ def test_a_footprint_that_is_larger_than_stated_is_named_and_is_in_the_error(tmp
     assert abs(found.constant / constant_of(Sensor()) - 1) < found.relative_error
 
 
+@pytest.mark.slow
 def test_an_outline_off_the_target_is_named(tmp_path):
     strip, corners = tarp_strip(tmp_path / "s.las", 6.0, 0.3e-3)
     beside = Target("t", 0.6, corners + np.array([1.5, 0.0]))
@@ -180,6 +187,7 @@ def channels(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_voxels_take_the_constant_of_each_channel(tmp_path, channels):
     one = write_strip(tmp_path / "one.las", [Facet(0.3)], Sensor(), 6000)
     targets = write_targets(tmp_path / "t.csv", (0.3, 40, -15, 70, 15))
@@ -212,6 +220,18 @@ def test_the_energy_from_shot_to_shot_is_measured(tmp_path):
     assert found.channels[0].spread > found.channels[0].shot_energy
 
 
+def test_energies_that_are_known_are_no_scatter(tmp_path):
+    sensor = Sensor(energy_spread=0.04, store_energy=True)
+    strip = write_strip(tmp_path / "s.las", [Facet(0.3)], sensor, 6000)
+    target = [Target("t", 0.3, outline(40, -15, 70, 15))]
+    known, ignored = (
+        calibrate_strip(strip, target, CalibrationOptions(divergence=0.5, energy=energy)).channels[0]
+        for energy in (None, "none")
+    )
+    assert known.shot_energy < 0.01 < 0.03 < ignored.shot_energy
+    assert known.constant == pytest.approx(ignored.constant, rel=0.01)
+
+
 def run_with(folder, strip, cal, *options):
     return call("run", strip, "-o", folder / "out", "--calibration", cal, "--overwrite", *options)
 
@@ -229,6 +249,7 @@ def test_a_channel_that_was_not_calibrated_has_no_values(tmp_path, channels):
     assert np.nanmedian(gamma) == pytest.approx(1.2, rel=0.03)
 
 
+@pytest.mark.slow
 def test_a_scanner_channel_that_was_not_calibrated_is_named(tmp_path):
     both, one = Sensor(gains={1: 1.0, 2: 0.45}, scanners=True), Sensor(gains={2: 0.45}, scanners=True)
     strips = [write_strip(tmp_path / f"{i}.las", [Facet(0.3)], sensor, 6000) for i, sensor in enumerate((both, one))]
@@ -239,6 +260,7 @@ def test_a_scanner_channel_that_was_not_calibrated_is_named(tmp_path):
     assert np.isfinite(wb.read_cloud(tmp_path / "out" / "0.laz")["reflectance"]).mean() == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.quick_cases("change0-*", "*was not calibrated, only*")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -268,6 +290,7 @@ def test_descriptors_that_differ_in_length_only_share_a_constant(tmp_path, chann
     assert np.nanmedian(err / gamma) > 0.3 and np.nanmedian(np.abs(gamma - 1.2) / err) < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message", "least"),
     [
@@ -294,6 +317,7 @@ def test_two_divergences_are_named(tmp_path, channels):
     assert "makes cross sections 156 % wrong" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_check_whose_key_is_taken_out_of_the_file_is_not_made(tmp_path, channels):
     lines = (channels / "two.toml").read_text().splitlines()
     (tmp_path / "cal.toml").write_text("\n".join(line for line in lines if not line.startswith("pulse_ns")))
@@ -304,6 +328,7 @@ def test_a_check_whose_key_is_taken_out_of_the_file_is_not_made(tmp_path, channe
     assert run_with(tmp_path, strip, tmp_path / "cal.toml").exit_code == 4
 
 
+@pytest.mark.slow
 def test_an_old_file_that_cannot_be_checked_says_so(tmp_path, channels):
     (tmp_path / "old.toml").write_text(
         'schema = "wavebatch.calibration/1"\nconstant = 1.6e-8\nrelative_error = 0.02\ndivergence_mrad = 0.5\n'
@@ -312,6 +337,7 @@ def test_an_old_file_that_cannot_be_checked_says_so(tmp_path, channels):
     assert done.exit_code == 0 and "the file does not say which sensor it was measured with" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_is_too_low_is_named_and_in_the_error(tmp_path):
     sensor = Sensor(height=400.0, light=4e7)
     strip = write_strip(tmp_path / "s.las", [Facet(0.3)], sensor, 6000)

@@ -57,6 +57,7 @@ def test_auto_is_the_default_and_chooses_per_strip(strips, tmp_path):
     assert "microseconds_per_waveform" not in flat["timing"]
 
 
+@pytest.mark.slow
 def test_the_choice_depends_on_neither_jobs_nor_block_size(strips, tmp_path):
     for name, options in {"a": ["--jobs", 1], "b": ["--jobs", 2, "--block-size", 333]}.items():
         assert _run(strips, "-o", tmp_path / name, "-q", *options).exit_code == 0
@@ -180,6 +181,7 @@ def ringing(tmp_path_factory):
     return folder
 
 
+@pytest.mark.quick_cases("True-options1")
 @pytest.mark.parametrize("options", [["--profile", "fast"], ["--chain", EXAMPLES / "urban.toml"]])
 @pytest.mark.parametrize("saved", [False, True])
 def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_counted(ringing, tmp_path, options, saved):
@@ -196,6 +198,7 @@ def test_a_chain_that_does_not_fit_the_pulse_is_named_and_its_false_echoes_count
     assert report["choice"]["by"] == "user"
 
 
+@pytest.mark.quick_cases("options2")
 @pytest.mark.parametrize(
     "options", [["--profile", "accurate"], ["--profile", "auto"], ["--chain", EXAMPLES / "forest.toml"]]
 )
@@ -205,6 +208,7 @@ def test_chains_that_fit_the_pulse_are_not_doubted(ringing, tmp_path, options):
     assert "predictions" not in _report(tmp_path, "ringing")["choice"]
 
 
+@pytest.mark.slow
 def test_a_tolerance_leaves_out_chains_that_do_not_fit_the_pulse(ringing, tmp_path):
     assert _run(ringing / "ringing.las", "-o", tmp_path, "-q", "--tolerance", "10m").exit_code == 0
     choice = _report(tmp_path, "ringing")["choice"]

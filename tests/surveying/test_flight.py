@@ -49,6 +49,7 @@ def test_strips_of_one_sensor_belong_together_whatever_their_scene(flight):
     assert all(strip.waveforms == 800 for strip in flight.strips)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_strips_does_not_matter(strips, flight):
     for names in itertools.islice(itertools.permutations(FLIGHT), 1, 6, 2):
         again = survey_flight(read_samples([strips[name] for name in names], waveforms=2400))
@@ -117,6 +118,7 @@ def test_surveys_that_agree(strips):
     assert not surveys_agree([surveys["flat"]])
 
 
+@pytest.mark.slow
 def test_parts_of_real_strips_belong_to_them(riegl, leica, tmp_path):
     for path, other in ((riegl, leica), (leica, riegl)):
         part = cut_strip(path, tmp_path / path.name, 400)

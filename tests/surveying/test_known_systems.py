@@ -78,6 +78,7 @@ def test_a_shipped_pulse_is_that_of_its_strip(strip, name, request):
     assert KNOWN[name].sensor in likeness.describe()
 
 
+@pytest.mark.quick_cases("11-0.03")
 @pytest.mark.parametrize(("points", "error"), [(11, 0.03), (54, 0.03), (100, 0.03)])
 def test_a_small_strip_has_the_echoes_of_the_whole_strip(riegl, tmp_path, points, error):
     """54 points are 53 packets. With a Gaussian they had 116 echoes, since each after-pulse became one."""
@@ -104,6 +105,7 @@ OTHERS = {
 }  # fmt: skip
 
 
+@pytest.mark.quick_cases("flat-wide", "urban-skewed", "flat-tail", "urban-ringing")
 @pytest.mark.parametrize("name", OTHERS)
 @pytest.mark.parametrize("scene", ["flat", "urban"])
 def test_a_small_strip_of_another_sensor_gets_no_known_pulse(name, scene):

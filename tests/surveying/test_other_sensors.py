@@ -62,6 +62,7 @@ def judge(block, time):
     return survey.system, echoes, one.mean(), error - np.median(error)
 
 
+@pytest.mark.quick_cases("2")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_flat_tops_are_learned_and_found(seed):
     block, time, _ = record(flat_top, seed)
@@ -81,6 +82,7 @@ def test_counts_that_hardly_scatter_do_not_spoil_the_pulse(noise):
     assert np.median(ratio) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.quick_cases("5")
 @pytest.mark.parametrize("seed", [4, 5])
 def test_noise_on_a_broad_top_is_no_echo(seed):
     block, time, _ = record(gaussian, seed, n=1500, s=300, width=10.0, wide=0.3)
@@ -89,6 +91,7 @@ def test_noise_on_a_broad_top_is_no_echo(seed):
     assert not (echoes.flags & int(EchoFlag.MERGED)).any()
 
 
+@pytest.mark.quick_cases("-1")
 @pytest.mark.parametrize("mirror", [1, -1])
 def test_widened_echoes_of_skewed_pulses_stay_whole(mirror):
     """A target adds its own shape to a pulse; it does not stretch it."""
@@ -117,6 +120,7 @@ def drifting(seed, *, drift, noise, n=3000, top=200):
     return WaveformBlock.from_samples(np.clip(np.rint(samples), 0, 65535).astype(np.uint16)), time, base
 
 
+@pytest.mark.quick_cases("2-0.4-200")
 @pytest.mark.parametrize(("drift", "noise", "top"), [(20, 1.0, 200), (300, 3.0, 3000), (2, 0.4, 200)])
 def test_baselines_that_drift_along_the_strip_hide_no_echo(drift, noise, top):
     block, time, base = drifting(7, drift=drift, noise=noise, top=top)

@@ -23,6 +23,7 @@ def test_every_shipped_chain_has_its_place_among_the_costs():
     assert sorted(COSTS) == list_profiles()
 
 
+@pytest.mark.quick_cases("mixed")
 @pytest.mark.parametrize(
     ("scene", "optimism"),
     [
@@ -54,6 +55,7 @@ def test_the_bound_and_a_perfect_chain_agree_on_flat_ground():
     assert accurate.to_json()["range_error_m"] == pytest.approx(accurate.range_error, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_false_echoes_are_predicted_as_often_as_they_come():
     """Chains of plain Gaussians take parts of a pulse with lobes for echoes; those that fit the pulse do not."""
     scene = make_scene("flat", pulse=find_pulse("riegl"), n_samples=100)

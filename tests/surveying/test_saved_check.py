@@ -58,6 +58,7 @@ def test_another_sensor_contradicts_and_another_scene_does_not(folder, name, pla
     assert CONTRADICTED.get(name, "") in found
 
 
+@pytest.mark.slow
 def test_shipped_and_saved_surveys_of_real_strips_fit_their_own_strip_and_no_other():
     paths = {
         "riegl-q680i": data_file("riegl-q680i/100429_152240_2535pt_UTM.las"),

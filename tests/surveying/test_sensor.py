@@ -255,6 +255,7 @@ def fly_roughly(rng, *, seconds=5.0, level=0.0, mounting=0.0, attitude=0.0, view
     return float(np.sqrt(seen)), float(np.sqrt(np.nanmean(far**2)))
 
 
+@pytest.mark.quick_cases("{}", "{'level': 0.3}", "{'mounting':*", "{'attitude': 5.0}")
 @pytest.mark.parametrize(
     "flight",
     [

@@ -15,6 +15,7 @@ from wavebatch.surveying.measuring.noise_and_width import FIRST_LOOK
 from wavebatch.tools.simulate import PulseModel, find_pulse
 
 
+@pytest.mark.quick_cases("14.0")
 @pytest.mark.parametrize("sigma", [0.5, 0.64, 0.85, 1.0, 1.4, 4.0, 10.0, 14.0])
 def test_the_width_is_found_however_far_from_the_first_guess(sigma):
     scene = make_scene("flat", pulse=PulseModel(sigma=sigma), n_samples=max(80, int(20 * sigma)))
@@ -31,6 +32,7 @@ def test_widths_are_in_ns_whatever_the_spacing(spacing):
     assert survey.system.sigma_ref == pytest.approx(2.0, rel=0.02) and survey.figures["spacing_ns"] == spacing
 
 
+@pytest.mark.quick_cases("gaussian-gaussian", "leica-learned")
 @pytest.mark.parametrize(
     ("pulse", "kind"), [("gaussian", "gaussian"), ("skewed", "skewed"), ("riegl", "learned"), ("leica", "learned")]
 )
@@ -76,6 +78,7 @@ def test_waveforms_of_several_lengths_are_surveyed_together():
     assert join_digitizers([]) == [] and survey_blocks([]).waveforms == 0
 
 
+@pytest.mark.quick_cases("0.2")
 @pytest.mark.parametrize("gain", [0.0, 0.03, 0.2])
 def test_the_growth_of_noise_is_not_what_the_fit_leaves_of_it(gain):
     scene = make_scene("flat", noise_gain=gain, pulse=find_pulse("leica"), n_samples=100)

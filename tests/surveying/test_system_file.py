@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_scenes import make_block
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from wavebatch.core.errors import ConfigError, InputError
@@ -69,7 +69,6 @@ def test_everything_comes_back():
 positive = st.floats(1e-3, 1e4)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     width=positive,
     numbers=st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=2),

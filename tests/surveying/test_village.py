@@ -101,6 +101,7 @@ def test_cross_sections_and_reflectances_are_recovered(village):
     check_light(*village[1:])
 
 
+@pytest.mark.slow
 def test_a_trajectory_changes_cross_sections_by_a_fifth_of_a_percent_at_most(village):
     folder, _, _ = village
     given = write_trajectory(folder / "t.txt", 0.1)
@@ -139,6 +140,7 @@ def test_level_ground_is_told_from_the_swath(half_angle):
     assert seen.width_scatter < 0.01 * true
 
 
+@pytest.mark.slow
 def test_a_reference_that_no_surface_shows_is_no_reference():
     block = simulate_seed_block(make_scene("empty"), 1, 0).block
     system = SystemPulse(2.0, divergence=0.5)
@@ -150,6 +152,7 @@ def test_a_reference_that_no_surface_shows_is_no_reference():
     assert measure_reference([unknown], blind, 1.0).system == blind
 
 
+@pytest.mark.slow
 def test_survey_says_what_angles_the_beam_tells(village):
     strip = village[0] / "v1.las"
     wide = call("survey", strip, "--divergence", "1.1", "-o", village[0] / "s.toml").stdout

@@ -65,6 +65,7 @@ def tailed(share, length):
     return lambda x: bell(x) + share * np.exp(-np.maximum(x - 2, 0) / length) / (1 + np.exp(-3 * (x - 1.5)))
 
 
+@pytest.mark.quick_cases("-0.012-30.0")
 @pytest.mark.parametrize(("share", "length"), [(0.012, 30.0), (0.03, 8.0), (-0.012, 30.0)])
 def test_tails_are_no_baseline(share, length):
     """Long tails, positive and negative: the level is that before the pulse, the tail the pulse's."""
@@ -76,6 +77,7 @@ def test_tails_are_no_baseline(share, length):
     assert found > 0.995 and true > 0.985
 
 
+@pytest.mark.quick_cases("leica")
 @pytest.mark.parametrize("strip", ["riegl", "leica"])
 def test_samples_before_the_pulse_agree_with_the_baseline(strip, request):
     with StripReader(request.getfixturevalue(strip)) as reader, reader.scan() as scan:
@@ -98,6 +100,7 @@ def optech(x):
     return front / 1.04 + tail + 0.01 * sum(share * bell((x - lag) / 0.6) for lag, share in ripples)
 
 
+@pytest.mark.quick_cases("4")
 @pytest.mark.parametrize("seed", [3, 4])
 def test_clipped_echoes_stay_one(seed):
     """Amplitudes to four times the range of the digitizer, noise that rounding nearly hides, widened echoes too."""
@@ -181,6 +184,7 @@ def test_strips_without_defects_keep_their_counts():
         assert not system.has_defects and clean_block(block, system) is block
 
 
+@pytest.mark.quick_cases("0.0-0.1")
 @pytest.mark.parametrize(("rho", "gain"), [(0.5, 0.05), (0.5, 0.1), (0.0, 0.1)])
 def test_errors_hold_in_coloured_noise_that_grows_with_the_signal(rho, gain):
     signal, rows, time, height = render(bell, 11, n=4000, amplitude=(15, 220))

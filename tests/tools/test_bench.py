@@ -1,4 +1,4 @@
-"""The benchmark command on small numbers: what its documents hold, its processes, peers, scenes and stiff cases."""
+"""The benchmark on small numbers: what its documents hold, its processes and scenes; and what releases measure."""
 
 import json
 import os
@@ -10,25 +10,28 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bench import against, peers
+from bench import jobs_model as jobs
+from bench.against import compare_runs, format_paired, simulate_strips
+from bench.cases import CASES, list_cases, make_scene
+from bench.jobs_model import Parts
+from bench.promises import SPEEDS, judge
+from bench.release import SCENES, format_release, measure_cases, read_options
+from bench.stability import FAILURES, count_changes, count_failures
 from click.testing import CliRunner
 
 import wavebatch
 from wavebatch.cli import main
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import Survey
-from wavebatch.tools.bench import command, peers, report
+from wavebatch.tools.bench import command, report
 from wavebatch.tools.bench.accuracy import Group, Tally, make_group, make_groups
-from wavebatch.tools.bench.cases import CASES, list_cases, make_scene
 from wavebatch.tools.bench.command import BenchOptions, run_bench
-from wavebatch.tools.bench.paired import compare, jobs
-from wavebatch.tools.bench.paired.compare import compare_runs, format_paired, simulate_strips
-from wavebatch.tools.bench.paired.jobs import Parts
 from wavebatch.tools.bench.report import format_document
 from wavebatch.tools.bench.scenes import find_bench_scene, shape_scene
-from wavebatch.tools.bench.stability import FAILURES, count_changes, count_failures
 from wavebatch.tools.bench.worker import Worker, WorkerDied, peak_memory
 from wavebatch.tools.simulate import Recording, simulate_block, simulate_blocks, simulate_strip
 
@@ -37,9 +40,6 @@ SMALL = BenchOptions(
     waveforms=1600,
     repeats=1,
     pulses=400,
-    peer_waveforms=60,
-    stability_waveforms=90,
-    hazards=("H10",),
     tolerance_cm=50.0,
 )
 
@@ -47,13 +47,16 @@ SMALL = BenchOptions(
 @pytest.fixture(scope="module")
 def document():
     """A small benchmark with everything in it."""
-    return run_bench(SMALL)
+    found = run_bench(SMALL, measure_others=lambda *of: peers.measure_peers(*of, lambda text: None, waveforms=60))
+    cases = measure_cases(SMALL, list_cases(["H10"]), lambda text: None, waveforms=90)
+    return {**found, "stability": cases, "promises": judge(found)}
 
 
 def find_row(document, name):
     return next(row for row in document["scenes"][0]["rows"] if row["name"] == name)
 
 
+@pytest.mark.slow
 def test_document_has_a_row_per_chain_and_peer(document):
     assert document["schema"] == command.SCHEMA
     names = [row["name"] for row in document["scenes"][0]["rows"]]
@@ -79,7 +82,8 @@ def test_isolated_echoes_are_at_the_bound(document):
 
 def test_document_is_plain_json_and_its_tables_show_all(document):
     assert json.loads(json.dumps(document, allow_nan=False)) == document
-    text = format_document(document)
+    text = format_release(document)
+    assert text.startswith(format_document(document)) and "isolated, time error / bound" in text
     for row in document["scenes"][0]["rows"]:
         assert f"\n{row['name']}" in text
     assert "constant 0, 12 or 255" in text and "cheapest chain with an error of 50 cm" in text
@@ -97,8 +101,9 @@ def test_stiff_cases_count_failures_by_kind(document):
         assert row["figures"]["false_alarms"]["value"] < 0.05 + (row["chain"] == "balanced")
 
 
+@pytest.mark.slow
 def test_figures_depend_on_the_seed_alone_and_move_by_no_more_than_they_say(timed_here):
-    small = replace(SMALL, peers=False, stability=False, pulses=0, waveforms=1200)
+    small = replace(SMALL, pulses=0, waveforms=1200)
     rows = [run_bench(replace(small, seed=seed))["scenes"][0]["rows"] for seed in (5, 5, 6)]
     for first, again, other in zip(*rows, strict=True):
         assert first["figures"] == again["figures"] != other["figures"]
@@ -117,8 +122,8 @@ def test_nothing_to_measure():
 
 
 def test_command_writes_what_it_prints(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "can_plot", lambda: False)
-    options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --no-peers --no-stability --json"
+    monkeypatch.setattr(report, "has_matplotlib", lambda: False)
+    options = "--scene flat --waveforms 800 --pulses 0 --repeat 1 --json"
     chain = tmp_path / "mine.toml"
     chain.write_text(
         "".join(f'[[chain]]\nstage = "{s}"\n' for s in ("noise.pooled", "detect.maximum", "decompose.none"))
@@ -148,7 +153,6 @@ def test_plot_is_written_where_matplotlib_is(tmp_path, document):
         (["--waveforms", "0"], "--waveforms': 0 is not in the range"),
         (["--tolerance", "2"], "no length"),
         (["missing.toml"], "cannot be read"),
-        (["--hazard", "H99"], "H99"),
     ],
 )
 def test_wrong_usage(words, message):
@@ -219,6 +223,20 @@ def test_tally_measures_what_was_put_in():
     gross = Tally()
     gross.add(group, replace(group.truth, time=group.truth.time + 20 * group.bounds[:, 0]))
     assert gross.figures()["gross_isolated"].value == 1
+
+
+def test_reported_errors_are_measured_with_and_without_flags():
+    """Every second echo is flagged and off by three of its errors, the others by one."""
+    group, tally = known_group(), Tally()
+    flagged = np.arange(len(group.truth)) % 2 == 1
+    error = np.full(len(group.truth), 0.01)
+    found = replace(group.truth, time=group.truth.time + np.where(flagged, 0.03, 0.01), time_err=error.astype("f4"))
+    tally.add(group, found.with_flags(EchoFlag.OVERLAPPED, flagged))
+    figures = tally.figures()
+    assert figures["time_calibration_flagged"].value == pytest.approx(3, rel=1e-3)
+    assert figures["time_calibration_not_flagged"].value == pytest.approx(1, rel=1e-3)
+    assert figures["hidden"].value == 0 and np.isnan(figures["time_calibration_hidden"].value)
+    assert figures["time_calibration_not_hidden"].value == pytest.approx(np.sqrt(5), rel=1e-2)
 
 
 def make_found(**columns) -> EchoTable:
@@ -299,10 +317,11 @@ def GaussianDecomposition(y, thres):
 """
 
 
+@pytest.mark.slow
 def test_peer_that_crashes_and_hangs_is_started_again(tmp_path, monkeypatch):
     (tmp_path / "gdecomp.py").write_text(FAKE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(peers, "PATIENCE", 1.5)
+    monkeypatch.setattr(peers, "PATIENCE", 10.0)
     scene = replace(find_bench_scene("flat"), recording=Recording(bits=16))
     ((block, truth),) = simulate_blocks(scene, 40, seed=2, size=40)
     samples = block.samples.copy()
@@ -324,35 +343,35 @@ def checkout(tmp_path):
     return root
 
 
+@pytest.mark.slow
 def test_two_checkouts_take_turns(tmp_path, checkout):
-    options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "--json", "-o", str(tmp_path / "out")]
-    missing = CliRunner().invoke(main, ["bench", "--against", str(tmp_path), *options])
-    assert missing.exit_code == 1 and "holds no wavebatch that Python can import" in missing.stderr
-    result = CliRunner().invoke(main, ["bench", "--against", str(checkout), *options])
-    assert result.exit_code == 0, result.output
-    (ratios,) = json.loads(result.stdout)["strips"].values()
+    options = ["--scene", "flat", "--pulses", "300", "--repeat", "2", "-o", str(tmp_path / "out")]
+    with pytest.raises(InputError, match="holds no wavebatch that Python can import"):
+        against.main([str(tmp_path), *options])
+    against.main([str(checkout), *options])
+    (ratios,) = json.loads((tmp_path / "out" / "against.json").read_text())["strips"].values()
     for name in ("cpu", "wall", "peak"):
         middle, low, high = ratios[name]
         assert 0 < low <= middle <= high
     assert "flat" in (tmp_path / "out" / "against.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_run_and_what_many_jobs_reach(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "UNIT_POINTS", 1000)
-    options = ["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")]
-    result = CliRunner().invoke(main, ["bench", "--jobs-model", "--json", *options])
-    assert result.exit_code == 0, result.output
-    document = json.loads(result.stdout)
+    jobs.main(["--scene", "flat", "--pulses", "3000", "--repeat", "1", "-o", str(tmp_path / "out")])
+    document = json.loads((tmp_path / "out" / "jobs.json").read_text())
     parts = document["parts"]
     assert 2900 < parts["waveforms"] <= 3000
-    assert all(parts[name] > 0 for name in ("start", "start_worker", "prepare", "single", "write", "strip"))
+    assert all(parts[name] > 0 for name in ("start", "start_worker", "prepare", "write", "strip"))
     text = (tmp_path / "out" / "jobs.txt").read_text()
     assert [line.split()[0] for line in text.splitlines()[11:16]] == ["1", "2", "4", "16", "64"]
-    assert json.loads((tmp_path / "out" / "jobs.json").read_text())["parts"] == parts
     (warning,) = document["warnings"]  # two units, which is few
-    assert "waveforms are fewer than 10 units" in warning and warning in text and parts["work"] >= 0
+    assert "waveforms are fewer than 10 units" in warning and warning in text
+    assert parts["work"] >= 0 and parts["single"] >= 0
 
 
+@pytest.mark.slow
 def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
     """Of a strip that two jobs cannot share, what a waveform costs is no-data; no cost is negative."""
     monkeypatch.setattr(jobs.Worker, "call", _call_slow_starter)
@@ -371,12 +390,14 @@ def test_a_short_strip_predicts_nothing(tmp_path, monkeypatch):
     assert "nothing is predicted" in document["warnings"][0]
 
 
-def test_jobs_are_measured_on_enough_waveforms_by_default(monkeypatch):
-    given = []
-    monkeypatch.setattr(compare, "simulate_strips", lambda scenes, pulses, *more: given.append(pulses) or {}["stop"])
-    for words in ([], ["--pulses", "700"]):
-        CliRunner().invoke(main, ["bench", "--jobs-model", *words])
-    assert given[0] > 1.1 * jobs.MANY_UNITS * jobs.UNIT_POINTS and given[1] == 700  # some pulses are empty
+def test_jobs_are_measured_on_enough_waveforms_by_default():
+    assert jobs.PULSES > 1.1 * jobs.MANY_UNITS * jobs.UNIT_POINTS  # some pulses are empty
+
+
+def test_releases_measure_the_scenes_that_they_promise():
+    given = read_options(["-o", "out"])
+    assert given.scene is None and given.waveforms == BenchOptions().waveforms and given.pulses == BenchOptions().pulses
+    assert {scene for scene, *_ in SPEEDS} == set(SCENES)
 
 
 def _call_slow_starter(self, function, *arguments):
@@ -388,18 +409,12 @@ def _call_slow_starter(self, function, *arguments):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--jobs-model a.las b.las", "one strip"), ("--jobs-model --scene flat --scene open", "one scene, not 2"),
-        ("--jobs-model --all-methods", "--all-methods has no meaning with --jobs-model"),
-        ("--jobs-model --tolerance 2cm", "--tolerance has no meaning"), ("--jobs-model --no-peers", "--peers has no"),
-        ("--jobs-model a.las --scene flat", "--scene is for simulated strips"),
-        ("--jobs-model a.las --pulses 50000", "--pulses is for simulated strips"),
-        ("--against . --hazard H5", "--hazard has no meaning with --against"),
-        ("--against . a.las --scene flat", "--scene is for simulated strips"),
         ("--real a.las --scene flat", "--scene has no meaning with --real"),
-        ("--real a.las --against .", "--against has no meaning with --real"),
+        ("--real a.las --tolerance 2cm", "--tolerance has no meaning with --real"),
+        ("--real a.las --all-methods", "--all-methods has no meaning"),
     ],
 )  # fmt: skip
-def test_options_that_a_mode_does_not_use_are_refused(words, message):
+def test_options_that_real_does_not_use_are_refused(words, message):
     result = CliRunner().invoke(main, ["bench", *words.split()])
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1, result.output
 
@@ -411,10 +426,9 @@ def test_a_small_strip_that_fails_is_no_time(tmp_path):
         jobs.run_small(broken, tmp_path / "small")
 
 
-@pytest.mark.parametrize("mode", ["--real", "--jobs-model"])
-def test_every_mode_takes_a_log_file(mode, tmp_path):
+def test_real_takes_a_log_file(tmp_path):
     log = tmp_path / "night.log"
-    result = CliRunner().invoke(main, ["bench", mode, str(tmp_path / "no.las"), "--log-file", str(log)])
+    result = CliRunner().invoke(main, ["bench", "--real", str(tmp_path / "no.las"), "--log-file", str(log)])
     assert "no.las" in result.stderr and "has no meaning" not in result.stderr and "no.las" in log.read_text()
 
 
@@ -433,7 +447,8 @@ def test_the_slowest_part_bounds_many_jobs():
     assert replace(parts, tail=0.4).predict(2) == pytest.approx(0.5 + 1 + 5 + 0.2)
 
 
-def test_of_two_checkouts_the_slower_one_is_seen(tmp_path, checkout):
+@pytest.mark.slow
+def test_the_slower_one_of_two_checkouts_is_seen(tmp_path, checkout):
     start = checkout / "wavebatch" / "__init__.py"
     start.write_text(start.read_text() + "\nimport time\nwhile time.process_time() < 5:\n    pass\n")
     (pair,) = compare_runs(checkout, simulate_strips(["flat"], 200, 0, tmp_path), 1, say=lambda text: None)

@@ -5,11 +5,13 @@ from dataclasses import replace
 import naive
 import numpy as np
 import pytest
+from bench.promises import format_promises, judge
 
 from wavebatch.cli.options import parse_length
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.errors import ConfigError
 from wavebatch.kernels.fit.bounds import crlb
+from wavebatch.tools.bench.accuracy import find_hidden
 from wavebatch.tools.bench.figures import (
     SURVEY_SCATTER,
     Figure,
@@ -19,7 +21,6 @@ from wavebatch.tools.bench.figures import (
     root_mean_square,
     share,
 )
-from wavebatch.tools.bench.promises import format_promises, judge
 from wavebatch.tools.bench.truth import describe_truth, effective_noise, find_bounds
 from wavebatch.tools.simulate import PULSES, PulseModel, Recording, simulate_blocks
 from wavebatch.tools.simulate.render import paint_echoes
@@ -132,6 +133,28 @@ def test_truth_is_described_as_the_painted_pulse_is(pulse):
     truth = next(gaussian)[1]
     same = describe_truth(truth, PulseModel())
     assert np.array_equal(same.time, truth.time) and np.array_equal(same.sigma, truth.sigma)
+
+
+def test_hidden_neighbours_are_those_of_a_loop(rng):
+    m = 300
+    waveform = np.sort(rng.integers(0, 90, m))
+    time, sigma = rng.uniform(0, 60, m), rng.uniform(1, 4, m)
+    order = np.lexsort((time, waveform))
+    truth = EchoTable.build(waveform[order], time[order], np.ones(m), sigma[order])
+    matched = rng.random(m) < 0.7
+    expected = [
+        matched[i]
+        and any(
+            not matched[j]
+            and truth.waveform[j] == truth.waveform[i]
+            and abs(truth.time[j] - truth.time[i]) < 6 * max(truth.sigma[i], truth.sigma[j])
+            for j in range(m)
+        )
+        for i in range(m)
+    ]
+    np.testing.assert_array_equal(find_hidden(truth, matched), expected)
+    assert 20 < np.sum(expected) < 200
+    assert not find_hidden(truth.take(np.zeros(0, int)), matched[:0]).any()
 
 
 def test_front_holds_what_nothing_beats():

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from bench.agreement import compare_parts, compare_solvers, format_agreement
 from click.testing import CliRunner
 from scipy.signal import lfilter
 from strips import make_raw
@@ -16,7 +17,6 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain
 from wavebatch.tools.bench.real import pool
-from wavebatch.tools.bench.real.agreement import compare_solvers
 from wavebatch.tools.bench.real.inject import add_signal, inject_echoes
 from wavebatch.tools.bench.real.measure import measure_real
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise, unround
@@ -54,6 +54,7 @@ def level_solver(**system):
     return Solver(survey, choose_chain(survey))
 
 
+@pytest.mark.slow
 def test_strong_echoes_are_found_and_weak_ones_are_not(report):
     rows = {row.low: row for row in report.quiet_by_sigma}
     assert rows[10.0].recall > 0.99 and rows[20.0].recall > 0.99 and rows[5.0].recall > 0.95
@@ -72,15 +73,11 @@ def test_reported_errors_are_right_where_the_noise_is_white(report):
     assert np.abs(whole.bias) == pytest.approx(0, abs=0.1) and abs(whole.bias[0]) < 0.01
 
 
-def test_few_false_echoes_and_surveys_that_agree(report):
+def test_few_false_echoes(report):
     false = report.false_echoes
     assert false.correctness > 0.995 and false.before.length > 1e4
     for part in (false.before, false.after):
         assert part.echoes < 1e-4 * part.length + 3 and part.mirrored < 1e-4 * part.length + 3
-    assert [row.parts for row in report.agreement] == ["even/odd", "first/last", "west/east", "in order/shuffled"]
-    for row in report.agreement:
-        assert row.differ < 0.02 and row.apart < 0.02 and abs(row.amplitude_ratio - 1) < 0.005
-        assert row.packets == report.waveforms
 
 
 def test_noise_and_templates_are_those_that_were_simulated(report):
@@ -91,21 +88,23 @@ def test_noise_and_templates_are_those_that_were_simulated(report):
     assert report.templates.fwhm == pytest.approx(report.survey.fwhm, rel=0.05)
 
 
+@pytest.mark.slow
 def test_seed_decides_all_and_json_holds_it(strip):
-    few = {"injections": 300, "stability": False, "waveforms": 1200}
+    few = {"injections": 300, "waveforms": 1200}
     one, same, other = (replace(measure_real(strip, seed=seed, **few), seconds={}) for seed in (1, 1, 2))
     assert one == same and one.quiet_by_sigma != other.quiet_by_sigma
-    assert json.loads(json.dumps(asdict(one)))["seed"] == 1 and one.agreement == []
+    assert json.loads(json.dumps(asdict(one)))["seed"] == 1
     assert "misses a goal" in format_report(one)
 
 
+@pytest.mark.slow
 def test_a_wrong_survey_is_seen(strip, report, monkeypatch):
     def deaf(blocks):
         survey = survey_blocks(blocks)
         return replace(survey, system=replace(survey.system, noise_std=4 * survey.system.noise_std))
 
     monkeypatch.setattr(pool, "survey_blocks", deaf)
-    found = measure_real(strip, injections=2000, stability=False)
+    found = measure_real(strip, injections=2000)
     rows = [{row.low: row.recall for row in each.quiet_by_sigma} for each in (report, found)]
     assert rows[0][6.0] > 0.99 and rows[1][6.0] < 0.5
     assert found.noise.std == pytest.approx(report.noise.std, rel=0.06)
@@ -144,6 +143,7 @@ def test_signal_is_added_as_if_the_digitizer_had_seen_it():
     assert clipped.max() == 60
 
 
+@pytest.mark.slow
 def test_gaps_of_fill_are_seen_and_left_alone(strip):
     samples = np.rint(20 + correlated(50, 100)).astype(np.uint8)
     samples[:25, 40:60] = 0
@@ -169,13 +169,24 @@ def test_gaps_of_fill_are_seen_and_left_alone(strip):
     assert 0 < len(made) <= 150 and not made.near.any()
 
 
+@pytest.mark.slow
 def test_clipped_echoes_are_injected_where_the_strip_has_some(strip, report, tmp_path):
     assert report.clipped is None
     path = tmp_path / "shore.las"
     simulate_strip("shore", path, pulses=2000, seed=3)
-    found = measure_real(path, injections=3000, stability=False)
+    found = measure_real(path, injections=3000)
     assert found.clipped.injected > 50 and found.clipped.recall > 0.98
     assert found.clipped.extra < 0.05 * found.clipped.injected
+
+
+def test_surveys_of_parts_agree(strip):
+    whole = read_pool(strip)
+    rows = compare_parts(whole, Solver.of_blocks(whole.surveyed), np.random.default_rng(3))
+    assert [row.parts for row in rows] == ["even/odd", "first/last", "west/east", "in order/shuffled"]
+    for row in rows:
+        assert row.differ < 0.02 and row.apart < 0.02 and abs(row.amplitude_ratio - 1) < 0.005
+        assert row.packets == len(whole)
+    assert format_agreement(rows).count("\n") == len(rows)
 
 
 def test_agreement_sees_a_survey_that_is_off(strip):
@@ -198,15 +209,15 @@ def test_a_strip_of_five_packets_gives_one_line(tmp_path):
 
 def test_command_measures_strips_and_goes_on_after_one_that_fails(strip, tmp_path):
     small = make_raw(5, n_samples=60).write(tmp_path / "five.las")
-    words = ["bench", "--real", str(small), str(strip), "--no-stability", "-o", str(tmp_path / "out")]
+    words = ["bench", "--real", str(small), str(strip), "-o", str(tmp_path / "out")]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 1 and "== urban.las" in result.stdout and "five.las" in result.stderr
-    assert "error / reported error" in result.stdout and "surveys of parts" not in result.stdout
+    assert "error / reported error" in result.stdout
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"real-urban.json", "real-urban.txt"} <= names
     document = json.loads((tmp_path / "out" / "real-urban.json").read_text("utf-8"))
     assert document["false_echoes"]["echoes"] > 0
-    result = CliRunner().invoke(main, ["bench", "--real", str(strip), "--no-stability", "--json"])
+    result = CliRunner().invoke(main, ["bench", "--real", str(strip), "--json"])
     assert result.exit_code == 0 and json.loads(result.stdout)["strips"][0]["strip"] == "urban.las"
 
 
@@ -216,9 +227,10 @@ def test_wrong_usage_is_one_line(words, message):
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_real_strips(riegl, leica):
     for path in (riegl, leica):
-        found = measure_real(path, injections=3000, stability=False)
+        found = measure_real(path, injections=3000)
         strong = [row for row in found.quiet_by_count if row.low >= 9]
         assert sum(row.found for row in strong) > 0.99 * sum(row.injected for row in strong) > 500
         assert 0.5 < found.noise.std < 1.5 and found.noise.correlation[0] > 0.3

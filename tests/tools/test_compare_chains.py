@@ -196,6 +196,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(mixed, monkeypatch, arguments, wo
     assert words in result.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_what_the_readme_says_of_the_real_strip(riegl):
     """The after-pulse of nearly every echo is a second maximum: the ASDF passes over it, the pulse explains it."""
     chains = {

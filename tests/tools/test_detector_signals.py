@@ -69,17 +69,6 @@ def test_spikes_have_sums_above_the_threshold():
         assert (signal.second >= signal.values - 1e-3).all()
 
 
-@pytest.mark.parametrize("derivative", ["first", "second"])
-def test_zero_crossings_are_those_of_the_derivative(derivative):
-    for signal in see("detect.zero_crossing", derivative=derivative):
-        for time in signal.found.time.tolist():
-            here = np.interp([time - 1.0, time, time + 1.0], signal.time, signal.values)
-            if derivative == "first":
-                assert here[0] > 0 > here[2] and abs(here[1]) < 0.2 * (here[0] - here[2])
-            else:
-                assert here[1] > 0
-
-
 def test_second_derivative_peaks_pass_its_threshold():
     for signal in see("detect.second_derivative"):
         assert len(signal.found) >= 1

@@ -14,8 +14,8 @@ from writer_tools import data_file, write_source
 import wavebatch as wb
 from wavebatch.cli import main
 from wavebatch.files.las.header import Vlr
-from wavebatch.tools.inspect.account import describe_account
 from wavebatch.tools.inspect.file_facts import describe_file
+from wavebatch.tools.inspect.provenance import describe_provenance
 
 
 @pytest.mark.parametrize("point_format", [0, 1, 3, 6, 8])
@@ -73,7 +73,7 @@ def test_the_command_that_is_shown_makes_the_cloud_again(tiny_strip, tmp_path, m
     words = ["run", "a strip.las", "--columns", "+amplitude_normalized", "--where", "amplitude > 20 and not 'z' == 3",
              "--drop-flags", "WEAK,AT_BOUND", "--classes", "0,1,2", "--bbox", box, "--polygon", "area.json",
              "--points", "returns", "--attenuation", "0.3", "--attenuation-error", "0.1",
-             "--pulse-energy", "energy.txt"]  # fmt: skip
+             "--energy", "energy.txt"]  # fmt: skip
     first = _make(words, "one")
     again = shlex.split(describe_file(Path("one/a strip.laz"))["provenance"][0]["command"])
     assert again[:2] == ["wavebatch", "run"] and again[3:5] == ["-o", "DIR"]
@@ -86,7 +86,7 @@ def test_the_command_that_is_shown_makes_the_cloud_again(tiny_strip, tmp_path, m
 
 def test_the_command_names_where_the_sensor_was():
     sensor = {"trajectory": {"size": 9}, "lever_arm": [0.1, -0.2, 0.3], "crs": "EPSG:32633", "height": None}
-    command = describe_account({"request": {"chain": "auto", "sensor": sensor}})["command"]
+    command = describe_provenance({"request": {"chain": "auto", "sensor": sensor}})["command"]
     assert command.endswith("--trajectory FILE --lever-arm 0.1,-0.2,0.3 --crs EPSG:32633")
 
 

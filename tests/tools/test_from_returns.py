@@ -12,7 +12,8 @@ from wavebatch.cli.simulate import synthesize
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
-from wavebatch.kernels.physics.radar import pass_atmosphere, receive_power, spread_cross_section
+from wavebatch.kernels.physics.radar import receive_power, spread_cross_section
+from wavebatch.kernels.physics.radiometry import transmit
 from wavebatch.surveying.inspect_strip import check_file
 from wavebatch.tools.compare.clouds import compare_clouds
 from wavebatch.tools.simulate import DiscreteReceiver, StripOptions, return_light, simulate_returns
@@ -129,9 +130,8 @@ def test_lidar_equation_for_a_surface_that_fills_the_footprint():
     distance = np.array([300.0, 800.0, 3000.0])
     figures = {"transmitted": 4000.0, "aperture": 0.1, "efficiency": 0.4, "attenuation": 0.3}
     power = receive_power(spread_cross_section(0.3, distance, 7e-4), distance, divergence=7e-4, **figures)
-    through = pass_atmosphere(distance, 0.3)
+    through = transmit(0.5 * distance, 0.3)
     assert power == pytest.approx(4000 * 0.1**2 * 0.3 * 0.4 * through**2 / (4 * distance**2), rel=1e-12)
-    assert pass_atmosphere(np.array([1000.0]), 0.22) ** 2 == pytest.approx([0.904], abs=5e-4)
 
 
 def test_reflectances_are_weakened_with_range(tmp_path):

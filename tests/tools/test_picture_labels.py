@@ -64,6 +64,7 @@ def check(texts):
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "show"), [(1, None), (1, "asdf"), (4, None), (4, "deconvolved")])
 def test_waveforms_with_crowded_echoes(texts, tmp_path, number, show):
     echoes = [(100.0, 30.0, 2.0), (80.0, 36.0, 2.0), (60.0, 42.0, 2.0), (50.0, 47.5, 2.0), (20.0, 60.0, 2.0)]
@@ -77,6 +78,7 @@ def test_waveforms_with_crowded_echoes(texts, tmp_path, number, show):
     check(texts)
 
 
+@pytest.mark.slow
 def test_histograms_maps_sections_and_profiles(texts, tmp_path):
     rng = np.random.default_rng(1)
     value = rng.normal(50, 10, 3000).astype("f4")
@@ -96,6 +98,7 @@ def test_histograms_maps_sections_and_profiles(texts, tmp_path):
     check(texts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(2.0, 700.0), (700.0, 2.0), (0.5, 0.5)])
 def test_maps_of_any_shape(texts, tmp_path, shape):
     path = write_cloud(tmp_path / "c.las", n=2000)
@@ -108,6 +111,7 @@ def test_maps_of_any_shape(texts, tmp_path, shape):
     check(texts)
 
 
+@pytest.mark.slow
 def test_slices_and_cubes(texts, tmp_path, riegl):
     words = ["slice", riegl, "--lines", "0:6", "--shortest", "10", "--png", tmp_path / "a.png"]
     words += ["--overview", tmp_path / "b.png", "--cube", tmp_path / "c.npz"]

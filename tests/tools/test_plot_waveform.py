@@ -47,8 +47,7 @@ def test_curves_are_the_fit_of_every_decomposer(name):
     block = simulate(shape, [(100.0, 30.3, 2.0)])
     views = build_views(block, make_chain(name, **parameters), system, range(len(block)))
     assert len(views) == 20
-    # A log-normal that begins with the samples of the echo has a skew that this pulse has not.
-    worst = {"decompose.asdf_only": 4.0, "decompose.log_normal": 5.0}.get(name, 1.25)
+    worst = {"decompose.asdf_only": 4.0}.get(name, 1.25)
     for view in views:
         assert len(view.echoes) == 1 and view.curves.shape == (1, len(view.fine))
         near = np.abs(view.time - 30) <= 5
@@ -352,6 +351,7 @@ def test_labels_of_the_benchs_plot_do_not_overlap(tmp_path):
             assert not box.overlaps(other)
 
 
+@pytest.mark.slow
 def test_random_packets_are_those_of_their_seed_and_fit_on_a_sheet(tiny_strip, tmp_path):
     with StripReader(tiny_strip) as reader, reader.scan() as scan:
         drawn = [

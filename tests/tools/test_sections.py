@@ -11,12 +11,13 @@ from plot_tools import write_cloud
 
 from wavebatch.cli import main
 from wavebatch.core.errors import ConfigError, InputError
+from wavebatch.core.units import HALF_C
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.tools.plots import section_data
 from wavebatch.tools.plots.section_data import cut_section, measure_profile
 from wavebatch.tools.plots.values import Selection
-from wavebatch.tools.slices.cube import build_cube, cut_cube
-from wavebatch.tools.slices.lines import read_scan_lines
+from wavebatch.tools.slices.cube import align_pulses, build_cube, cut_cube
+from wavebatch.tools.slices.lines import ScanLine, read_scan_lines
 from wavebatch.tools.slices.output import SegmentWriter
 from wavebatch.tools.slices.read_segments import profile_segments
 from wavebatch.tools.slices.segments import Segment
@@ -137,16 +138,17 @@ def test_the_cube_has_every_sample_on_one_axis_of_time(riegl):
         lines = list(read_scan_lines(reader, scan))[:6]
     cube = build_cube(lines, "c.npz")
     values, time, spacing = cube["values"], cube["time"], lines[0].spacing
-    assert values.shape == (6, max(map(len, lines)), len(time)) and np.diff(time) == pytest.approx(spacing)
+    columns = align_pulses(lines)
+    assert values.shape == (6, 1 + max(map(max, columns)), len(time)) and np.diff(time) == pytest.approx(spacing)
     assert np.isfinite(values).sum() == sum(len(line.row) for line in lines)
     for i, line in enumerate(lines):
         for pulse in (0, len(line) // 2, len(line) - 1):
-            mine = line.row == pulse
-            there = np.flatnonzero(np.isfinite(values[i, pulse]))
-            assert np.array_equal(values[i, pulse, there], line.value[mine])
+            mine, column = line.row == pulse, columns[i][pulse]
+            there = np.flatnonzero(np.isfinite(values[i, column]))
+            assert np.array_equal(values[i, column, there], line.value[mine])
             # Where a sample lies in space follows from its time alone: all pulses start at one plane.
-            at = time[there] + cube["offset"][i, pulse] - line.time[mine]
-            assert np.ptp(at) < 1e-4 and abs(cube["offset"][i, pulse]) <= 0.51 * spacing
+            at = time[there] + cube["offset"][i, column] - line.time[mine]
+            assert np.ptp(at) < 1e-4 and abs(cube["offset"][i, column]) <= 0.51 * spacing
     starts = [line.origin[0] - at for line, at in zip(lines, _starts(cube, lines), strict=True)]
     mean = np.mean(
         [line.direction.mean(axis=0) / np.linalg.norm(line.direction.mean(axis=0)) for line in lines], axis=0
@@ -157,8 +159,31 @@ def test_the_cube_has_every_sample_on_one_axis_of_time(riegl):
 def _starts(cube, lines):
     """Way from the common plane to sample 0 of the first pulse of each line [m]."""
     for i, line in enumerate(lines):
-        first = np.flatnonzero(np.isfinite(cube["values"][i, 0]))[0]
-        yield (cube["time"][first] + cube["offset"][i, 0] - line.time[0]) * line.direction[0]
+        column = align_pulses(lines)[i][0]
+        first = np.flatnonzero(np.isfinite(cube["values"][i, column]))[0]
+        yield (cube["time"][first] + cube["offset"][i, column] - line.time[0]) * line.direction[0]
+
+
+def _sweep(number, angles):
+    """A scan line of one sample per pulse, which holds the scan angle [deg], under a sensor 100 m above the ground."""
+    n, turn = len(angles), np.radians(angles)
+    direction = HALF_C * np.stack([np.sin(turn), np.zeros(n), -np.cos(turn)], axis=1)
+    origin = np.tile([0.0, 5.0 * number, 100.0], (n, 1))
+    row = np.arange(n)
+    return ScanLine(number, row, row * 1e-5, origin, direction, 1.0, row, np.zeros(n), np.asarray(angles, "f4"))
+
+
+def test_lines_of_an_oscillating_mirror_are_aligned_by_scan_angle():
+    """To and fro, with steps that shrink at the turns; one line begins late, one ends early."""
+    swing = 15 * np.sin(np.linspace(-0.45, 0.45, 61) * np.pi)
+    lines = [_sweep(0, swing), _sweep(1, swing[::-1]), _sweep(2, swing[20:]), _sweep(3, swing[:35][::-1])]
+    values = build_cube(lines, "c.npz")["values"].max(axis=2)
+    for column, angle in enumerate(swing):
+        known = values[np.isfinite(values[:, column]), column]
+        assert len(known) == 2 + (column >= 20) + (column < 35) and np.abs(known - angle).max() < 1e-4
+    assert values.shape == (4, 61)
+    level = [_sweep(0, np.zeros(5)), _sweep(1, np.zeros(3))]
+    assert [column.tolist() for column in align_pulses(level)] == [[0, 1, 2, 3, 4], [0, 1, 2]]
 
 
 def test_slices_of_the_cube(tmp_path):

@@ -331,3 +331,11 @@ def test_strips_too_short_for_a_scan_line_say_so(tiny_strip, tmp_path):
     none = cut_strip(tiny_strip, tmp_path / "none.las", 0)
     done = CliRunner().invoke(main, ["slice", str(none), "-o", str(tmp_path / "y.csv")])
     assert done.exit_code == 0 and "none.las: has no waveform, so no scan line\n" in done.stderr
+
+
+def test_lines_with_as_many_segments_as_allowed_are_counted_and_said(riegl, tmp_path):
+    words = ["slice", str(riegl), "--lines", "0:6", "-o", str(tmp_path / "s.csv"), "--json", "--overwrite", "--most"]
+    few, many = (CliRunner().invoke(main, [*words, most]) for most in ("1", "50"))
+    found = json.loads(few.stdout)
+    assert found["full"] == found["segments"] > 0 and f"{found['full']} scan lines may have more" in few.stderr
+    assert json.loads(many.stdout)["full"] == 0 and "may have more" not in many.stderr

@@ -1,5 +1,6 @@
 """Distances are metres whatever the unit of the coordinates is: state planes are in feet."""
 
+import base64
 import json
 import re
 import shutil
@@ -114,8 +115,9 @@ def test_a_foot_in_the_crs_of_a_strip_in_metres_does_not_stop_it(tmp_path):
 @pytest.mark.parametrize(("unit", "name"), [("m", "m"), ("ft", "us-ft"), ("deg", "deg")])
 def test_maps_of_report_pages_name_the_unit(clouds, unit, name):
     maps = picture_cloud(clouds[unit], ["amplitude"])[1]
-    assert len(maps) == 2 and all(f"{name} east" in one and re.search(rf"cells of \S+ {name};", one) for one in maps)
-    assert f"1/{name}2;" in maps[0]
+    drawn = [base64.b64decode(re.search(r'base64,([^"]+)', one)[1]).decode() for one in maps]
+    assert len(maps) == 2 and all(re.search(rf"Cells of \S+ {name};", one) for one in maps)
+    assert all(f"east [{name}]" in one for one in drawn) and f"[1/{name}2]" in drawn[0]
 
 
 @pytest.mark.parametrize("unit", ["ft", "deg"])

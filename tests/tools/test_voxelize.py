@@ -118,6 +118,7 @@ def test_energy_is_that_of_the_echoes(scene, least, most, seed):
     assert least < energy / np.sum(truth.amplitude * truth.sigma * SQRT_2PI) < most
 
 
+@pytest.mark.quick_cases("1-leica*", "*leica-1*")
 @pytest.mark.parametrize("name", ["riegl", "leica"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_energy_of_learned_pulses_is_that_of_the_waveforms(name, seed):
@@ -361,6 +362,7 @@ def test_light_goes_out_along_the_ray_and_empty_voxels_are_written_on_request(tm
         assert np.array_equal(some[name], every[name][kept])
 
 
+@pytest.mark.quick_cases("v.laz")
 @pytest.mark.parametrize("target", ["v.npz", "v.laz"])
 def test_the_same_bytes_for_any_block_and_any_memory(forest, tmp_path, target, monkeypatch):
     strip, _ = forest
@@ -560,6 +562,7 @@ def write_canopy(path, rng, *, leaf, soil, slope=0.0, n=900, full=180.0, layers=
     return left.mean()
 
 
+@pytest.mark.quick_cases("20.0-0.15-0.5")
 @pytest.mark.parametrize(("leaf", "soil"), [(0.5, 0.15), (0.3, 0.3), (0.15, 0.5)])
 @pytest.mark.parametrize("slope", [0.0, 20.0])
 def test_gap_probability_does_not_depend_on_what_leaf_and_ground_reflect(tmp_path, leaf, soil, slope):
@@ -629,6 +632,7 @@ def test_32_bit_samples_do_not_overflow(tmp_path):
     assert found["energy"].max() > 0.9 * summary.energy
 
 
+@pytest.mark.slow
 def test_real_strips(riegl, leica, tmp_path):
     for path, waveforms in ((riegl, 2375), (leica, 999)):
         summary, found = voxelize(path, tmp_path / "v.npz", 0.5, system=None, overwrite=True)

@@ -96,6 +96,8 @@ class RunReport:
     """Points written per flag."""
     no_data: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     """Echoes per column that can lack values and per reason in no_data.NoData; KNOWN counts those with a value."""
+    above_one: int = 0
+    """Echoes that reflect more than a white matt surface, level or facing the sensor."""
     remarks: tuple[str, ...] = ()
     """Lines about the strip as a whole, from `explain`."""
     echoes_per_waveform: np.ndarray = _zeros(OVERFLOW + 1)
@@ -178,6 +180,7 @@ class RunReport:
             "remarks": list(self.remarks),
             "quality": {
                 "echoes_per_waveform": [int(n) for n in self.echoes_per_waveform],
+                "reflectance_above_one": self.above_one,
                 **{name: _histogram_json(_BINS[name], counts) for name, counts in histograms.items()},
             },
         }
@@ -196,6 +199,7 @@ class RunReport:
                 column: {name: int(n) for name, n in reasons.items()} for column, reasons in counts["no_data"].items()
             },
             remarks=tuple(str(line) for line in document["remarks"]),
+            above_one=int(quality.get("reflectance_above_one", 0)),
             echoes_per_waveform=np.array(quality["echoes_per_waveform"], np.int64).reshape(OVERFLOW + 1),
             amplitude=amplitude,
             echo_width=echo_width,

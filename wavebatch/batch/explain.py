@@ -14,6 +14,7 @@ from wavebatch.batch.unit import Prepared
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.cloud.column_names import describe_roundings
+from wavebatch.stages.decompose.rebuild import loop_model
 from wavebatch.surveying.angle_limits import AngleOutlook, angle_parameters, predict_angles
 from wavebatch.surveying.measuring.noise_and_width import FEW
 from wavebatch.surveying.sensor import SensorSource
@@ -42,8 +43,24 @@ _NEEDS: dict[str, tuple[NoData, ...]] = {
 FASTEST = 120.0
 """Speed of a sensor above which its coordinates are doubted [m/s]: survey aircraft fly at 40 to 100, in feet 130 up."""
 
+JETS = 5000.0
+"""Height of a sensor above the points from which a speed beyond FASTEST is believed where a CRS says metres [m]."""
+
+MOST_ABOVE_ONE = 0.03
+"""Share of the reflectances above 1 from which a warning is printed."""
+
 MOST_GAPS = 3
 """Most gaps of a trajectory that a remark lists."""
+
+
+def _name_model(prepared: Prepared) -> list[str]:
+    """The pulse that a residual loop takes from the survey where the chain names none."""
+    step = prepared.job.chain.steps[2]
+    model = step.effective().get("model")
+    if model != "auto":
+        return []
+    fitted = loop_model(prepared.system, model)
+    return [f'{step.stage.name} fits the pulse of the survey: model = "{fitted}"']
 
 
 def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
@@ -67,6 +84,7 @@ def find_remarks(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _find_gaps(prepared.sensor, report.no_data)
     lines += _doubt_units(prepared)
     lines += _name_height(prepared)
+    lines += _name_model(prepared)
     lines += [*prepared.layout.notes, *describe_roundings(prepared.layout.written), *_name_copied(prepared, report)]
     for column, counts in sorted(report.no_data.items()):
         known, total = counts.get(NoData.KNOWN.name, 0), sum(counts.values())
@@ -106,6 +124,7 @@ def find_warnings(prepared: Prepared, report: RunReport) -> tuple[str, ...]:
     lines += _miss_all(prepared, report)
     lines += _find_nothing(prepared, report)
     lines += _doubt_pulse(prepared, report)
+    lines += _doubt_reflectance(report)
     if not choice.doubted or not echoes:
         return tuple(lines)
     share, (_, best) = choice.false_share, choice.predictions
@@ -153,6 +172,17 @@ def _doubt_pulse(prepared: Prepared, report: RunReport) -> Iterator[str]:
         )
 
 
+def _doubt_reflectance(report: RunReport) -> Iterator[str]:
+    """More reflectances above 1 than metal, signs and wet roofs explain."""
+    known = max(report.no_data.get(name, {}).get(NoData.KNOWN.name, 0) for name in ("level_reflectance", "reflectance"))
+    if report.above_one > MOST_ABOVE_ONE * known > 0:
+        share = f"{100 * report.above_one / known:.0f} %"
+        yield (
+            f"{share} of the reflectances exceed 1, that of a white matt surface: the calibration is of another sensor "
+            "or setting, a target's reflectance is wrong, or coordinates are not in metres"
+        )
+
+
 def _name_height(prepared: Prepared) -> Iterator[str]:
     """A flight height that was not needed."""
     height, sensor = prepared.job.sensor.height, prepared.sensor
@@ -186,12 +216,14 @@ def _doubt_waveforms(prepared: Prepared, report: RunReport) -> Iterator[str]:
 def _doubt_units(prepared: Prepared) -> Iterator[str]:
     """An aircraft that is too fast: its strip may be in feet without saying so."""
     facts = dict(prepared.sensor.facts)
-    named = any(unit.horizontal is not None or unit.kind is not None for unit in prepared.facts.units)
-    if prepared.sensor.kind != "trajectory" and not named and facts.get("speed_m_s", 0.0) > FASTEST:
+    named = any(unit.horizontal is not None for unit in prepared.facts.units)
+    if named and facts.get("height_m", 0.0) > JETS:
+        return
+    if prepared.sensor.kind != "trajectory" and facts.get("speed_m_s", 0.0) > FASTEST:
         yield (
             f"range: if coordinates are in metres, the sensor flies at {facts['speed_m_s']:.0f} m/s, "
-            f"{facts['height_m']:.0f} m above the points; no CRS says so: are they in feet? Then ranges are 3.28 times "
-            "too long: project the strip to metres"
+            f"{facts['height_m']:.0f} m above the points, whatever a CRS says: are they in feet? Then ranges are "
+            "3.28 times too long: project the strip to metres"
         )
 
 

@@ -59,7 +59,7 @@ class StripJob:
     """Of the air during the flight and its standard deviation [dB/km]; None: of the calibration, or the default."""
 
     pulse_energy: str | None = None
-    """Extra byte, or text file by GPS time, with the energy of each emitted pulse."""
+    """Extra byte, or text file by GPS time, with the energy of each emitted pulse; see `find_pulse_energy`."""
     selection: Selection = Selection()
     """What is written."""
 

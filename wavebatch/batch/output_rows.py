@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from wavebatch.files.cloud.layout import OutputLayout
     from wavebatch.files.strip.reader import Unit
 
+_REFLECTING = ("level_reflectance", "reflectance", "facing_reflectance")
+"""Columns that no matt surface has above 1."""
+
 NEEDED = ("x", "y", "z", "point")
 """Attribute columns that every point needs."""
 
@@ -329,10 +332,12 @@ def _count(
         "unmatched_returns": inside & has_echoes & ~found,
         "points_out": len(flags),
     }
+    above = np.any([table.attributes[name] > 1 for name in _REFLECTING if name in table.attributes], axis=0)
     report = RunReport(
         counts={name: n if isinstance(n, int) else int(np.count_nonzero(n)) for name, n in counts.items()},
         passed_through=count_flags(reason),
         flags=count_flags(flags),
         no_data=count_reasons(table.attributes),
+        above_one=int(np.count_nonzero(above)),
     )
     return report + RunReport.of_echoes(per_packet[:-1][owned], table.amplitude, table.sigma)

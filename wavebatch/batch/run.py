@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.files.disk.protect import protecting
 from wavebatch.files.disk.publish import remove_stale, reporting
 from wavebatch.files.text_file import write_text
+from wavebatch.kernels.library import load as load_kernels
 from wavebatch.surveying import Survey
 from wavebatch.surveying.flight import read_samples, survey_flight, surveys_agree
 from wavebatch.surveying.system_file import SavedSurvey, format_survey, parse_survey
@@ -114,13 +115,14 @@ def run_batch(
 
     Raises
     ------
-    ConfigError
-        Before any work.
+    ConfigError, InputError
+        Before any work; InputError if the compiled kernels cannot be loaded, which each strip would report else.
     KeyboardInterrupt
         After temporary files were removed.
     """
     start = time.perf_counter()
     check_outputs(jobs, options)
+    load_kernels()
     saved = load_flight(jobs, options)
     workers: Workers | Cluster = Workers(options.jobs)
     if options.scheduler is not None:
@@ -141,7 +143,7 @@ def run_batch(
 
 
 def _drop_flight(folder: Path) -> None:
-    """Remove the survey of a flight of which no cloud came: the next run, perhaps of other strips, would use it."""
+    """Remove the survey of a flight if no cloud was written: the next run, perhaps of other strips, would use it."""
     if not any(folder.glob("*.report.json")):
         with contextlib.suppress(OSError):
             flight_path(folder).unlink(missing_ok=True)
@@ -309,4 +311,5 @@ class _Batch:
             if strip.prepared is not None:
                 lost = [*strip.prepared.scan.losses, *strip.prepared.doubts]
                 more |= {"sensor": strip.prepared.sensor.describe(), "doubts": lost}
+                more["decisions"] = [asdict(decision) for decision in strip.prepared.choice.decisions]
             self._tell({**event, **more})

@@ -28,10 +28,11 @@ from wavebatch.files.strip.reader import StripFacts, StripReader, StripScan, Uni
 from wavebatch.stages.chain import Chain, Step
 from wavebatch.surveying.angle_limits import angle_parameters, sample_reference
 from wavebatch.surveying.auto_chain import without_columns
+from wavebatch.surveying.calibrating.setting import check_energies
 from wavebatch.surveying.calibrating.strip_match import match_strip
 from wavebatch.surveying.calibration import needs_sensor
 from wavebatch.surveying.choose_chain import Choice, make_choice, try_chain
-from wavebatch.surveying.flat_ground import choose_radius
+from wavebatch.surveying.flat_ground import choose_radius, measure_slope
 from wavebatch.surveying.flight import hold_strip
 from wavebatch.surveying.sensor import UNKNOWN, SensorRequest, SensorSource, find_sensor, judge_scale, refuse_units
 from wavebatch.surveying.systems.saved_check import check_saved
@@ -41,6 +42,9 @@ BLOCK_SAMPLES = 1 << 22
 
 USUAL_SAMPLES = 256
 """Waveforms of more samples than this count several times where --block-size is given."""
+
+STEEP = 80.0
+"""Largest slope that the error of a level reflectance holds [deg]."""
 
 LARGEST_HEIGHT_ERROR = 0.3
 """Largest logarithm of the ratio of two flight heights: a user knows the one planned, not that above each hill."""
@@ -152,8 +156,10 @@ def prepare_strip(job: StripJob) -> Prepared:
             _hold_height(reader, job.sensor, sensor)
             choice, more = _see_level(reader, scan, job, choice, sensor)
             doubts += more
-            job = replace(job, chain=_set_radius(reader, scan, job.chain))
-            energy = None if job.pulse_energy is None else find_pulse_energy(reader, scan, job.pulse_energy)
+            job = replace(job, chain=_set_parameters(reader, scan, job.chain))
+            energy = find_pulse_energy(reader, scan, job.pulse_energy) if needs_sensor(job.chain) else None
+            if job.pulse_energy is not None and energy is not None:
+                check_energies(reader, scan, energy)
             layout = plan_layout(job, facts)
             RowSelector(job.selection, job.chain, layout).check()
             units = reader.unit_count()
@@ -167,14 +173,17 @@ def prepare_strip(job: StripJob) -> Prepared:
     return replace(prepared, forced=forced)
 
 
-def _set_radius(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
-    """The chain with a radius in place of one of 0, which means that the distance between the points decides."""
-    steps = [
-        replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
-        if step.stage.second_pass is not None and step.effective()["radius"] == 0
-        else step
-        for step in chain.steps
-    ]
+def _set_parameters(reader: StripReader, scan: StripScan, chain: Chain) -> Chain:
+    """The chain with what the strip decides: a radius in place of one of 0, by the distance between the points; and in
+    the error of level reflectances, where no slope is given, the strip's slopes."""
+    steps = []
+    for step in chain.steps:
+        if step.stage.second_pass is not None and step.effective()["radius"] == 0:
+            step = replace(step, parameters={**step.parameters, "radius": choose_radius(reader, scan)})
+        elif step.stage.name == "attribute.level_reflectance" and not step.parameters:
+            slope = max(step.effective()["slope"], round(measure_slope(reader, scan), 1))
+            step = replace(step, parameters={"slope": min(slope, STEEP)})
+        steps.append(step)
     return replace(chain, steps=tuple(steps))
 
 
@@ -207,7 +216,8 @@ def _fit_calibration(
     """The job with the calibration as it holds for this strip, and warnings; InputError where it does not fit."""
     if job.calibration is None:
         return job, ()
-    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain)
+    air = None if job.attenuation is None else job.attenuation[0]
+    fitted = match_strip(job.calibration, reader, scan, choice.survey.system, sensor, job.chain, air)
     return replace(job, calibration=fitted.calibration), fitted.warnings
 
 

@@ -20,6 +20,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "info": ("wavebatch.cli.inspect:info", "Show points, packets, descriptors and samples of a strip."),
     "check": ("wavebatch.cli.inspect:check", "Check strips and chain files; one line per problem."),
     "survey": ("wavebatch.cli.survey:survey", "Measure noise, pulse and scene of a strip; choose its chain."),
+    "import": ("wavebatch.cli.archives.import_files:import_", "Make strips of PulseWaves files."),
+    "export": ("wavebatch.cli.archives.export:export", "Write strips for other programs: repaired LAS, or arrays."),
     "stages": ("wavebatch.cli.stages:stages", "List the algorithms, or explain one with its parameters."),
     "simulate": ("wavebatch.cli.simulate:simulate", "Simulate a strip with known echoes."),
     "compare": ("wavebatch.cli.compare:compare", "Compare clouds or chains with each other, returns or truth."),

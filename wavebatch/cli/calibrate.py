@@ -5,6 +5,7 @@ Only reads options and prints; the work is in `wavebatch.surveying.calibrating.t
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,12 +40,15 @@ if TYPE_CHECKING:
               help="Attenuation of the air, one way [dB/km].")
 @click.option("--divergence", type=click.FloatRange(0.001, 100.0), metavar="MRAD",
               help="Full angle of the beam between the 1/e^2 points [mrad]; cross sections need it.")
+@click.option("--scan-angle", is_flag=True,
+              help="Fit how the light falls with the scan angle, where strips overlap; `run` takes it off.")
 @shared.output_option("Also write constants, drifts and overlaps of the strips as JSON.", "FILE", "--report",
                       required=False)
 @shared.output_option("Also draw drifts and overlaps of the strips (PNG, SVG or PDF).", "FILE", "--plot",
                       required=False)
 @shared.chain_options
 @shared.system_option
+@shared.energy_option
 @shared.sensor_options
 @shared.direction_option
 @shared.html_option
@@ -99,6 +103,9 @@ def calibrate(
         talk(line)
     for line in [*map(_describe_strip, found.strips), *map(_describe_pair, flight.pairs)]:
         talk(line)
+    if found.swath:
+        edge = math.expm1(-sum(found.swath[1:]))
+        talk(f"scan angle: {100 * edge:+.1f} % light at {math.degrees(found.swath[0]):.1f} deg against straight down")
     for note in found.notes:
         talk(f"warning: {note}")
     numbers = f"constant {format_relative(found.constant, found.relative_error)} +- {100 * found.relative_error:.1f} %"
@@ -114,7 +121,7 @@ def _read_options(options: dict[str, Any]) -> CalibrationOptions:
 
     chain, request = find_request(options["chain_file"] or options["profile"], system=options["system_file"])
     request = replace(request, force=options["force"])
-    names = ("attenuation", "divergence", "reflectance_error", "direction")
+    names = ("attenuation", "divergence", "reflectance_error", "direction", "energy", "scan_angle")
     figures = {name: options[name] for name in names}
     return CalibrationOptions(sensor=shared.read_sensor(options), chain=chain, request=request, **figures)
 

@@ -53,7 +53,7 @@ _TIME = {"type": click.FloatRange(0.0), "metavar": "NS"}
               help="Compare incidence angles from echo widths with those from normals: both of A, or of A and B.")
 @click.option("--overlap", is_flag=True,
               help="Compare brightness and height of the clouds of two strips, A and B, where they overlap.")
-@where_option("Compare two clouds at the points of both")
+@where_option("Compare at the points of both clouds, or at those of A with --truth (all true echoes count)")
 @click.option("--tolerance", type=float, metavar="NS",
               help="Largest time difference of the same echo [ns].  [default: 1; with --truth: 1.5]")
 @click.option("--min-completeness", **_SHARE, help="Least share of B's echoes that A has.")
@@ -153,9 +153,7 @@ def _compare(a: Path, b: Path | None, truth: Path | None, options: dict) -> Comp
     if b is not None and b.suffix.lower() == ".npz":
         raise click.UsageError(f"{b} looks like a truth file; give it with --truth")
     if truth:
-        if options["where"] is not None:
-            raise click.UsageError("--where is for two clouds; a truth has no such columns")
-        return compare_truth(a, truth, **_tolerance(options))
+        return compare_truth(a, truth, **_tolerance(options), where=options["where"])
     return compare_clouds(a, b, **_tolerance(options), where=options["where"])
 
 

@@ -122,8 +122,8 @@ def _list_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield f"format         {kind} {facts['las_version']}, point format {facts['point_format']}"
     made = [facts["system_identifier"], facts["generating_software"], facts["created"]]
     yield f"made by        {', '.join(part for part in made if part) or 'not said'}"
-    for account in facts["provenance"]:
-        yield from _account_lines(account)
+    for run in facts["provenance"]:
+        yield from _provenance_lines(run)
     yield f"CRS            {_shorten(facts['crs'] or 'none')}"
     yield f"points         {facts['points']}"
     if "counts" in facts:
@@ -144,12 +144,12 @@ def _list_lines(facts: dict[str, Any]) -> Iterator[str]:
     yield from (f"problem        {line}" for line in facts["problems"])
 
 
-def _account_lines(account: dict[str, Any]) -> Iterator[str]:
-    yield f"command        {account['command']}  (wavebatch {account['version']})"
-    stages = [line.split('"')[1] for line in str(account["chain"] or "").splitlines() if line.startswith("stage =")]
+def _provenance_lines(run: dict[str, Any]) -> Iterator[str]:
+    yield f"command        {run['command']}  (wavebatch {run['version']})"
+    stages = [line.split('"')[1] for line in str(run["chain"] or "").splitlines() if line.startswith("stage =")]
     if stages:
-        yield f"chain          {', '.join(stages)}; chosen by {account['chosen_by']}"
-    columns = [name if name == stored else f"{name} as {stored}" for name, stored in account["columns"].items()]
+        yield f"chain          {', '.join(stages)}; chosen by {run['chosen_by']}"
+    columns = [name if name == stored else f"{name} as {stored}" for name, stored in run["columns"].items()]
     if columns:
         yield f"columns        {', '.join(columns)}"
 

@@ -134,6 +134,12 @@ system_option = together(
     click.option("--force", is_flag=True, help="Use the survey of --system also where bits, noise or echo width of the "
                  "strip contradict it."),
 )  # fmt: skip
+energy_option = click.option(
+    "--energy", metavar="COLUMN|FILE|none",
+    help="Energy of each emitted pulse, which backscatter and normalized amplitudes are divided by: an extra byte of "
+    "the strips, or a text file with columns time (GPS time of the points) and energy; none: not divided.  [default: "
+    "the extra byte pulse_energy, where it is there]",
+)  # fmt: skip
 calibration_option = file_option(
     "--calibration", "calibration_file",
     text="Calibration file of `wavebatch calibrate`: adds calibrated columns; cross sections need its divergence.",
@@ -146,9 +152,7 @@ air_options = together(
                  help="Meteorological visibility during the flight [km], in place of --attenuation."),
     click.option("--wavelength", type=click.FloatRange(300.0, 2500.0), metavar="NM",
                  help="Wavelength of the laser [nm], for --visibility.  [default: 1064]"),
-    click.option("--pulse-energy", metavar="NAME|FILE",
-                 help="Energy of each emitted pulse: an extra byte of the strips, or a text file with columns time "
-                 "(GPS time of the points) and energy. Backscatter and normalized amplitudes are divided by it."),
+    energy_option,
     click.option("--attenuation-error", type=click.FloatRange(0.0, 100.0), metavar="DB_KM",
                  help="Standard deviation of the attenuation [dB/km]: goes into the errors.  [default: 0]"),
 )  # fmt: skip
@@ -302,9 +306,14 @@ def floats_reader(form: str) -> Callable[[click.Context, click.Parameter, str | 
     return lambda context, parameter, text: None if text is None else parse_floats(text, form)
 
 
-def for_each(paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False) -> tuple[list[Any], int]:
-    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr."""
-    if len(paths) == 1:
+def for_each(
+    paths: Sequence[Path], work: Callable[[Path], Any], *, debug: bool = False, alone: bool = False
+) -> tuple[list[Any], int]:
+    """The results of `work` for the paths, and how many failed: with several, one that fails is one line on stderr.
+
+    alone: a single one that fails is such a line too.
+    """
+    if len(paths) == 1 and not alone:
         return [work(paths[0])], 0
     results, failed = [], 0
     for path in paths:

@@ -88,8 +88,8 @@ def _read_classes(context: click.Context, parameter: click.Parameter, text: str 
               "e.g. 0.02m.")
 @system_option
 @click.option("--survey", type=click.Choice(["each", "flight"]), default="each", show_default=True,
-              help="Survey each strip by itself, or all strips once: kept as DIR/flight.system.toml, used again with "
-              "--resume and for later strips; a strip that does not fit it is named and surveyed by itself.")
+              help="Survey each strip alone, or all strips once: kept as DIR/flight.system.toml, used again with "
+              "--resume and for later strips; a strip that does not fit it is named and surveyed alone.")
 @sensor_options
 @calibration_option
 @air_options
@@ -206,7 +206,7 @@ def _check_report(report: Path, jobs: list[Any], batch_options: Any, option: str
 
 
 _PASSED_ON = (
-    "pulse_energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
+    "energy", "columns", "points", "point_format", "las_version", "names", "no_data", "strict", "keep_packets",
     "direction", "headerless", "scheduler", "memory", "block_size", "overwrite", "resume", "where", "drop_flags",
     "classes", "bbox", "polygon",
 )  # fmt: skip

@@ -256,7 +256,7 @@ def _list_light(summary: SynthesisSummary, settings: SynthesisOptions) -> Iterat
         found = f"{light.own_share} of the cloud, {light.assumed_share} assumed"
         yield f"shares: {found}; the returns of a pulse take {summary.light_used:.1%} of its light on average"
     if settings.shares == EQUAL and summary.scattered:
-        yield "note: equal shares count the returns that the points state, also those that the cloud lacks"
+        yield "note: equal shares use number_of_returns, including missing returns"
     elif light.pulses and summary.scattered:
         yield "note: shares of incomplete pulses are those of the points that are there in a row"
     if light.over_one:

@@ -155,6 +155,9 @@ def _slice(
     found = f"{count(counts['segments'], 'segment')} in {count(counts['lines'], 'scan line')}"
     if not options["quiet"]:
         talk(f"{strip}: {found} of {count(counts['pulses'], 'pulse')}")
+        if counts["full"]:
+            talk(f"{strip}: {count(counts['full'], 'scan line')} may have more segments than --most {settings.most}; "
+                 "raise it")  # fmt: skip
     return {"strip": str(strip), **counts}
 
 
@@ -170,7 +173,7 @@ def _find(
 ) -> dict[str, Any]:
     """Writes the segments of the wanted lines; returns their counts."""
     first, end = lines
-    counts = {"lines": 0, "pulses": 0, "segments": 0, "sigma": settings.sigma}
+    counts = {"lines": 0, "pulses": 0, "segments": 0, "full": 0, "sigma": settings.sigma}
     with ExitStack() as stack:
         writer, every = None, []
         cube = CubeBuilder(extras.cube) if extras.cube else None
@@ -192,6 +195,7 @@ def _find(
             counts["lines"] += 1
             counts["pulses"] += len(line)
             counts["segments"] += len(segments)
+            counts["full"] += len(segments) >= settings.most
         if extras.targets and not counts["lines"]:
             raise InputError(f"{extras.targets[0]}: not written, because no scan line has a number in --lines")
         if extras.overview:
@@ -206,7 +210,7 @@ def _find(
 
 def _draw_overview(segments: list[Segment], target: Path, reader: StripReader, lines: int, overwrite: bool) -> None:
     """Draws the segments of all lines; InputError without any."""
-    from wavebatch.files.las.crs_name import describe_crs
+    from wavebatch.files.las.crs import describe_crs
     from wavebatch.tools.slices.draw import draw_segments
 
     if not segments:

@@ -112,7 +112,7 @@ def _list_lines(found: ReturnStats) -> Iterator[str]:
         yield from _list_zones(found)
     if found.several:
         pulses = count(found.several, "pulse")
-        yield f"depth          {found.depth:.3f} m, mean height of the first above the last return of {pulses}"
+        yield f"first to last  {found.depth:.3f} m, mean height of the first above the last return of {pulses}"
     for name, number in (found.flags or {}).items():
         if number:
             yield f"{name:<22}  {number:>10}"

@@ -57,6 +57,7 @@ _SENSOR = ("trajectory", "lever_arm", "crs", "flight_height")
 @click.option("--all-crossed", is_flag=True, help="Also write voxels that rays crossed without any signal.")
 @shared.system_option
 @shared.calibration_option
+@shared.energy_option
 @shared.sensor_options
 @shared.strip_options
 @shared.common_options("overwrite", "json", "quiet")

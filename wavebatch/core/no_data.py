@@ -15,6 +15,8 @@ import numpy as np
 
 from wavebatch.core.units import LEAST_PULSE_WIDTH
 
+_UNSETTLED_REMEDY = "try a slower decompose stage, or a larger most_width: steep surfaces make echoes wider than that"
+
 
 class NoData(IntEnum):
     """Why an echo has no value: the first reason that applies, in this order."""
@@ -53,7 +55,7 @@ class NoData(IntEnum):
     )
     SATURATED = 7, "saturated", "fly higher, or with less power"
     CUT = 8, "cut by the start or the end of its waveform", "record longer waveforms"
-    UNSETTLED = 9, "its fit did not converge, or ended at a bound", "try a slower decompose stage"
+    UNSETTLED = 9, "its fit did not converge, or ended at a bound", _UNSETTLED_REMEDY
     NO_ANGLE = 10, "its incidence angle is not known", "see why incidence_angle is not, or set surface"
     TOO_STEEP = 11, "incidence angle above 80 degrees, or broader than any slope explains", "there is no remedy"
     UNCERTAIN = (
@@ -70,7 +72,7 @@ class NoData(IntEnum):
         "its width was fitted with another pulse than mode compares it with",
         'fit the pulse of the survey (decompose.adaptive), or Gaussians with mode = "pulse"',
     )
-    NO_PULSE_ENERGY = 18, "the energy of its pulse is not known", "complete the file of --pulse-energy, or leave it out"
+    NO_PULSE_ENERGY = 18, "the energy of its pulse is not known", "complete the file of --energy, or leave it out"
     NO_LEVEL = (
         19,
         "the width of an echo that no slope widens is not known: too few points of the strip lie on planes",

@@ -97,6 +97,8 @@ class WaveformBlock:
     """
     pulse_energy: np.ndarray | None = None
     """Energy of each emitted pulse over the mean of the strip, float64 (n,), NaN where unknown; None without any."""
+    pulse_energy_err: np.ndarray | None = None
+    """Standard deviation of the energy, float64 (n,); None where it is not known."""
 
     def __len__(self) -> int:
         """Number of waveforms."""
@@ -173,7 +175,8 @@ class WaveformBlock:
             returns = ReturnTable(at[keep], returns.time[keep], returns.point[keep], returns.xyz[keep])
         samples = self.samples[index]
         samples.flags.writeable = False
-        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy")
+        names = ("point", "gps_time", "origin", "direction", "sensor", "scanner", "missing", "pulse_energy",
+                 "pulse_energy_err")  # fmt: skip
         given = {name: getattr(self, name) for name in names}
         parts = {name: values if values is None else values[index] for name, values in given.items()}
         first = int(self.point[index[0]]) if len(index) else self.first
@@ -211,7 +214,7 @@ class Noise:
 
     @property
     def for_fits(self) -> np.ndarray:
-        """The same as `kernels.fit.cluster.cut_windows` takes it, float32 (n,) or (n, s)."""
+        """The same as `kernels.fit.decompose.Samples` takes it, float32 (n,) or (n, s)."""
         return self.baseline if self.of_sample is None else self.of_sample
 
     def rows(self, rows: np.ndarray) -> Noise:
@@ -291,6 +294,10 @@ class SystemPulse:
     """Relative standard deviation of the emitted energy from shot to shot, where the block does not hold it."""
     channels: Mapping[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
     """Calibration and its relative error of single channels, by (index of the digitizer, scanner channel)."""
+    swath: tuple[float, ...] = ()
+    """How the calibration grows with the angle t of the ray to the vertical: largest angle T [rad], a and b of
+    exp(a u^2 + b u^4), u = min(t / T, 1); empty where it does not.
+    """
     attenuation: float = AIR_ATTENUATION
     """Attenuation of the light in the air, one way [dB/km]."""
     attenuation_error: float = 0.0
@@ -316,8 +323,8 @@ class SystemPulse:
         if other is None:
             return self
         whole = (
-            "divergence", "divergence_error", "calibration", "calibration_err", "channels", "shot_error",
-            "attenuation", "attenuation_error", "sensor_error",
+            "divergence", "divergence_error", "calibration", "calibration_err", "channels", "swath",
+            "shot_error", "attenuation", "attenuation_error", "sensor_error",
         )  # fmt: skip
         return replace(other, **{name: getattr(self, name) for name in whole})
 
@@ -338,4 +345,20 @@ class SystemPulse:
             if digitizer == block.digitizer.index:
                 same = np.full(n, scanner == 0) if block.scanner is None else block.scanner == scanner
                 constant[same], error[same] = value, value_err
+        if self.swath:
+            constant *= np.exp(swath_columns(angle_to_vertical(block.direction), self.swath[0]) @ self.swath[1:])
         return constant, error
+
+
+def angle_to_vertical(direction: np.ndarray) -> np.ndarray:
+    """Angle of rays to the vertical, at which they strike level ground; direction: f8 (n, 3), angle: f8 (n,) [rad]."""
+    x, y, z = direction.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        down = -z / np.sqrt(x * x + y * y + z * z)
+    return np.arccos(np.clip(down, -1.0, 1.0))
+
+
+def swath_columns(angle: np.ndarray, most: float) -> np.ndarray:
+    """u^2 and u^4 of angles (n,) [rad], f8 (n, 2), u = min(angle / most, 1): see `SystemPulse.swath`."""
+    square = np.minimum(angle / most, 1.0) ** 2
+    return np.stack([square, square**2], axis=1)

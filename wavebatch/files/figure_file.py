@@ -1,18 +1,20 @@
-"""Picture files drawn with matplotlib (optional extra `plot`): one style, and equal bytes for equal figures.
+"""Pictures drawn with matplotlib (optional extra `plot`): one style, and equal bytes for equal figures.
 
-All plots are written through `open_picture`. matplotlib is imported only when a picture is drawn, because it takes
-longer to import than many commands take to run.
+All plots are written through `open_picture`; pages hold the SVG of `open_svg`. matplotlib is imported only when a
+picture is drawn, because it takes longer to import than many commands take to run.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
+import io
 import logging
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.optional import advise_install
@@ -59,7 +61,7 @@ def check_picture(target: Path, *, overwrite: bool) -> None:
     """Raise ConfigError for an unknown suffix or if matplotlib is missing, InputError if the file exists."""
     if target.suffix.lower() not in _METADATA:
         raise ConfigError(f"{target}: unknown kind of picture; use {', '.join(_METADATA)}")
-    if importlib.util.find_spec("matplotlib") is None:
+    if not has_matplotlib():
         raise ConfigError(f"{target}: pictures need matplotlib: {advise_install('matplotlib')}")
     check_target(target, overwrite=overwrite)
 
@@ -74,23 +76,61 @@ def open_picture(
     Raises as `check_picture` does, and InputError if the file cannot be written.
     """
     check_picture(target, overwrite=overwrite)
+    with _style(str(target)), _new_figure(size, dpi) as figure:
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.08)
+        yield figure
+        _save(figure, target, overwrite)
+
+
+@contextlib.contextmanager
+def open_svg(size: tuple[float, float]) -> Iterator[tuple[Figure, list[str]]]:
+    """Give a figure of `size` inches and a list to the `with` block, which gets the SVG at the end of the block.
+
+    For pictures inside of pages, of which there are many: no layout is computed, and places have a tenth of a point.
+    """
+    with _style("the page", {"font.sans-serif": ["DejaVu Sans", "Verdana"]}), _new_figure(size, 72) as figure:
+        drawn: list[str] = []
+        yield figure, drawn
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+        text = buffer.getvalue()
+        text = text[text.index("<svg") :].replace("\n", " ")
+        # Places stand in attributes; labels of ticks keep their digits.
+        drawn.append(_ATTRIBUTE.sub(lambda found: _FINE.sub(r"\1", found[0]), text))
+
+
+def has_matplotlib() -> bool:
+    """Return whether pictures can be drawn (extra `plot`)."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+_ATTRIBUTE, _FINE = re.compile(r'="[^"]*"'), re.compile(r"(\d+\.\d)\d+")
+
+
+@contextlib.contextmanager
+def _style(target: str, more: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """matplotlib with our settings, and some more."""
     # Without a home folder (cron) matplotlib would write about its cache on stderr.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     try:
         import matplotlib
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+        import matplotlib.backends.backend_agg  # also where a half of an installation is missing
     except ImportError as error:
         raise ConfigError(f"{target}: matplotlib cannot be imported; install it again: {error}") from error
-
     kept = {name: value for name, value in matplotlib.rcParamsDefault.items() if name not in _UNTOUCHED}
-    with matplotlib.rc_context({**kept, **_STYLE}), warnings.catch_warnings():
+    with matplotlib.rc_context({**kept, **_STYLE, **(more or {})}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from", category=UserWarning)
-        figure = Figure(figsize=size, dpi=dpi, layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.08)
-        yield figure
-        _save(figure, target, overwrite)
+        yield
+
+
+@contextlib.contextmanager
+def _new_figure(size: tuple[float, float], dpi: float) -> Iterator[Figure]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=dpi)
+    FigureCanvasAgg(figure)
+    yield figure
 
 
 _UNTOUCHED = ("backend", "backend_fallback", "interactive", "toolbar", "timezone", "webagg.port")

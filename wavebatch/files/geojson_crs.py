@@ -16,7 +16,7 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.optional import advise_install
 from wavebatch.files.las.crs import find_epsg
-from wavebatch.files.las.geotiff_wkt import find_code
+from wavebatch.files.las.geo_keys import find_code
 from wavebatch.files.las.header import Vlr
 from wavebatch.files.wkt_repair import drop_empty_codes, repair_wkt
 

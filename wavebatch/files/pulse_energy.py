@@ -1,12 +1,12 @@
 """The energy of each emitted pulse, as sensors log it: an extra byte of the points, or a text file by GPS time.
 
-`batch.unit` finds it once per strip and fills it into each block. Energies count relative to their mean over the strip,
-so their unit does not matter.
+Runs, calibrations and voxels find it once per strip and fill it into each block. Energies count relative to their mean
+over the strip, so their unit does not matter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,12 @@ from wavebatch.core.suggest import nearest
 from wavebatch.core.waveforms import WaveformBlock
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.files.text_file import read_text
+
+COLUMN = "pulse_energy"
+"""Extra byte that is used without being asked for: `wavebatch import` writes it."""
+
+NONE = "none"
+"""Request for no energies."""
 
 SAMPLED_UNITS = 8
 """Units of a strip over whose points the mean is taken."""
@@ -56,6 +62,10 @@ class PulseEnergy:
     """Standard deviation from shot to shot, relative."""
     known: float = 1.0
     """Share of the sampled points whose energy is known."""
+    error_field: str | None = None
+    """Field of the standard deviations, in the unit of the source; None where they are not known."""
+    fills: bool = False
+    """A pulse of unknown energy counts as one of mean energy, as it would without energies; else it has no data."""
 
     def read(self, points: np.ndarray) -> np.ndarray:
         """Return the energies of the pulses of point records (n,), f8, NaN where unknown, in the unit of the source."""
@@ -77,7 +87,15 @@ class PulseEnergy:
         records[inside] = unit.points[place[inside]]
         if not inside.all():
             records[~inside] = unit.context[np.searchsorted(unit.context_index, block.point[~inside])]
-        return replace(block, pulse_energy=self.read(records) / self.mean)
+        energy, error = self.read(records) / self.mean, None
+        if self.error_field is not None:
+            error = records[self.error_field].astype(np.float64) / self.mean
+            error = np.where((error >= 0) & (error < LARGEST), error, 0.0)
+        if self.fills and np.isnan(energy).any():
+            unknown = np.isnan(energy)
+            error = np.where(unknown, self.spread, 0.0 if error is None else error)
+            energy = np.where(unknown, 1.0, energy)
+        return replace(block, pulse_energy=energy, pulse_energy_err=error)
 
     def describe(self) -> dict[str, Any]:
         """Return source, mean and spread for reports."""
@@ -89,19 +107,29 @@ class PulseEnergy:
         }
 
 
-def find_pulse_energy(reader: StripReader, scan: StripScan, request: str) -> PulseEnergy:
+def read_blocks(
+    reader: StripReader, scan: StripScan, size: int, energy: PulseEnergy | None
+) -> Iterator[WaveformBlock]:
+    """Yield every packet of a strip once, as `StripReader.all_blocks` does, with the energies of its pulses."""
+    for unit in reader.read_units(scan):
+        for block, _ in reader.read_blocks(unit, size, owned_only=True):
+            yield block if energy is None else energy.fill(block, unit)
+
+
+def find_pulse_energy(reader: StripReader, scan: StripScan, request: str | None) -> PulseEnergy | None:
     """Find the energies of a strip's pulses.
 
     Parameters
     ----------
     reader : StripReader
     scan : StripScan
-    request : str
-        Name of an extra byte of the strip, or path of a text file with columns time and energy.
+    request : str or None
+        Name of an extra byte of the strip, or path of a text file with columns time and energy. None: the extra byte
+        COLUMN, if the strip has it and it knows half of the pulses; NONE: no energies.
 
     Returns
     -------
-    PulseEnergy
+    PulseEnergy or None
 
     Raises
     ------
@@ -109,20 +137,28 @@ def find_pulse_energy(reader: StripReader, scan: StripScan, request: str) -> Pul
         Where there is no such extra byte and no such file, or where it does not know half of the strip's pulses.
     """
     path = reader.facts.path
-    found = _find_column(reader, request) or _read_file(reader, request)
+    if request == NONE:
+        return None
+    found = _find_column(reader, request or COLUMN)
+    if found is None and request is None:
+        return None
+    found = found or _read_file(reader, request)
     units = reader.unit_count()
     chosen = np.unique(np.linspace(0, units - 1, min(units, SAMPLED_UNITS)).round().astype(int)) if units else []
     # Points of one pulse follow each other: each pulse counts once.
     values = np.concatenate([np.empty(0), *(_once(found, reader.read_unit(int(number), scan)) for number in chosen)])
     there = values[np.isfinite(values)]
     if len(values) and len(there) < LEAST_KNOWN * len(values):
+        if request is None:
+            return None
         raise InputError(
-            f"{path}: --pulse-energy {request} knows {len(there)} of {len(values)} pulses of the strip; it must have "
+            f"{path}: --energy {request} knows {len(there)} of {len(values)} pulses of the strip; it must have "
             "positive energies, a text file those at the GPS times of the points"
         )
     mean = float(there.mean()) if len(there) else 1.0
     spread = float(there.std() / mean) if len(there) else 0.0
-    return replace(found, mean=mean, spread=spread, known=len(there) / max(len(values), 1))
+    known = len(there) / max(len(values), 1)
+    return replace(found, mean=mean, spread=spread, known=known, fills=request is None)
 
 
 def _once(found: PulseEnergy, unit: Unit) -> np.ndarray:
@@ -136,11 +172,14 @@ def _find_column(reader: StripReader, request: str) -> PulseEnergy | None:
     """The extra byte of this name; None where there is none."""
     facts = reader.facts
     fields = facts.dtype.names[len(facts.dtype.names) - len(facts.records) :] if facts.records else ()
-    for field, record in zip(fields, facts.records, strict=True):
-        if record.name == request and 1 <= record.code <= 10:
-            empty = None if record.no_data is None else float(record.no_data[0])
-            return PulseEnergy(request, field, record.scaling or (1.0, 0.0), empty)
-    return None
+    known = {record.name: (field, record) for field, record in zip(fields, facts.records, strict=True)}
+    field, record = known.get(request, (None, None))
+    if record is None or not 1 <= record.code <= 10:
+        return None
+    empty = None if record.no_data is None else float(record.no_data[0])
+    error, described = known.get(f"{request}_err", (None, None))
+    plain = described is not None and 1 <= described.code <= 10 and described.scaling is None
+    return PulseEnergy(request, field, record.scaling or (1.0, 0.0), empty, error_field=error if plain else None)
 
 
 def _read_file(reader: StripReader, request: str) -> PulseEnergy:
@@ -148,7 +187,7 @@ def _read_file(reader: StripReader, request: str) -> PulseEnergy:
         names = [record.name for record in reader.facts.records]
         hint = nearest(request, names) if names else "the strip has no extra bytes"
         path = reader.facts.path
-        raise InputError(f"{path}: --pulse-energy: no extra byte and no file is called {request!r}; {hint}")
+        raise InputError(f"{path}: --energy: no extra byte and no file is called {request!r}; {hint}")
     time, energy = _parse(read_text(request, "file of pulse energies", 1 << 30).splitlines(), request)
     order = np.argsort(time, kind="stable")
     time, energy = time[order], energy[order]

@@ -3,6 +3,9 @@
 Uses $CC, else cc, gcc or clang; where the machine has none, pip installs `ziglang`, a compiler in a wheel, for the time
 of the build. The flags are strict, so that every build gives the same bits: no contraction of products and sums, no
 fast mathematics, no instructions beyond the baseline of the architecture.
+
+Called by pip, and by kernels/library.py in a checkout. Before you change it: it runs where only Python and setuptools
+are installed.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from pathlib import Path
 SOURCES = Path(__file__).with_name("c")
 LIBRARY = Path(__file__).with_name("_kernels" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 FLAGS = ("-std=gnu99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden", "-shared")
+ZIG = (sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline", "-fno-sanitize=undefined")
+"""Without options zig takes all instructions of this machine, and some of its modes stop at undefined behaviour."""
 
 
 def find_compiler() -> list[str] | None:
@@ -30,7 +35,7 @@ def find_compiler() -> list[str] | None:
         if shutil.which(name):
             return [name]
     if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+        return list(ZIG)
     return None
 
 
@@ -45,22 +50,43 @@ def compile_library(target: Path = LIBRARY, flags: tuple[str, ...] = ()) -> None
     command = find_compiler()
     if command is None:
         raise RuntimeError("no C compiler found: install cc, gcc or clang, set CC, or `pip install ziglang`")
-    position = () if sys.platform == "win32" else ("-fPIC",)
+    source_time = _source_time()
+    is_windows = sys.platform == "win32"
+    position, mathematics = ((), ()) if is_windows else (("-fPIC",), ("-lm",))  # Windows needs neither
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".build-") as folder:
         built = Path(folder) / target.name
-        call = [*command, *FLAGS, *position, *flags, str(SOURCES / "library.c"), "-o", str(built), "-lm"]
-        done = subprocess.run(call, capture_output=True, text=True)
+        call = [*command, *FLAGS, *position, *flags, str(SOURCES / "library.c"), "-o", str(built), *mathematics]
+        # Zig keeps what it compiles, 50 MB, in the user's home, which a container may lack.
+        caches = dict.fromkeys(("ZIG_GLOBAL_CACHE_DIR", "ZIG_LOCAL_CACHE_DIR"), folder)
+        done = subprocess.run(call, capture_output=True, text=True, errors="replace", env={**os.environ, **caches})
         if done.returncode:
-            raise RuntimeError(f"{shlex.join(call)} failed: {done.stderr.strip()}")
+            lines = done.stderr.splitlines() or ["it printed nothing"]
+            reason = next((line for line in lines if "error" in line), lines[-1])
+            raise RuntimeError(f"the C compiler failed: {reason.strip()}; its call: {shlex.join(call)}")
+        os.utime(built, ns=(source_time, source_time))
         os.replace(built, target)
 
 
 def is_outdated() -> bool:
-    """Whether this is a checkout whose C is newer than the library."""
+    """Whether this is a checkout whose library is not of the present source; an installed package has no source."""
+    source_time = _source_time()
+    return source_time > 0 and not (LIBRARY.exists() and LIBRARY.stat().st_mtime_ns == source_time)
+
+
+def _source_time() -> int:
+    """When the source was last changed, which the library takes over [ns]; 0 where there is no source."""
     sources = list(SOURCES.glob("*.[ch]"))
-    return bool(sources) and (
-        not LIBRARY.exists() or max(path.stat().st_mtime for path in sources) > LIBRARY.stat().st_mtime
-    )
+    return max((path.stat().st_mtime_ns for path in [*sources, Path(__file__)]), default=0) if sources else 0
+
+
+def is_whole(library: Path) -> bool:
+    """Whether the file ends where its header says, if it is of ELF: to load less of it kills the process (SIGBUS)."""
+    with library.open("rb") as file:
+        head = file.read(64)
+    if not head.startswith(b"\x7fELF\x02\x01"):
+        return True  # other systems refuse what is cut
+    place, size, number = (int.from_bytes(head[begin:end], "little") for begin, end in ((40, 48), (58, 60), (60, 62)))
+    return len(head) == 64 and library.stat().st_size >= place + size * number
 
 
 def _setuptools() -> object:

@@ -8,12 +8,20 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-from wavebatch.kernels.build_kernels import LIBRARY, compile_library, is_outdated
+from wavebatch.core.errors import InputError
+from wavebatch.kernels.build_kernels import LIBRARY, SOURCES, compile_library, is_outdated, is_whole
 
 _POINTER = ctypes.c_void_p
+
+FUNCTIONS = (
+    "decompose_clusters", "promise_echoes", "quiet_levels", "find_maxima", "group_candidates", "exponentials",
+    "logarithms", "solve_equations", "decode_packets",
+)  # fmt: skip
+"""What the library offers; each returns an int64, below 0 where there is no memory."""
 
 
 def _fields(kind: type, names: str) -> list[tuple[str, type]]:
@@ -80,28 +88,128 @@ class Echoes(ctypes.Structure):
     ]
 
 
+class Candidates(ctypes.Structure):
+    """`Candidates` of kernels/c/signal.h."""
+
+    _fields_ = [*_fields(ctypes.c_int64, "room"), *_fields(_POINTER, "waveform amplitude time width")]
+
+
+class Detector(ctypes.Structure):
+    """`Detector` of kernels/c/signal.h."""
+
+    _fields_ = [
+        *_fields(ctypes.c_double, "threshold width_ref broad"),
+        *_fields(_POINTER, "taps"),
+        *_fields(ctypes.c_int64, "reach"),
+    ]
+
+
+class Grouping(ctypes.Structure):
+    """`Grouping` of kernels/c/signal.h."""
+
+    _fields_ = [*_fields(ctypes.c_int64, "margin reach most"), *_fields(_POINTER, "tail")]
+
+
+class Groups(ctypes.Structure):
+    """`Groups` of kernels/c/signal.h."""
+
+    _fields_ = _fields(_POINTER, "waveform low high first number")
+
+
+class Samples(NamedTuple):
+    """n waveforms of s samples, with their noise."""
+
+    counts: np.ndarray
+    """uint8, uint16, uint32 or float32 (n, s) [count]."""
+    baseline: np.ndarray
+    """Level of each waveform, float32 (n,), or of each sample (n, s) [count]."""
+    std: np.ndarray
+    """Noise of each waveform, float32 (n,) [count]."""
+    missing: np.ndarray | None = None
+    """Samples that were not recorded, bool (n, s); None where there is none."""
+
+    def checked(self) -> Samples:
+        """The same as the library reads it; raises ValueError where it would read outside of the arrays."""
+        counts, baseline, std, missing = self
+        n, s = counts.shape
+        if counts.dtype not in (np.uint8, np.uint16, np.uint32, np.float32):
+            raise ValueError(f"samples of type {counts.dtype} cannot be read")
+        if baseline.shape not in ((n,), (n, s)) or std.shape != (n,):
+            raise ValueError(f"levels or noise do not have the shape of {n} waveforms of {s} samples")
+        if missing is not None and missing.shape != (n, s):
+            raise ValueError(f"gaps do not have the shape of {n} waveforms of {s} samples")
+        if not (np.isfinite(baseline).all() and np.isfinite(std).all() and (std > 0).all()):
+            raise ValueError("levels and noise must be finite, and the noise above 0")
+        if counts.dtype == np.float32 and not np.isfinite(counts if missing is None else counts[~missing]).all():
+            raise ValueError("samples must be finite where they are not missing")
+        flat = (np.ascontiguousarray(baseline, np.float32), np.ascontiguousarray(std, np.float32))
+        gaps = None if missing is None else np.ascontiguousarray(missing, np.bool_)
+        return Samples(np.ascontiguousarray(counts), *flat, gaps)
+
+    def as_block(self) -> Block:
+        """The structure, which points into these arrays."""
+        counts, baseline, std, missing = self
+        kind = 0 if counts.dtype == np.float32 else counts.dtype.itemsize
+        block = Block(
+            counts.ctypes.data, counts.shape[1], kind, place(baseline, np.float32), baseline.ndim - 1,
+            place(std, np.float32), None if missing is None else place(missing, np.bool_),
+        )  # fmt: skip
+        block.arrays = self  # they must live as long as the structure
+        return block
+
+
 @cache
 def load() -> ctypes.CDLL:
     """The library.
 
     Raises
     ------
-    ImportError
-        It was not built, or for another machine.
+    InputError
+        It cannot be built, is missing or damaged, or was built for another machine.
     """
+    in_checkout = SOURCES.is_dir()
     try:
         if is_outdated():
             compile_library()
-        library = ctypes.CDLL(str(LIBRARY))
     except (OSError, RuntimeError) as error:
-        reason = f"cannot be loaded ({error})" if LIBRARY.exists() else f"were not built ({error})"
-        raise ImportError(
-            f"{LIBRARY}: the compiled kernels {reason}; install wavebatch again on this machine: "
-            "python -m pip install --force-reinstall --no-cache-dir wavebatch"
-        ) from None
-    for function in (library.decompose_clusters, library.promise_echoes):
-        function.restype = ctypes.c_int64
+        raise InputError(f"{LIBRARY}: cannot be built from its C sources: {error}") from error
+    try:
+        if not is_whole(LIBRARY):
+            raise OSError("its end is missing")
+        library = ctypes.CDLL(str(LIBRARY))
+        for name in FUNCTIONS:
+            getattr(library, name).restype = ctypes.c_int64
+    except (OSError, AttributeError) as error:
+        again = "remove it, it is then built again" if in_checkout else "install wavebatch again on this machine"
+        raise InputError(
+            f"{LIBRARY}: cannot be loaded ({_reason(error)}): it is missing, damaged or of another machine; {again}"
+        ) from error
     return library
+
+
+def _reason(error: Exception) -> str:
+    """What the system says, without the path that the message begins with."""
+    text = getattr(error, "strerror", None) or str(error)
+    return text.removeprefix(f"{LIBRARY}: ")
+
+
+def call(name: str, *arguments: ctypes.Structure | ctypes._SimpleCData | np.ndarray) -> int:
+    """Calls a function of the library: structures and arrays by reference.
+
+    Raises
+    ------
+    MemoryError
+        There is not enough for its largest waveform or window.
+    """
+    given = [
+        ctypes.c_void_p(part.ctypes.data) if isinstance(part, np.ndarray)
+        else ctypes.byref(part) if isinstance(part, ctypes.Structure) else part
+        for part in arguments
+    ]  # fmt: skip
+    result = getattr(load(), name)(*given)
+    if result < 0:
+        raise MemoryError("no memory for a window of so many samples and echoes")
+    return result
 
 
 def place(array: np.ndarray, dtype: type) -> int:

@@ -10,9 +10,11 @@ import numpy as np
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.units import QUANTISATION_STD
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.library import Samples
+from wavebatch.kernels.signal.maxima import quiet_levels
 from wavebatch.kernels.signal.noise import DRIFT, find_levels
 from wavebatch.kernels.signal.runs import find_stretches, list_samples
-from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_quiet, quiet_mean, sum_samples, transpose_samples
+from wavebatch.kernels.signal.signal import SMOOTH_GAIN, quiet_mean, sum_samples, transpose_samples
 from wavebatch.stages.chain import Range, stage
 
 LEAST_QUIET, LOWEST_TENTH = 6, 1.28
@@ -53,21 +55,20 @@ def pooled(
     """
     n = len(block)
     std = max(system.noise_std, QUANTISATION_STD)
-    signal = transpose_samples(block.samples)
-    signal -= np.float32(system.baseline)
     reach = int(np.ceil(guard * system.sigma_ref / block.spacing))
-    recovery = int(np.ceil(min(system.recovery / block.spacing, signal.shape[0])))
+    recovery = int(np.ceil(min(system.recovery / block.spacing, block.samples.shape[1])))
     spread = system.baseline_spread
     if spread > DRIFT * std:
+        signal = transpose_samples(block.samples)
+        signal -= np.float32(system.baseline)
         mean, quiet, number = find_levels(signal, std, reach, limit, recovery)
         if block.missing is not None:
             quiet &= ~block.missing.T
             mean, number = quiet_mean(signal, quiet)
     else:
-        quiet = find_quiet(signal, np.float32(limit * np.hypot(SMOOTH_GAIN * std, spread)), reach, recovery)
-        if block.missing is not None:
-            quiet &= ~block.missing.T
-        mean, number = quiet_mean(signal, quiet)
+        level = np.full(n, system.baseline, np.float32)
+        samples = Samples(block.samples, level, np.ones(n, np.float32), block.missing)
+        mean, number = quiet_levels(samples, limit * np.hypot(SMOOTH_GAIN * std, spread), reach, recovery)
     trust = spread**2 / (spread**2 + std**2 / np.maximum(number, 1)) * (number > 0)
     baseline = system.baseline + trust * mean
     noise = Noise(baseline.astype(np.float32), np.full(n, std, np.float32))

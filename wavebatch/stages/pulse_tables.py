@@ -12,6 +12,7 @@ import numpy as np
 
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log, solve
 from wavebatch.kernels.fit.pulse_shape import (
     GAUSSIAN,
     NO_SKEW,
@@ -213,14 +214,14 @@ def _factor_table(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Widths (k,) and the factors of errors there (k, 4)."""
     alone = max(noise_factors(shape, limits.ref, correlation)[0], 1.0)
-    widths = np.geomspace(limits.low, limits.high, FACTOR_WIDTHS)
+    widths = exp(np.linspace(log(limits.low), log(limits.high), FACTOR_WIDTHS))
     return widths, np.stack([_factors_at(shape, limits, float(width), correlation) for width in widths]) / alone
 
 
 def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlation: tuple[float, ...]) -> np.ndarray:
     """Errors of amplitude, time, width, energy (4,) in noise of this correlation, over those in white noise."""
     joint = _pulse_rows(shape, width)
-    main = np.linalg.solve(joint @ joint.T, joint)
+    main = solve(np.einsum("is,js->ij", joint, joint), joint)
     # A unit of amplitude and a unit of width are the same relative change; each component has its share of the energy.
     main = np.concatenate([main, main[:1] + main[2:]])
     whole = main.copy()
@@ -228,7 +229,7 @@ def _factors_at(shape: PulseShape, limits: ShapeLimits, width: float, correlatio
         peak, by_peak, by_delay = _change_with_width(pulse_measures(shape, limits), np.float64(width))
         whole[0] += by_peak / peak * width * main[2]
         whole[1] += by_delay * main[2]
-    variance = np.einsum("is,is->i", whole @ correlation_matrix(correlation, joint.shape[1]), whole)
+    variance = np.einsum("is,st,it->i", whole, correlation_matrix(correlation, joint.shape[1]), whole)
     return np.sqrt(np.maximum(variance / np.sum(whole * whole, axis=1), LEAST_FACTOR))
 
 

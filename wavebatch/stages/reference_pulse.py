@@ -9,6 +9,7 @@ import numpy as np
 
 from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
+from wavebatch.kernels.elementary import exp
 from wavebatch.kernels.fit.pulse_shape import evaluate_pulse
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.stages.pulse_tables import pulse_measures, pulse_shape, shape_limits
@@ -63,7 +64,7 @@ def reference_pulse(
     half = int(np.ceil(reach * system.sigma_ref / spacing))
     x = np.arange(-half, half + 1, dtype=np.float64)
     if kind == "gaussian":
-        return Reference(np.exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
+        return Reference(exp(-0.5 * (x * spacing / system.sigma_ref) ** 2), float(half))
     shape, limits = pulse_shape(system, spacing), shape_limits(system, spacing)
     delay, peak = 0.0, 1.0
     if shape.components:

@@ -91,8 +91,17 @@ def chain_text(survey: Survey) -> str:
         format_step("attribute.amplitude", {}),
     ]
     lines += [format_step("attribute.echo_width", {})] if width.needed else [_comment(width), ""]
-    lines += [_comment(decisions[Part.ANGLE]), ""] if Part.ANGLE in decisions else []
+    lines += [_comment(decisions[Part.ANGLE]), ""] if Part.ANGLE in decisions else _explain_angle(survey)
     return "\n".join([*lines, format_step("attribute.position", {})])
+
+
+def _explain_angle(survey: Survey) -> list[str]:
+    """Why angles are not in the chain although widths say that surfaces slope."""
+    if not any(decision.part == Part.ANGLE and decision.needed for decision in survey.decisions):
+        return []
+    needs = "it needs the divergence of the beam, which no strip holds"
+    add = 'with it, add "attribute.incidence_angle" with divergence = MRAD after attribute.position'
+    return [f"# {Part.ANGLE}: not in this chain: {needs};", f"# {add}.", ""]
 
 
 def _comment(decision: Decision) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from wavebatch.core.errors import ConfigError
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.stages.chain import STAGES, Chain, Step
 
@@ -23,9 +24,19 @@ NEEDS_SENSOR = (
 )  # fmt: skip
 """Columns that need the sensor's position."""
 
+LEAST_ATTENUATION = 0.01
+"""Of air near the ground [dB/km]: what molecules alone scatter at 1064 nm is 0.004, and haze is never absent."""
+
 _REPORTED = ("strip", "date", "sensor", "flight", "chain", "decomposer", "height", "distance")
 _MOST_DESCRIBED = 8
 """Strips that a description lists one by one."""
+
+
+def check_attenuation(value: float) -> None:
+    """Raise ConfigError for an attenuation [dB/km] that no air has, as of a value per metre; 0 is no air at all."""
+    if 0.0 < value < LEAST_ATTENUATION:
+        problem = f"attenuation: {value:g} dB/km is less than any air has near the ground"
+        raise ConfigError(f"{problem}; is it per metre? Clear air has 0.1 to 0.5 dB/km")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +95,10 @@ class ChannelConstant:
     """Volts per count, as the descriptor has it."""
     pulse_ns: float | None = None
     """Full width at half maximum of the system pulse [ns]."""
+    noise_dn: float | None = None
+    """Standard deviation of the noise of a sample [DN]."""
+    brightest: float | None = None
+    """Light of its strongest waveforms [DN m2]: see `setting.Setting`."""
 
     @property
     def is_described(self) -> bool:
@@ -138,6 +153,10 @@ class Calibration:
     """Median height of the sensor above the targets [m]."""
     distance: float | None = None
     """Median distance from the sensor to the targets [m]."""
+    rate: float | None = None
+    """Pulses per second by GPS times; None where they do not show it."""
+    software: str = ""
+    """Generating software of the strip's header."""
     fingerprint: Mapping[str, Any] = field(default_factory=dict)
     """Of the strip that was measured."""
     targets: tuple[TargetResult, ...] = ()
@@ -145,6 +164,8 @@ class Calibration:
     """Channels that have a constant of their own."""
     strips: tuple[StripConstant, ...] = ()
     """Constants of single strips, where several were calibrated together."""
+    swath: tuple[float, ...] = ()
+    """How the constant grows with the scan angle, as `SystemPulse.swath`; empty where it was not fitted."""
     notes: tuple[str, ...] = ()
     """What is doubtful about it, one line each; not kept in the file."""
 
@@ -163,6 +184,7 @@ class Calibration:
             calibration_err=self.relative_error,
             channels={(row.digitizer, row.scanner): (row.constant, row.relative_error) for row in self.channels},
             shot_error=max((row.shot_energy for row in self.channels), default=0.0),
+            swath=self.swath,
             attenuation=self.attenuation,
             divergence=self.divergence if system.divergence is None else system.divergence,
         )
@@ -175,6 +197,7 @@ class Calibration:
             "attenuation_db_km": self.attenuation,
             "divergence_mrad": self.divergence,
             "section_constant": self.section_constant,
+            **({"scan_angle_terms": list(self.swath)} if self.swath else {}),
             **{name: getattr(self, name) for name in _REPORTED},
             "channels": [asdict(row) for row in self.channels],
             "strips": self._describe_strips(),

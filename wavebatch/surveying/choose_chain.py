@@ -19,6 +19,7 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import load_profile
 from wavebatch.surveying import SAMPLE, Decision, Survey, join_digitizers, survey_blocks
 from wavebatch.surveying.auto_chain import choose_chain, decide, widest_chain
+from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.predict_error import WAVEFORMS, Prediction, leave_out_false, predict_errors
 from wavebatch.surveying.system_file import SavedSurvey, describe_system
 
@@ -43,7 +44,7 @@ class Request:
     system: SavedSurvey | None = None
     """A saved survey; None: the strip is surveyed."""
     flight: bool = False
-    """The saved survey is that of the strip's flight, or will be made before the run: the strip is held against it."""
+    """The saved survey is that of the strip's flight, or will be made before the run: the strip is compared with it."""
     force: bool = False
     """Use the saved survey also where the strip contradicts it."""
 
@@ -132,7 +133,10 @@ def make_choice(reader: StripReader, scan: StripScan, chain: Chain, request: Req
         Where no shipped chain meets the tolerance.
     """
     sample = read_sample(reader, scan) if request.system is None or request.tolerance is not None else []
-    found = survey_blocks(sample) if request.system is None else request.system.survey
+    if request.system is None:
+        found = compare_outgoing(survey_blocks(sample), reader.facts.path)
+    else:
+        found = request.system.survey
     block = sample[0] if sample else None
     if request.tolerance is not None:
         return _choose_by_tolerance(block, found, request.tolerance, str(reader.facts.path))

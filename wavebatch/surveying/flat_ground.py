@@ -47,6 +47,9 @@ RADII = (1.5, 12.0)
 LARGEST_ANGLE, LARGEST_ERROR = np.radians(50.0), 3.0
 """Surfaces struck at a larger angle [rad], or known less well [deg], say little about the reference."""
 
+ENOUGH_SLOPES = 1000
+"""Points whose surface is looked at for the slopes of a strip."""
+
 GROUPS = 12
 """Groups of echoes by angle, through whose median widths the first line for the divergence goes."""
 
@@ -113,6 +116,33 @@ def choose_radius(reader: StripReader, scan: StripScan) -> float:
         return RADII[0]
     unit = reader.read_unit(reader.unit_count() // 2, scan)
     return _choose_radius(locate(unit.points, reader.facts.header)) if len(unit.points) else RADII[0]
+
+
+def measure_slope(reader: StripReader, scan: StripScan) -> float:
+    """Measure how steep the surfaces of a strip are.
+
+    Parameters
+    ----------
+    reader : StripReader
+    scan : StripScan
+
+    Returns
+    -------
+    float
+        Slope [deg] that 84 % of the sampled planes in the middle of the strip do not exceed; 0 where there are too few.
+    """
+    if not reader.unit_count():
+        return 0.0
+    xyz = locate(reader.read_unit(reader.unit_count() // 2, scan).points, reader.facts.header)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    radius, some = _choose_radius(xyz), xyz[:: max(len(xyz) // ENOUGH_SLOPES, 1)]
+    around = Surroundings(xyz[thin_out(xyz, np.arange(len(xyz)), radius)])
+    (slope, _), _ = measure_normals(
+        some, np.tile([0.0, 0.0, -1.0], (len(some), 1)), around,
+        radius=radius, min_points=LEAST_NEIGHBOURS, max_error=LARGEST_ERROR,
+    )  # fmt: skip
+    known = slope[np.isfinite(slope)]
+    return float(np.quantile(known, 0.84)) if len(known) >= ENOUGH_TO_LEARN else 0.0
 
 
 def _choose_radius(xyz: np.ndarray) -> float:

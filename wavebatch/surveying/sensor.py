@@ -60,6 +60,10 @@ whose PulseWaves file has the origin of each pulse."""
 LEAST_DOUBT = 2.0
 """Least median difference of ranges by the trajectory and by the packet vectors for a remark [m]."""
 
+MOST_LAG = 5e-3
+"""Least distance along the flight, as a share of the range, between a trajectory and the packet vectors for a remark: a
+mounting is known better than to 5 mrad."""
+
 HEIGHT_ERROR = 0.05
 """Error of the range, relative, where only the height of the flight is known."""
 
@@ -125,6 +129,13 @@ class SensorSource:
 
     def doubt(self) -> str:
         """Return the line about a trajectory that contradicts the packet vectors; empty where it does not."""
+        late, behind = (dict(self.facts).get(name) or 0.0 for name in ("late_s", "behind_m"))
+        if abs(behind) > max(MOST_LAG * (self.distance or 0.0), 10.0 * (self.vectors_error or 0.0)):
+            return (
+                f"range: the trajectory is {abs(behind):.1f} m {'behind' if late > 0 else 'ahead of'} the packets' "
+                f"vectors, as if its clock were off by {late:+.2f} s: check its clock and lever arm; the error of the "
+                f"ranges, {self.error:.2g} m, holds it"
+            )
         if self.farther is None or abs(self.farther) <= max(LEAST_DOUBT, 5.0 * (self.vectors_error or 0.0)):
             return ""
         which = "farther" if self.farther > 0 else "nearer"
@@ -193,13 +204,25 @@ def refuse_units(reader: StripReader, scan: StripScan) -> None:
             f"{path}: packet vectors are {ratio:.3f} times c/2 long, as in feet, but the CRS of the strip does not say "
             f"that its coordinates are in feet: {remedy}"
         )
-    if all(unit.horizontal is None for unit in units):
-        scale = measure_scale(reader, scan)
-        if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
-            raise InputError(
-                f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
-                f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
-            )
+    if _look_like_degrees(reader):
+        raise InputError(
+            f"{path}: coordinates look like degrees, since all points lie within one unit, and no CRS says so: {remedy}"
+        )
+    scale = measure_scale(reader, scan)
+    if scale is not None and abs(scale * FOOT - 1.0) < 0.05:
+        raise InputError(
+            f"{path}: returns of one pulse lie {scale:.2f} times as far apart as their times in the packet say: "
+            f"coordinates are in feet, packet vectors in metres, and no CRS says so: {remedy}"
+        )
+
+
+def _look_like_degrees(reader: StripReader) -> bool:
+    """Whether all of many points lie within one unit, at numbers of degrees."""
+    header = reader.facts.header
+    low, high = np.array(header.mins[:2]), np.array(header.maxs[:2])
+    extent = high - low
+    inside = (np.maximum(np.abs(low), np.abs(high)) <= (360.0, 90.0)).all()
+    return bool(header.point_count > 100 and inside and (extent > 0).all() and (extent < 1.0).all())
 
 
 def judge_scale(reader: StripReader, scan: StripScan) -> tuple[str, ...]:
@@ -250,7 +273,9 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several:
     except InputError as error:
         raise InputError(f"{request.trajectory}: {error}") from error
     share = known.share_known(start, stop)
-    farther, error, vectors_error = _compare_ranges(distance, rays)
+    path = estimate_path(rays, "direction vectors")
+    farther, error, vectors_error = _compare_ranges(distance, rays, path)
+    late, behind = (None, None) if path is None else _find_lag(known, path.trajectory)
     distance = distance[np.isfinite(distance)]
     facts = {
         "file": request.trajectory.name,
@@ -262,6 +287,8 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several:
         "distance_m": None,
         "farther_than_by_vectors_m": farther,
         "by_vectors_error_m": vectors_error,
+        "late_s": late,
+        "behind_m": behind,
     }
     return SensorSource(
         "trajectory",
@@ -274,17 +301,34 @@ def _from_file(reader: StripReader, rays: Rays, request: SensorRequest, several:
     )
 
 
-def _compare_ranges(distance: np.ndarray, rays: Rays) -> tuple[float | None, float, float | None]:
+def _find_lag(known: Trajectory, path: Trajectory) -> tuple[float | None, float | None]:
+    """By how much a trajectory comes later than the path by the packet vectors, in s and in m along the flight."""
+    step = known.at(path.time + 0.5 * NODE_SECONDS) - known.at(path.time - 0.5 * NODE_SECONDS)
+    square = np.einsum("ni,ni->n", step, step)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        late = NODE_SECONDS * np.einsum("ni,ni->n", path.xyz - known.at(path.time), step) / square
+    there = np.isfinite(late)
+    if not there.any():
+        return None, None
+    middle = float(np.median(late[there]))
+    return round(middle, 4), round(middle * float(np.sqrt(np.median(square[there]))) / NODE_SECONDS, 3)
+
+
+def _compare_ranges(
+    distance: np.ndarray, rays: Rays, path: SensorSource | None
+) -> tuple[float | None, float, float | None]:
     """How much longer ranges from a trajectory are than ranges from packet vectors [m]: median, root mean square, and
     the error of the latter; None, 0 and None where the vectors give no position."""
-    path = estimate_path(rays, "direction vectors")
     if path is None:
         return None, 0.0, None
     longer = distance - np.sqrt(((rays.point - path.trajectory.at(rays.time)) ** 2).sum(axis=1))
     longer = longer[np.isfinite(longer)]
     if not len(longer):
         return None, 0.0, None
-    return round(float(np.median(longer)), 3), float(np.sqrt(np.mean(longer**2))), round(path.error, 6)
+    error = float(np.sqrt(np.mean(longer**2)))
+    # A contradiction is known no better than the vectors are.
+    error = float(np.hypot(error, path.error)) if error > path.error else error
+    return round(float(np.median(longer)), 3), error, round(path.error, 6)
 
 
 def _disagreement(ahead: np.ndarray, distance: np.ndarray, rays: Rays) -> float:

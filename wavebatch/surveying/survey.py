@@ -465,7 +465,8 @@ def _decide(system: SystemPulse, spacing: float, figures: Mapping[str, float]) -
         Decision(
             Part.ANGLE,
             width >= LEAST_PULSE_WIDTH and figures["system_width_share"] < 0.95,
-            f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse",
+            f"{100 * figures['system_width_share']:.0f} % of the clear echoes have the width of the system pulse; a "
+            "chain has angles only where the beam's divergence is given",
         ),
     )
 

@@ -269,4 +269,5 @@ def _work(scratch: Path | None, function: Callable, arguments: tuple) -> Any:
 
 def _with_packets(path: Path) -> list[Path]:
     """The strip, and the packet file beside it."""
-    return [path, *(file for file in (path.with_suffix(".wdp"), path.with_suffix(".WDP")) if file.exists())]
+    beside = (path.with_suffix(suffix) for suffix in (".wdp", ".WDP", ".wdz", ".WDZ"))
+    return [path, *(file for file in beside if file.exists())]

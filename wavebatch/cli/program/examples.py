@@ -23,6 +23,14 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
         ("wavebatch survey strip.las", "noise, pulse and scene, and which chain the strip needs"),
         ("wavebatch survey strip.las -o system.toml --chain chain.toml", "save both for `run --system` and `--chain`"),
     ),
+    "import": (
+        ("wavebatch import flight.pls -o flight.las", "flight.las and flight.wdp, and flight.system.toml"),
+        ("wavebatch import archive/ -o strips --resume", "all files of a folder; go on after an interruption"),
+    ),
+    "export": (
+        ("wavebatch export strip.las -o repaired.laz", "packets as the LAS specification has them"),
+        ("wavebatch export strip.las -o strip.npz", "waveforms with their geometry as arrays"),
+    ),
     "stages": (
         ("wavebatch stages", "list all algorithms"),
         ("wavebatch stages decompose.adaptive", "one with parameters, units, source and a TOML example"),
@@ -78,6 +86,8 @@ EXAMPLES: dict[str, tuple[tuple[str, str], ...]] = {
     "calibrate": (
         ("wavebatch calibrate strip.las --targets targets.csv --divergence 0.5 -o cal.toml",
          "for `run --calibration cal.toml`"),
+        ("wavebatch calibrate *.laz --targets targets.csv --scan-angle --html cal.html -o cal.toml",
+         "with light that falls across the swath"),
     ),
     "bench": (
         ("wavebatch bench strip.las -o bench", "all shipped chains on echoes like those of the strip"),
@@ -94,7 +104,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Reading": ("direction", "headerless", "recursive"),
     "Position of the sensor": ("trajectory", "lever_arm", "crs", "flight_height"),
     "Air and light": (
-        "attenuation", "attenuation_error", "visibility", "wavelength", "pulse_energy", "reflectance_error",
+        "attenuation", "attenuation_error", "visibility", "wavelength", "energy", "reflectance_error", "scan_angle",
     ),
     "Which points": (
         "where", "flags_with", "flags_without", "drop_flags", "bbox", "polygon", "classes", "bounds", "packets",

@@ -65,7 +65,8 @@ class Progress:
         elif kind == "written" and self._level >= 0:
             self._say(printable(_summary(event, self._level > 0)))
             warnings = [f"warning: {line}" for line in event["warnings"]]
-            more = [*_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])] * (self._level > 0)
+            more = [*_decisions(event), *_sensor_lines(event["sensor"]), *_reasons(event["counts"]["no_data"])]
+            more *= self._level > 0
             for line in [*warnings, *more, *event["remarks"]]:
                 self._say(printable(f"{strip}: {line}"))
         elif kind == "written":
@@ -120,6 +121,12 @@ def _sensor_lines(sensor: dict[str, Any]) -> Iterator[str]:
     parts = [text.format(sensor[key]) for key, text in words.items() if sensor.get(key) is not None]
     if parts:
         yield f"sensor from {sensor['source']}: {', '.join(parts)}"
+
+
+def _decisions(event: dict[str, Any]) -> Iterator[str]:
+    """What the automatic chain keeps and leaves out, and why."""
+    for decision in event["decisions"]:
+        yield f"{decision['part']}: {'kept' if decision['needed'] else 'left out'}: {decision['reason']}"
 
 
 def _reasons(no_data: dict[str, dict[str, int]]) -> Iterator[str]:

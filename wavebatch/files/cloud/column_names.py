@@ -58,6 +58,7 @@ STYLES: dict[str, dict[str, Naming]] = {
         "amplitude_err": Naming("PeakAmplitudeErr"),
         "range": Naming("EchoRange"),
         "range_err": Naming("EchoRangeErr"),
+        "range_error": Naming("EchoRangeError"),
         "reflectance": Naming("Reflectance", unit="dB", decibel=True),
         "pulse_deviation": Naming("PulseShapeDeviation"),
     },

@@ -79,7 +79,7 @@ class CloudReader(Closing):
         written = find_written(checked.header, [one.name for one in extra if one.num_elements == 1])
         kinds = {one.name: one.kind for one in extra}
         self.written = {column: name for column, name in written.items() if _may_hold(kinds[name], column)}
-        """The file's name of each wavebatch column, by the account of the run; empty without one. Columns that another
+        """The file's name of each wavebatch column, by its provenance; empty without one. Columns that another
         program has stored as several numbers, or flags as signed ones, are none."""
         self._sources = self._find_ours(extra, (*CLOUD_COLUMNS, "echo_flags"))
         self.columns = tuple(name for name in CLOUD_COLUMNS if name in self._sources)
@@ -202,7 +202,7 @@ def read_field(raw: np.ndarray, point_format: int, name: str) -> np.ndarray:
 def find_columns(extra: list[DimensionInfo], columns: Iterable[str]) -> dict[str, DimensionInfo]:
     """Return the extra dimension of each column that the cloud has, by its names alone.
 
-    For clouds without an account of the run, which other programs may drop. wavebatch's name is preferred to those of
+    For clouds without provenance, which other programs may drop. wavebatch's name is preferred to those of
     other styles, and a name with the prefix `wb_` (`wb ` in old clouds) to one without. A dimension of another style
     counts only if it is stored as that style stores it: RIEGL's Amplitude, for example, is in dB.
     """

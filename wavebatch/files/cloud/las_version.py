@@ -71,8 +71,8 @@ def choose_version(path: Path, header: LasHeader, wanted: str, point_format: int
 
 
 _REPAIRED = (
-    "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS show the strip elsewhere; the "
-    "cloud's WKT is right"
+    "the strip's WKT says metres where it means degrees, as RiPROCESS writes it: GIS programs show the strip "
+    "in a wrong place; the cloud's WKT is right"
 )
 
 

@@ -1,4 +1,4 @@
-"""Writer of output clouds: points, the records of the input, and an account of how the cloud was made.
+"""Writer of output clouds: points, the records of the input, and the cloud's provenance.
 
 The batch opens one `CloudWriter` per strip. Equal input and options must give equal bytes: write no time of day, no
 path and nothing that depends on the number of processes into the file.
@@ -94,7 +94,7 @@ class CloudWriter(PointFile):
             if packets.internal:
                 self.append_record(head, source, packets.start, packets.end, waveforms=True)
                 return
-            packet_file = self.target.with_suffix(".wdp")
+            packet_file = self.target.with_suffix(packets.file.suffix.lower())
             with protecting(self._inputs):
                 draft = Draft(packet_file, overwrite=self.draft.overwrite)
             self.drafts.insert(0, draft)
@@ -199,13 +199,13 @@ def _encode_provenance(layout: OutputLayout, provenance: Mapping[str, Any], numb
     path, source = layout.source.path, layout.source.header
     made_by = {key: decode_text(getattr(source, key)) for key in ("system_identifier", "generating_software")}
     columns = {written.column: written.record.name for written in layout.written}
-    account = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
-    payload = _encode_json(account)
+    whole = {"wavebatch": __version__, "input_header": made_by, "columns": columns, **provenance}
+    payload = _encode_json(whole)
     if len(payload) > MOST_PAYLOAD:
         payload = _encode_json(_shorten(json.loads(payload)))
     if len(payload) > MOST_PAYLOAD:
         raise ConfigError(
-            f"{path}: the account of the run takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
+            f"{path}: the provenance takes {len(payload)} bytes, a VLR holds at most {MOST_PAYLOAD}"
         )
     return Vlr(USER_ID.encode(), number, payload, b"how this cloud was made (JSON)")
 
@@ -215,17 +215,17 @@ def _encode_json(value: Any) -> bytes:
     return text.encode(errors="backslashreplace")
 
 
-def _shorten(account: dict[str, Any]) -> dict[str, Any]:
-    """The account, with the largest tables and lists replaced by their checksums until it fits into a VLR."""
-    parts = sorted(_list_parts(account, ""), key=lambda part: (-part[0], part[1]))
+def _shorten(whole: dict[str, Any]) -> dict[str, Any]:
+    """The provenance, with the largest tables and lists replaced by their checksums until it fits into a VLR."""
+    parts = sorted(_list_parts(whole, ""), key=lambda part: (-part[0], part[1]))
     left_out: dict[str, str] = {}
-    account["left_out"] = {"why": "a VLR is too small; the report of the strip has them", "sha256": left_out}
+    whole["left_out"] = {"why": "a VLR is too small; the report of the strip has them", "sha256": left_out}
     for _, name, holder, key in parts:
-        if len(_encode_json(account)) <= MOST_PAYLOAD:
+        if len(_encode_json(whole)) <= MOST_PAYLOAD:
             break
         left_out[name] = hashlib.sha256(_encode_json(holder[key])).hexdigest()
         holder[key] = None
-    return account
+    return whole
 
 
 def _list_parts(table: dict[str, Any], prefix: str) -> Iterator[tuple[int, str, dict[str, Any], str]]:

@@ -95,4 +95,4 @@ def _packet_files(path: Path) -> list[Path]:
         return []
     if head[_ENCODING_BYTE] & _WAVES_INTERNAL:
         return []
-    return [path.with_suffix(suffix) for suffix in (".wdp", ".WDP")]
+    return [path.with_suffix(suffix) for suffix in (".wdp", ".WDP", ".wdz", ".WDZ")]

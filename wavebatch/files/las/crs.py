@@ -1,6 +1,7 @@
-"""Units of coordinates, from the WKT and the GeoTIFF keys of a strip.
+"""The CRS of a LAS file and the units of its coordinates, from its WKT and its GeoTIFF keys.
 
-`find_facts` reads them once; the survey refuses strips that are not in metres. The records may hold any bytes: what
+`find_facts` reads them once; the survey refuses strips that are not in metres. `describe_crs` has short words for
+pictures and tables. The records may hold any bytes: what
 cannot be read counts as missing, and nothing here raises an error for it.
 """
 
@@ -9,12 +10,11 @@ from __future__ import annotations
 import json
 import math
 import re
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from wavebatch.files.las.epsg_units import find_unit
+from wavebatch.files.las.geo_keys import GeoKeys, find_code
 from wavebatch.files.las.header import (
     EVLR_HEADER_SIZE,
     GEOTIFF_ID,
@@ -22,6 +22,7 @@ from wavebatch.files.las.header import (
     LasHeader,
     find_evlrs,
     is_projection,
+    read_header,
 )
 from wavebatch.files.wkt_repair import LONGEST_WKT, repair_wkt
 
@@ -30,18 +31,8 @@ _IDS = (WKT_ID, GEOTIFF_ID, DOUBLES_ID, CITATION_ID)
 
 _TOKEN = re.compile(r'"((?:[^"]|"")*)"|([A-Za-z_][A-Za-z_0-9]*)([\[(])?|([-+]?[0-9.][-+0-9.eE]*)|([\])])|,|\s+')
 
-_MODEL, _LINEAR, _LINEAR_SIZE, _VERTICAL = 1024, 3076, 3077, 4099
-_GEOGRAPHIC_CODE, _PROJECTED_CODE, _VERTICAL_CODE = 2048, 3072, 4096
-_MODELS = {1: "projected", 2: "geographic", 3: "geocentric"}
-_USER_DEFINED, _UNIT_CODES = 32767, range(9001, 9200)
-_LEAST_CODE = 1024
-"""Least EPSG code; smaller values are those of other tables."""
-METRES = {
-    9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937, 9004: 0.3048122529845059, 9005: 0.3047972654, 9006: 0.3047995142,
-    9014: 1.8288, 9015: 1853.248, 9030: 1852.0, 9036: 1000.0, 9037: 0.9143917963, 9060: 0.30479951024814694,
-    9093: 1609.344, 9096: 0.9144,
-}  # fmt: skip
-"""Metres per unit by EPSG code of the unit (GeoTIFF specification 6.3.1.3)."""
+_SHORT = {"metres": "m", "international feet": "ft", "US survey feet": "us-ft", "degrees": "deg"}
+"""Units of pictures and tables."""
 
 _EARTH = (6.34e6, 6.40e6)
 """Distance of land from the centre of the Earth [m]: 6,357 km at the poles to 6,378 km at the equator, and room for
@@ -135,8 +126,9 @@ def read_crs(path: Path, header: LasHeader) -> tuple[str | None, tuple[CrsUnits,
         units.append(parse_wkt(text or ""))
     if GEOTIFF_ID in records:
         citation = records.get(CITATION_ID, b"").split(b"\0")[0].decode("latin-1").strip("| ")
-        text = text or _read_code(records[GEOTIFF_ID]) or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
-        units.append(parse_geotiff(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b"")))
+        keys = GeoKeys.parse(records[GEOTIFF_ID], records.get(DOUBLES_ID, b""), records.get(CITATION_ID, b""))
+        text = text or keys.name or (f"GeoTIFF: {citation}" if citation else "GeoTIFF keys")
+        units.append(CrsUnits(keys.kind, *keys.read_units()))
     if all(unit == CrsUnits() for unit in units) and looks_geocentric(header.mins, header.maxs):
         units.append(CrsUnits("geocentric"))
     return text, tuple(units)
@@ -151,8 +143,8 @@ def read_crs_definition(path: Path, header: LasHeader) -> str | None:
     text = records.get(WKT_ID, b"").split(b"\0")[0].decode("utf-8", "replace").strip()
     if text:
         return repair_wkt(text)
-    code = _read_code(records.get(GEOTIFF_ID, b""))
-    return None if code is None else code.partition("+")[0]  # heights have no place in a raster
+    code = GeoKeys.parse(records.get(GEOTIFF_ID, b"")).code  # without its heights, which have no place in a raster
+    return f"EPSG:{code}" if code else None
 
 
 def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
@@ -166,63 +158,6 @@ def _read_records(path: Path, header: LasHeader) -> dict[int, bytes]:
                 file.seek(evlr.start + EVLR_HEADER_SIZE)
                 found[evlr.record_id] = file.read(evlr.length)
     return found
-
-
-def parse_geotiff(directory: bytes, doubles: bytes = b"", texts: bytes = b"") -> CrsUnits:
-    """Return the units of a GeoKeyDirectory (34735); `doubles` and `texts` are the records 34736 and 34737.
-
-    If no key gives the unit, the EPSG code of the CRS does (`epsg_units`), then a citation that names feet.
-    """
-    keys = _list_keys(directory)
-    kind = _MODELS.get(keys.get(_MODEL, (0, 0))[1])
-    horizontal, vertical = _read_unit(keys, _LINEAR, doubles), _read_unit(keys, _VERTICAL, doubles)
-    if horizontal is None and kind != "geographic":
-        horizontal = find_unit(_find_code(keys, _PROJECTED_CODE)) or _guess_unit(texts.decode("latin-1"))
-    if vertical is None:
-        vertical = find_unit(_find_code(keys, _VERTICAL_CODE), vertical=True)
-    return CrsUnits(kind, horizontal, vertical)
-
-
-def _list_keys(directory: bytes) -> dict[int, tuple[int, int]]:
-    """Place and value of each key."""
-    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
-    return {key: (place, value) for key, place, _, value in rows[1 : rows[0][3] + 1]} if rows else {}
-
-
-def _find_code(keys: Mapping[int, tuple[int, int]], key: int) -> int:
-    """The EPSG code in a key, 0 without one."""
-    place, code = keys.get(key, (0, 0))
-    return code if place == 0 and _LEAST_CODE <= code < _USER_DEFINED else 0
-
-
-def _read_code(directory: bytes) -> str | None:
-    """The EPSG code of the CRS, with `+` and that of the heights if there is one."""
-    keys = _list_keys(directory)
-    geographic = _MODELS.get(keys.get(_MODEL, (0, 0))[1]) == "geographic"
-    code = _find_code(keys, _GEOGRAPHIC_CODE if geographic else _PROJECTED_CODE)
-    upright = _find_code(keys, _VERTICAL_CODE)
-    return None if not code else f"EPSG:{code}+{upright}" if upright else f"EPSG:{code}"
-
-
-def _read_unit(keys: Mapping[int, tuple[int, int]], key: int, doubles: bytes) -> float | None:
-    if key not in keys or keys[key][0] != 0 or keys[key][1] == 0:
-        return None
-    code = keys[key][1]
-    if code != _USER_DEFINED:
-        # Leica's ALSPP writes the EPSG code of the CRS here, which is not a unit.
-        return METRES.get(code, math.nan) if code in _UNIT_CODES else None
-    place, at = keys.get(_LINEAR_SIZE, (0, 0)) if key == _LINEAR else (0, 0)
-    if place != DOUBLES_ID or 8 * at + 8 > len(doubles):
-        return math.nan
-    size = struct.unpack_from("<d", doubles, 8 * at)[0]
-    return size if math.isfinite(size) and size > 0 else math.nan
-
-
-def _guess_unit(text: str) -> float | None:
-    words = text.lower()
-    if "ftus" in words or "us survey f" in words or "us_survey_f" in words or "us feet" in words:
-        return 1200 / 3937
-    return 0.3048 if re.search(r"\b(feet|foot|ft)\b", words) else None
 
 
 _PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS", "LOCAL_CS", "ENGCRS", "ENGINEERINGCRS")
@@ -295,3 +230,30 @@ def _to_json(token: re.Match) -> str:
 
 def _find(node: list, *words: str) -> list | None:
     return next((child for child in node if isinstance(child, list) and child[0] in words), None)
+
+
+def describe_crs(path: Path) -> tuple[str, str]:
+    """Return the name of a file's CRS, empty if it gives none, and the unit of x and y.
+
+    The unit is m if the file gives none: most strips without a CRS are in metres. Raises InputError for a file that is
+    not LAS.
+    """
+    header = read_header(path)
+    text, units = read_crs(path, header)
+    along = next((one for one in units if one.kind == "geographic" or one.horizontal is not None), None)
+    words = "metres" if along is None else along.describe().split(" with ")[0]
+    code = find_code(header.vlrs)
+    if text and text.rstrip().endswith("]"):
+        name = name_crs(text)
+    else:
+        name = f"EPSG:{code}" if code else text or ""
+    return name, _SHORT.get(words, "m" if words == "metres" else "units")
+
+
+def name_crs(text: str) -> str:
+    """Return the name of a CRS in WKT with its EPSG code; other text as it is."""
+    named = re.match(r'\s*\w+\s*[\[(]\s*"([^"]*)"', text)
+    if named is None:
+        return " ".join(text.split())
+    code = find_epsg(text)
+    return named[1] + (f" (EPSG:{code})" if code else "")

@@ -1,7 +1,7 @@
 """EPSG codes of projected and vertical CRSs whose unit is not the metre.
 
-`crs` looks units up here where GeoTIFF keys give the code of a CRS but not its unit. From the EPSG data set as PROJ 9
-holds it; a code that is not listed here is taken for metres, as most are.
+`geo_keys` looks units up here where GeoTIFF keys give the code of a CRS but not its unit. From the EPSG data set as
+PROJ 9 holds it; a code that is not listed here is taken for metres, as most are.
 """
 
 from __future__ import annotations

@@ -7,20 +7,13 @@ is worse than none. What is not sure is None.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 
 from wavebatch.core.errors import InputError
 from wavebatch.core.optional import advise_install
-from wavebatch.files.las.header import GEOTIFF_ID, Vlr, is_projection
-
-_MODEL, _PROJECTED_CODE, _LINEAR, _VERTICAL_CODE, _VERTICAL_UNIT = 1024, 3072, 3076, 4096, 4099
-_PROJECTED, _METRE = 1, 9001
-_USER_DEFINED = 32767
-_ELLIPSOIDAL = range(5001, 5034)
-"""Codes of heights above an ellipsoid (GeoTIFF specification 6.3.4.1); the projected CRS says which ellipsoid."""
-_UNIT_CODES = range(9001, 9200)
+from wavebatch.files.las.geo_keys import find_code
+from wavebatch.files.las.header import Vlr
 
 _GRS80 = 'SPHEROID["GRS 1980",6378137,298.257222101,AUTHORITY["EPSG","7019"]]'
 _WGS84 = (
@@ -38,22 +31,6 @@ _UTM = (
     (range(26901, 26924), 26900, "N", _NAD83),
 )
 """EPSG codes of UTM zones, the code of zone 0, the hemisphere and the datum."""
-
-
-def find_code(vlrs: Iterable[Vlr]) -> int | None:
-    """Return the EPSG code of the projected CRS in the GeoTIFF keys; None without one, or with a vertical CRS."""
-    directory = next((v.payload for v in vlrs if is_projection(v) and v.record_id == GEOTIFF_ID), b"")
-    rows = list(struct.iter_unpack("<4H", directory[: len(directory) // 8 * 8]))
-    keys = {key: value for key, place, _, value in rows[1 : rows[0][3] + 1] if place == 0} if rows else {}
-    vertical = keys.get(_VERTICAL_CODE, 0)
-    if keys.get(_MODEL) != _PROJECTED or vertical and vertical not in _ELLIPSOIDAL:
-        return None
-    code, unit = keys.get(_PROJECTED_CODE, 0), keys.get(_LINEAR, _METRE)
-    if not code and unit not in _UNIT_CODES:
-        code, unit = unit, _METRE  # Leica's ALSPP writes the code of the CRS where that of the unit belongs
-    if (unit, keys.get(_VERTICAL_UNIT, _METRE)) != (_METRE, _METRE):
-        return None
-    return code if 0 < code != _USER_DEFINED else None
 
 
 def convert_geotiff(path: Path, vlrs: Iterable[Vlr], *, asked: bool) -> str | None:

@@ -29,6 +29,8 @@ MAX_VLRS = 1 << 16
 MAX_FILE = 1 << 54
 """Byte offsets below this fit into 64 bits together with the index of a descriptor."""
 
+STANDARD_TIME = 0b1
+"""GPS times are standard GPS time less 1e9 s; else seconds of the week."""
 WAVES_INTERNAL = 0b10
 WAVES_EXTERNAL = 0b100
 WKT_BIT = 0b1_0000
@@ -137,7 +139,7 @@ class LasHeader:
             tuple(map(float, scales)),
             tuple(map(float, offsets)),
             vlrs=[build_wkt(wkt)] if wkt else [],
-            global_encoding=1 | encoding | (WKT_BIT if is_wkt else 0),
+            global_encoding=STANDARD_TIME | encoding | (WKT_BIT if is_wkt else 0),
             system_identifier=b"OTHER",
             generating_software=SOFTWARE,
             creation=(1, 2025),
@@ -189,8 +191,8 @@ def _guess(path: Path, front: bytes) -> str:
     beside = (path.with_suffix(end) for end in (".las", ".laz", ".LAS", ".LAZ"))
     strip = next((one for one in beside if one.is_file()), None)
     if front.startswith(b"PulseWaves"):
-        return "; it is PulseWaves, which wavebatch does not read" + f": give {strip}" * (strip is not None)
-    if path.suffix.lower() == ".wdp":
+        return f"; it is PulseWaves: `wavebatch import {path}` makes a strip of it" + f", or give {strip}" * bool(strip)
+    if path.suffix.lower() in (".wdp", ".wdz"):
         return f"; it has the packets of {strip or path.with_suffix('.las')}: give that file"
     text = path.suffix.lower() in (".txt", ".lst", ".list", ".csv") or not front
     if text and b"\0" not in front:

@@ -15,7 +15,7 @@ from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.crs import CrsUnits, read_crs
 from wavebatch.files.las.read_points import open_points
-from wavebatch.files.strip.packets import PacketPlace, locate_packets, read_descriptors, settle_headerless
+from wavebatch.files.strip.packets import COMPRESSED, PacketPlace, locate_packets, read_descriptors, settle_headerless
 
 _FIRST_POINTS = 10_000
 """Points that show from where a .wdp without header counts its byte offsets."""
@@ -34,6 +34,11 @@ class StripFacts(CheckedHeader):
     crs: str | None
     units: tuple[CrsUnits, ...]
     """Units of the coordinates, one entry from the WKT and one from the GeoTIFF keys, if these are there."""
+
+    @property
+    def compressed(self) -> frozenset[int]:
+        """Indices of descriptors with compressed packets."""
+        return frozenset(index for index, kind in self.compression.items() if kind == COMPRESSED)
 
 
 def find_facts(path: Path, direction: str, headerless: bool) -> StripFacts:

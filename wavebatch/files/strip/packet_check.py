@@ -15,7 +15,7 @@ from wavebatch.core.echoes import EchoFlag
 from wavebatch.files.disk.raw_bytes import widen
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.packet_vectors import RANGE_RATIO, measure_ratio
-from wavebatch.files.strip.packets import MAX_SAMPLES, refuse_compressed
+from wavebatch.files.strip.packets import BLOCK_BYTES, COMPRESSED, MAX_SAMPLES, PacketFile, refuse_compressed
 
 INDEX_BITS = np.uint64(8)
 """Bits of the descriptor index in a key; see `Judged.keys`."""
@@ -42,6 +42,7 @@ class Reason(IntEnum):
     NO_GEOMETRY = 6
     OVERFULL = 7
     PACKED = 8
+    DAMAGED = 9
 
 
 REASON_TEXTS = {
@@ -53,6 +54,7 @@ REASON_TEXTS = {
     Reason.OVERFULL: "share one packet with more points than a pulse can have",
     Reason.PACKED: "have samples of other than 8, 16 or 32 bits, and a packet size that fits neither whole bytes "
     "nor packed samples of 10 or 12 bits",
+    Reason.DAMAGED: "have a compressed packet that is damaged",
 }
 
 
@@ -89,14 +91,16 @@ class Judge:
 
     def __init__(self, facts: StripFacts) -> None:
         self._facts = facts
-        self._known, self._good, self._compressed = (np.zeros(256, bool) for _ in range(3))
+        self._known, self._good, self._compressed, self._packs = (np.zeros(256, bool) for _ in range(4))
         self._width, self._samples = np.ones(256, np.int64), np.zeros(256, np.int64)
         self._odd, self._packed = np.zeros(256, bool), np.full(256, -1, np.int64)
         for index, digitizer in facts.digitizers.items():
             self._known[index] = True
             self._good[index] = 0 < digitizer.bits <= MOST_BITS and 0 < digitizer.spacing <= MAX_SPACING
             self._good[index] &= 0 < digitizer.n_samples <= MAX_SAMPLES
-            self._compressed[index] = facts.compression.get(index, 0) != 0 and digitizer.n_samples > 0
+            kind = facts.compression.get(index, 0)
+            self._packs[index] = kind == COMPRESSED and digitizer.bits in (8, 16)
+            self._compressed[index] = kind != 0 and not self._packs[index] and digitizer.n_samples > 0
             if self._good[index]:
                 self._width[index], self._samples[index] = digitizer.width, digitizer.n_samples
                 self._odd[index] = digitizer.bits not in WHOLE_BITS
@@ -131,10 +135,13 @@ class Judge:
         has = (index > 0) & (size > 0)
         self._refuse_compressed(index[has])
         n_samples = np.minimum(self._samples[index], size // self._width[index])
+        packs = self._packs[index]
+        # A compressed packet has all samples of its descriptor, in any number of bytes.
+        n_samples = np.where(packs & (size > self._width[index]), self._samples[index], np.where(packs, 0, n_samples))
         # Only the size of the packet shows whether samples of 12 bits have two bytes each.
-        packed = size == self._packed[index]
+        packed = (size == self._packed[index]) & ~packs
         n_samples = np.where(packed, self._samples[index], n_samples)
-        room = self._end - np.where(packed, size, n_samples * self._width[index])
+        room = self._end - np.where(packed | packs, size, n_samples * self._width[index])
         inside = (room >= 0) & (offset <= np.maximum(room, 0).astype(np.uint64)) & (offset >= np.uint64(self._least))
         keys = (offset << INDEX_BITS) | index
         reason = np.zeros(len(points), np.uint8)
@@ -148,9 +155,26 @@ class Judge:
         reason[~self._good[index]] = Reason.BAD_DESCRIPTOR
         reason[~self._known[index]] = Reason.NO_DESCRIPTOR
         reason[~has] = Reason.NO_WAVEFORM
+        if packs.any():
+            rows = np.flatnonzero(packs & (reason == Reason.USABLE))
+            reason[rows[~self._decode(index[rows], offset[rows], size[rows])]] = Reason.DAMAGED
         good = reason == Reason.USABLE
         short = good & (n_samples < self._samples[index])
         return Judged(reason, np.where(good, n_samples, 0).astype(np.int32), keys, short, packed)
+
+    def _decode(self, index: np.ndarray, offset: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Whether compressed packets are whole, bool (n,): only decoding them shows it."""
+        good = np.zeros(len(index), bool)
+        packets = PacketFile(self._facts.packets, self._facts.compressed)
+        try:
+            for kind in np.unique(index).tolist():
+                same = np.flatnonzero(index == kind)
+                n_samples, bits = int(self._samples[kind]), 8 * int(self._width[kind])
+                for rows in np.array_split(same, -(-len(same) * n_samples * bits // 8 // BLOCK_BYTES)):
+                    good[rows] = packets.decode(offset[rows], size[rows], n_samples, bits)[1]
+        finally:
+            packets.close()
+        return good
 
     def _refuse_compressed(self, index: np.ndarray) -> None:
         bad = self._compressed[index]

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,11 +26,14 @@ from wavebatch.files.las.header import (
     LasHeader,
     find_evlrs,
 )
+from wavebatch.kernels.signal.compressed import MOST_BYTES, decode_packets
 
 MAX_SAMPLES = 1 << 16
 """Longer waveforms are damage: digitizers record a few hundred samples."""
 BLOCK_BYTES = 1 << 25
 """Most bytes of samples in one block, for any number of waveforms."""
+COMPRESSED = 1
+"""Compression type of LAStools."""
 MOST_VOLTS = 1e6
 """Largest gain [V per count] and offset [V] of a descriptor; digitizers have a few volts, larger ones are damage."""
 
@@ -98,34 +101,42 @@ def read_descriptors(header: LasHeader) -> tuple[dict[int, Digitizer], dict[int,
 def locate_packets(checked: CheckedHeader, compression: dict[int, int], headerless: bool) -> PacketPlace:
     """Return the place of the packets: in the strip itself, or in the .wdp next to it.
 
+    Packets of LAStools may be compressed, in a .wdz.
     headerless: accept a .wdp without its 60-byte header; `settle_headerless` finds how its offsets count.
     Raises InputError if packets are missing, compressed, or in a file that is not a .wdp.
     """
     header, path = checked.header, checked.path
-    if compression and all(compression.values()):
+    if compression and min(compression.values()) > COMPRESSED:
         raise refuse_compressed(path, next(iter(compression.values())))
     if header.global_encoding & WAVES_INTERNAL:
         return _locate_internal(checked)
     packet_file, external = _find_packet_file(path), header.global_encoding & WAVES_EXTERNAL
+    packed = _find_packet_file(path, "wdz")
+    if COMPRESSED in compression.values() and packed is not None:
+        packet_file = packed
     warning = "the header does not give the place of the packets (global encoding bits 1 and 2)"
     if header.waveform_start and not external:
         place, where = _locate_internal(checked), "the record in the file"
     elif packet_file is not None:
         place, where = _locate_external(checked, packet_file, headerless), packet_file.name
-    elif _find_packet_file(path, "wdz") is not None:
-        raise refuse_compressed(path, 1)
+    elif packed is not None:
+        raise InputError(
+            f"{path}: its packets are in {packed.name}, which holds compressed ones, but its descriptors say that they "
+            f"are not compressed: get {path.with_suffix('.wdp').name}, or the strip that belongs to {packed.name}"
+        )
     elif external:
-        raise InputError(f"{path}: its packets are missing: put {path.with_suffix('.wdp').name} next to the strip")
+        name = path.with_suffix(".wdz" if COMPRESSED in compression.values() else ".wdp").name
+        raise InputError(f"{path}: its packets are missing: put {name} next to the strip")
     else:
         return PacketPlace(None, False, 0, 0, 0, (f"{warning}, and there is no .wdp next to the strip",))
     return place if external else replace(place, warnings=(*place.warnings, f"{warning}; they are read from {where}"))
 
 
 def refuse_compressed(path: Path, kind: int) -> InputError:
-    """Return the error for compressed packets, with the command that decompresses them."""
+    """Return the error for packets of an unknown compression, with the command that may decompress them."""
     return InputError(
-        f"{path}: its packets are compressed (type {kind}, LAStools .wdz), which LAS does not define; decompress them "
-        f"first: laszip -i {path.name} -o {path.stem}_raw.las -waveform"
+        f"{path}: its packets are compressed (type {kind}), which LAS does not define; wavebatch reads type 1 with 8 "
+        f"or 16 bits; decompress them first: laszip -i {path.name} -o {path.stem}_raw.las -waveform"
     )
 
 
@@ -186,10 +197,10 @@ def settle_headerless(place: PacketPlace, points: np.ndarray) -> PacketPlace:
 
 
 class PacketFile:
-    """Reads the samples of many packets at once."""
+    """Reads the samples of many packets at once; compressed: indices of descriptors with compressed packets."""
 
-    def __init__(self, place: PacketPlace) -> None:
-        self._place = place
+    def __init__(self, place: PacketPlace, compressed: Collection[int] = ()) -> None:
+        self._place, self._compressed = place, compressed
         self._file = None
         self._buffer = np.empty(0, np.uint8)
         if place.file is not None:
@@ -201,7 +212,7 @@ class PacketFile:
         if self._file is not None:
             self._file.close()
 
-    def read(self, offsets: np.ndarray, n_samples: int, bits: int) -> np.ndarray:
+    def read(self, offsets: np.ndarray, n_samples: int, bits: int, descriptor: int = 0) -> np.ndarray:
         """Return raw counts of packets that were checked before.
 
         Parameters
@@ -210,12 +221,17 @@ class PacketFile:
             Byte offsets as points have them.
         n_samples, bits : int
             Samples per packet, and bits per sample: 8, 16 or 32.
+        descriptor : int
+            Index of their descriptor.
 
         Returns
         -------
         u1, u2 or u4 (n, n_samples), read-only
         """
-        samples = self.read_bytes(offsets, n_samples * (bits // 8)).view(f"<u{bits // 8}")
+        if descriptor in self._compressed:
+            samples, _ = self.decode(offsets, np.full(len(offsets), MOST_BYTES * n_samples + 16), n_samples, bits)
+        else:
+            samples = self.read_bytes(offsets, n_samples * (bits // 8)).view(f"<u{bits // 8}")
         samples.flags.writeable = False
         return samples
 
@@ -224,6 +240,29 @@ class PacketFile:
         starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
         with reporting_reads(self._place.file, "packets ", "; check the disk"):
             return self._gather(starts, width)
+
+    def decode(
+        self, offsets: np.ndarray, sizes: np.ndarray, n_samples: int, bits: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return counts of compressed packets, and which of them are whole, bool (n,).
+
+        sizes: bytes of the packets, or more; i8 (n,).
+        """
+        if not len(offsets):
+            return np.empty((0, n_samples), f"<u{bits // 8}"), np.empty(0, bool)
+        starts = (offsets + np.uint64(self._place.base % 2**64)).astype(np.int64)
+        order = np.argsort(starts, kind="stable")
+        ends = np.minimum(starts + sizes, self._place.end)[order]
+        samples, good = np.zeros((len(starts), n_samples), f"<u{bits // 8}"), np.zeros(len(starts), bool)
+        with reporting_reads(self._place.file, "packets ", "; check the disk"):
+            for a, z in _find_runs(starts[order], int(sizes.max(initial=0)), BLOCK_BYTES):
+                first, last = int(starts[order[a]]), int(ends[a:z].max())
+                buffer = self._take_buffer(last - first)
+                read_exactly(self._file.fileno(), buffer, first)
+                here = starts[order[a:z]] - first
+                rows = order[a:z]
+                samples[rows], good[rows] = decode_packets(buffer, here, ends[a:z] - first, n_samples, bits // 8)
+        return samples, good
 
     def _gather(self, starts: np.ndarray, width: int) -> np.ndarray:
         n = len(starts)
@@ -260,9 +299,11 @@ class PacketFile:
         return self._buffer[:size]
 
 
-def _find_runs(ordered: np.ndarray, width: int) -> Iterator[tuple[int, int]]:
-    """Slices of sorted starts with only small gaps."""
-    cuts = np.flatnonzero(np.diff(ordered) > width + _GAP) + 1
+def _find_runs(ordered: np.ndarray, width: int, most: int = 2**62) -> Iterator[tuple[int, int]]:
+    """Slices of sorted starts with only small gaps, and at most about so many bytes long."""
+    cut = np.diff(ordered) > width + _GAP
+    cut |= np.diff((ordered - ordered[:1]) // most) > 0
+    cuts = np.flatnonzero(cut) + 1
     edges = [0, *cuts.tolist(), len(ordered)]
     return zip(edges[:-1], edges[1:], strict=True)
 

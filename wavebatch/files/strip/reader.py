@@ -117,7 +117,7 @@ class StripReader(Closing):
         self._points = open_points(facts)
         try:
             self._judge = Judge(facts)
-            self._packets = PacketFile(facts.packets)
+            self._packets = PacketFile(facts.packets, facts.compressed)
         except BaseException:
             self._points.close()
             raise
@@ -229,6 +229,27 @@ class StripReader(Closing):
         Trailing padding is cut off, other fill is marked as missing, counts of inverted waveforms are mirrored.
         """
         geometry = _Geometry(unit, self.facts)
+        for samples, digitizer, chosen in self.read_counts(unit, rows, size):
+            stored = self.facts.digitizers[digitizer.index]
+            length = recorded_lengths(samples)
+            for recorded in np.unique(length).tolist():
+                part = np.flatnonzero(length == recorded)
+                kept = samples if len(part) == len(chosen) else samples[part]
+                kept = np.ascontiguousarray(kept[:, :recorded])
+                missing = find_fill(kept, stored.max_count, digitizer.max_count)
+                if missing is not None:
+                    kept = quiet_fill(kept, missing)
+                kept.flags.writeable = False
+                yield geometry.build_block(chosen[part], digitizer, kept, missing), chosen[part]
+
+    def read_counts(
+        self, unit: Unit, rows: np.ndarray, size: int
+    ) -> Iterator[tuple[np.ndarray, Digitizer, np.ndarray]]:
+        """Yield counts of the packets `rows` (k,) of the unit as they are stored, in groups of one kind.
+
+        Each group has its samples (n, s), their digitizer and its rows of unit.packets. Counts of inverted waveforms
+        are mirrored.
+        """
         table = unit.packets
         kinds = (table.digitizer[rows].astype(np.int64) << 32) | (table.packed[rows].astype(np.int64) << 31)
         kinds |= table.n_samples[rows]
@@ -244,16 +265,7 @@ class StripReader(Closing):
             for begin in range(0, len(same), step):
                 chosen = same[begin : begin + step]
                 samples = read_samples(self._packets, table.offset[chosen], n_samples, stored, packed, form)
-                length = recorded_lengths(samples)
-                for recorded in np.unique(length).tolist():
-                    part = np.flatnonzero(length == recorded)
-                    kept = samples if len(part) == len(chosen) else samples[part]
-                    kept = np.ascontiguousarray(kept[:, :recorded])
-                    missing = find_fill(kept, stored.max_count, digitizer.max_count)
-                    if missing is not None:
-                        kept = quiet_fill(kept, missing)
-                    kept.flags.writeable = False
-                    yield geometry.build_block(chosen[part], digitizer, kept, missing), chosen[part]
+                yield samples, digitizer, chosen
 
 
 class _Geometry:

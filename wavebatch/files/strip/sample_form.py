@@ -76,7 +76,7 @@ def read_samples(
         rows = packets.read_bytes(offsets, packed_bytes(n_samples, stored.bits))
         samples = unpack_samples(rows, n_samples, stored.bits, form.little)
     else:
-        samples = packets.read(offsets, n_samples, 8 * stored.width)
+        samples = packets.read(offsets, n_samples, 8 * stored.width, stored.index)
     if not form.inverted:
         return samples
     return np.subtract(samples.dtype.type(form.digitizer(stored, packed).max_count), samples)

@@ -16,7 +16,7 @@ from wavebatch.core.units import PS_PER_NS
 from wavebatch.core.waveforms import Digitizer
 from wavebatch.files.disk.publish import Draft, refuse_existing, reporting
 from wavebatch.files.las.extra_bytes import ExtraRecord, build_dtype
-from wavebatch.files.las.header import EVLR_HEADER_SIZE, WAVES_EXTERNAL, WAVES_INTERNAL, LasHeader, Vlr
+from wavebatch.files.las.header import EVLR_HEADER_SIZE, STANDARD_TIME, WAVES_EXTERNAL, WAVES_INTERNAL, LasHeader, Vlr
 from wavebatch.files.las.write_points import PointFile, waveform_head
 from wavebatch.files.strip.packets import DESCRIPTOR
 
@@ -48,6 +48,12 @@ class FullwaveWriter(PointFile):
         Further VLRs, written unchanged.
     toward : bool
         Whether the vectors x_t, y_t, z_t are stored toward the sensor.
+    week : bool
+        Whether GPS times are seconds of the week, not standard GPS time less 1e9 s.
+    system : str
+        The sensor, for the header.
+    source : int
+        File source id.
 
     Raises
     ------
@@ -71,6 +77,9 @@ class FullwaveWriter(PointFile):
         extra_bytes: Sequence[ExtraRecord] = (),
         records: Sequence[Vlr] = (),
         toward: bool = True,
+        week: bool = False,
+        system: str = "OTHER",
+        source: int = 0,
         overwrite: bool = False,
     ) -> None:
         target = Path(target)
@@ -82,6 +91,10 @@ class FullwaveWriter(PointFile):
             numbers, point_format, scales, offsets, wkt, WAVES_INTERNAL if internal else WAVES_EXTERNAL
         )
         header.vlrs = [*map(_build_descriptor, digitizers), *header.vlrs, *records]
+        header.system_identifier, header.file_source_id = system.encode("latin-1", "replace")[:32], source
+        if week:
+            header.global_encoding &= ~STANDARD_TIME
+        self.scales, self.offsets = header.scales, header.offsets
         super().__init__(target, header, build_dtype(point_format, extra_bytes), extra_bytes, overwrite=overwrite)
         packet_file = target if internal else target.with_suffix(".wdp")
         try:

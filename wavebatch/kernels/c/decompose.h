@@ -140,13 +140,13 @@ static void write_echoes(const Solution *s, int64_t begin, int64_t cluster, int6
    not done, and in `found` the number of echoes; -1 where there is no memory. */
 EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, const Settings *s, int64_t from, Echoes *out, int64_t *found) {
     Work work = {0};
-    int64_t i = make_taps(&work, s) ? from : -1;
+    int64_t i = make_taps(&work, s, block->length) ? from : -1;
     *found = 0;
     for (; i >= 0 && i < clusters->n; i++) {
         if (!set_starts(clusters, i, &work)) { i = -1; break; }
         cut_window(block, s, clusters->waveform[i], clusters->low[i], clusters->high[i], &work.window);
         if (decompose_window(s, &work) < 0) { i = -1; break; }
-        if (s->skew_spread > 0) free_skews(s, &work);
+        if (s->skew_spread > 0 && s->pulse.kind != LOG_NORMAL) free_skews(s, &work);
         if (s->pulse.kind == LOG_NORMAL) tied_skews(origin_of(s, &work.window), &work.best);
         if (*found + work.best.k > out->room) break;
         write_echoes(&work.best, clusters->low[i], i, *found, out);
@@ -159,7 +159,7 @@ EXPORT int64_t decompose_clusters(const Block *block, const Clusters *clusters, 
 /* Fall of chi2 that one more echo promises beside the candidates of each cluster, which are the fit; -1 without memory. */
 EXPORT int64_t promise_echoes(const Block *block, const Clusters *clusters, const Settings *s, double *promise) {
     Work work = {0};
-    int64_t done = make_taps(&work, s);
+    int64_t done = make_taps(&work, s, block->length);
     for (int64_t i = 0; i < clusters->n && done; i++) {
         const int64_t k = clusters->number[i];
         done = set_starts(clusters, i, &work) && reserve(&work, k + 1, VECTORS(clusters->high[i] - clusters->low[i]));

@@ -14,3 +14,6 @@
 #include "fit.h"
 #include "next_echo.h"
 #include "decompose.h"
+#include "signal.h"
+#include "elementary.h"
+#include "wdz.h"

@@ -39,9 +39,10 @@ static int is_misfit(const Settings *s, const Work *work, const Fit *fit) {
     return 0.25 * highest > s->gate_residual * SMOOTH_GAIN * w->std || shape > s->gate_hermite;
 }
 
-/* Half of a Gaussian of height 1 with the width of a new echo, up to three widths, and after it the same squared. */
-static int make_taps(Work *work, const Settings *s) {
-    work->reach = (int64_t)ceil(3 * s->width_ref);
+/* Half of a Gaussian of height 1 with the width of a new echo, up to three widths, and after it the same squared. No
+   more than a waveform is long: else a width out of proportion would take all memory. */
+static int make_taps(Work *work, const Settings *s, int64_t length) {
+    work->reach = (int64_t)ceil(fmin(3 * s->width_ref, length));
     if (!enlarge(&work->taps, 2 * (work->reach + 1) * sizeof(float))) return 0;
     for (int64_t i = 0; i <= work->reach; i++) {
         double z = i / s->width_ref, tap = exp_lanes(ALL(-0.5 * z * z))[0];

@@ -2,13 +2,22 @@
 
 static const float OUTSIDE = -1e6f;            /* position of a sample that takes no part: every pulse is 0 there */
 
-INLINE float count_at(const Block *block, int64_t i) {
-    switch (block->bytes) {
-        case 1: return ((const uint8_t *)block->samples)[i];
-        case 2: return ((const uint16_t *)block->samples)[i];
-        case 4: return ((const uint32_t *)block->samples)[i];
-        default: return ((const float *)block->samples)[i];
-    }
+/* Counts i .. i + n - 1 of a block as floats. */
+static void read_counts(const Block *block, int64_t i, int64_t n, float *restrict out) {
+    const uint8_t *bytes = (const uint8_t *)block->samples + i;
+    const uint16_t *words = (const uint16_t *)block->samples + i;
+    const uint32_t *longs = (const uint32_t *)block->samples + i;
+    if (block->bytes == 1) for (int64_t x = 0; x < n; x++) out[x] = bytes[x];
+    else if (block->bytes == 2) for (int64_t x = 0; x < n; x++) out[x] = words[x];
+    else if (block->bytes == 4) for (int64_t x = 0; x < n; x++) out[x] = longs[x];
+    else memcpy(out, (const float *)block->samples + i, n * sizeof(float));
+}
+
+/* Takes the level of samples i .. of a waveform off. */
+static void take_level(const Block *block, int64_t waveform, int64_t i, int64_t n, float *restrict y) {
+    const float *levels = block->baseline + (block->baseline_per_sample ? i : waveform), level = *levels;
+    if (block->baseline_per_sample) for (int64_t x = 0; x < n; x++) y[x] -= levels[x];
+    else for (int64_t x = 0; x < n; x++) y[x] -= level;
 }
 
 /* Noise without signal over noise at each sample: var = std^2 + gain * signal, from the smoothed signal, H12. */
@@ -29,19 +38,17 @@ static void weigh(Window *w, double gain) {
 /* Cuts samples low .. high - 1 of a waveform, above its baseline. */
 static void cut_window(const Block *block, const Settings *s, int64_t waveform, int64_t low, int64_t high, Window *w) {
     float *y = (float *)w->y, *x = (float *)w->x, *clipped = (float *)w->clipped;
-    int64_t first = waveform * block->length;
-    w->begin = low; w->n = high - low; w->vectors = VECTORS(w->n);
-    w->used = w->n; w->std = block->std[waveform];
+    const int64_t first = waveform * block->length + low, n = high - low;
+    const float top = s->clip;
+    w->begin = low; w->n = w->used = n; w->vectors = VECTORS(n); w->std = block->std[waveform];
     w->any_clipped = 0; w->is_weighted = s->noise_gain > 0;
-    for (int64_t i = 0; i < w->n; i++) {
-        int64_t at = first + low + i;
-        float count = count_at(block, at);
-        y[i] = count - block->baseline[block->baseline_per_sample ? at : waveform];
-        x[i] = i;
-        clipped[i] = count >= s->clip;
-        w->any_clipped |= count >= s->clip;
-        if (block->missing && block->missing[at]) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; w->used--; }
-    }
-    for (int64_t i = w->n; i < w->vectors * LANES; i++) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; }
+    read_counts(block, first, n, y);
+    for (int64_t i = 0; i < n; i++) x[i] = i;
+    for (int64_t i = 0; i < n; i++) w->any_clipped |= y[i] >= top;
+    for (int64_t i = 0; i < n && w->any_clipped; i++) clipped[i] = y[i] >= top;
+    take_level(block, waveform, first, n, y);
+    for (int64_t i = 0; i < n && block->missing; i++)
+        if (block->missing[first + i]) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; w->used--; }
+    for (int64_t i = n; i < w->vectors * LANES; i++) { y[i] = 0; x[i] = OUTSIDE; clipped[i] = 0; }
     if (w->is_weighted) weigh(w, s->noise_gain);
 }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.signal.signal import sum_samples
 
 
@@ -46,12 +47,12 @@ def fit_closed_form(y: np.ndarray, fraction: float) -> tuple[np.ndarray, np.ndar
     safe = np.where(used, y, 1.0)
     weight = np.where(used, y * y, 0.0)
     x = np.arange(-middle, y.shape[1] - middle, dtype=np.float64)
-    c0, c1, c2 = fit_parabola(weight, x, np.log(safe), axis=1)
+    c0, c1, c2 = fit_parabola(weight, x, log(safe), axis=1)
     holds = c2 < 0
     c2 = np.where(holds, c2, -1.0)
     time = -c1 / (2 * c2)
     holds &= np.abs(time) < 2
-    amplitude = np.exp(np.clip(c0 - c1 * c1 / (4 * c2), -50, 50))
+    amplitude = exp(np.clip(c0 - c1 * c1 / (4 * c2), -50, 50))
     return amplitude, time, np.sqrt(-1 / (2 * c2)), holds
 
 
@@ -82,9 +83,9 @@ def estimate_starts(
     floor = 0.05 * peak
     used = np.maximum(y, floor[None])
     weight = np.where((at == sample[None] + offsets[:, None]) & (y > floor), used * used, 0.0)
-    log = np.log(np.maximum(used, 1e-12))
+    logarithm = log(np.maximum(used, 1e-12))
     x = offsets[:, None].astype(np.float64)
-    c0, c1, c2 = fit_parabola(weight, x, log, axis=0)
+    c0, c1, c2 = fit_parabola(weight, x, logarithm, axis=0)
     good = (c2 < -1e-4) & np.isfinite(c1)
     safe = np.where(good, c2, -1.0)
     shift = -c1 / (2 * safe)
@@ -92,7 +93,7 @@ def estimate_starts(
     variance = -1 / (2 * safe)
     time = sample + np.where(good, shift, 0.0)
     narrow = np.sqrt(np.maximum(variance - 0.5, 0.1))
-    amplitude = np.where(good, np.exp(np.clip(c0 - c1 * c1 / (4 * safe), -20, 20)), peak)
+    amplitude = np.where(good, exp(np.clip(c0 - c1 * c1 / (4 * safe), -20, 20)), peak)
     amplitude *= np.where(good, np.sqrt(1 + 0.5 / narrow**2), 1.1)
     return amplitude, time, np.where(good, narrow, width)
 
@@ -118,7 +119,7 @@ def start_errors(amplitude: np.ndarray, width: np.ndarray, std: np.ndarray) -> t
     """
     spread = width * width + 0.5
     x = np.arange(-2, 3, dtype=spread.dtype)[:, None]
-    shape = np.exp(-0.5 * x * x / spread)
+    shape = exp(-0.5 * x * x / spread)
     s0, s2, s4 = (sum_samples(shape * shape * x**p) for p in (0, 2, 4))
     determinant = s0 * s4 - s2 * s2
     # Of the parabola c0 + c2 x^2: width sqrt(-1 / (2 c2) - 1/2), amplitude exp(c0) sqrt(1 + 1 / (2 width^2)).

@@ -6,7 +6,6 @@ Called by stages/decompose and the survey.
 from __future__ import annotations
 
 import ctypes
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,20 +13,7 @@ from wavebatch.kernels import library
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape
-from wavebatch.kernels.library import place
-
-
-class Samples(NamedTuple):
-    """n waveforms of s samples, with their noise."""
-
-    counts: np.ndarray
-    """uint8, uint16, uint32 or float32 (n, s) [count]."""
-    baseline: np.ndarray
-    """Level of each waveform, float32 (n,), or of each sample (n, s) [count]."""
-    std: np.ndarray
-    """Noise of each waveform, float32 (n,) [count]."""
-    missing: np.ndarray | None = None
-    """Samples that were not recorded, bool (n, s); None where there is none."""
+from wavebatch.kernels.library import Samples, call, place
 
 
 def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings) -> Solution:
@@ -53,7 +39,7 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
     ----------
     docs/algorithms.md 2.3 and 4.2.
     """
-    call = _Call(samples, candidates, clusters, settings)
+    problem = _as_problem(samples, candidates, clusters, settings)
     c = len(clusters.number)
     number, converged = np.zeros(c, np.int64), np.zeros(c, bool)
     misfit, cost = np.zeros(c), np.zeros(c)
@@ -63,7 +49,7 @@ def decompose_clusters(samples: Samples, candidates: Candidates, clusters: Clust
         columns = (number, converged, misfit, cost, *echoes)
         out = library.Echoes(room, *(column.ctypes.data for column in columns))
         found = ctypes.c_int64()
-        reached = call.run("decompose_clusters", ctypes.c_int64(done), ctypes.byref(out), ctypes.byref(found))
+        reached = call("decompose_clusters", *problem, ctypes.c_int64(done), out, ctypes.byref(found))
         parts.append([column[: found.value] for column in echoes])
         room, done = 2 * room, reached
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else _no_echoes()
@@ -76,7 +62,7 @@ def promise_echoes(samples: Samples, echoes: Candidates, clusters: Clusters, set
     As `decompose_clusters`, with echoes that are the fit itself (docs/algorithms.md 2.3).
     """
     promise = np.zeros(len(clusters.number))
-    _Call(samples, echoes, clusters, settings).run("promise_echoes", ctypes.c_void_p(promise.ctypes.data))
+    call("promise_echoes", *_as_problem(samples, echoes, clusters, settings), promise)
     return promise
 
 
@@ -84,65 +70,45 @@ def _no_echoes() -> tuple[np.ndarray, ...]:
     return np.empty((0, 4)), np.empty((0, 4)), np.empty((0, 2)), np.empty(0, bool)
 
 
-class _Call:
-    """The structures of one call, and the arrays to which they point."""
-
-    def __init__(self, samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings):
-        self.keep = _check(samples, candidates, clusters)
-        samples, candidates, clusters = self.keep
-        counts, baseline, std, missing = samples
-        kind = 0 if counts.dtype == np.float32 else counts.dtype.itemsize
-        self.block = library.Block(
-            counts.ctypes.data, counts.shape[1], kind, place(baseline, np.float32), baseline.ndim - 1,
-            place(std, np.float32), None if missing is None else place(missing, np.bool_),
-        )  # fmt: skip
-        starts = candidates.amplitude, candidates.time, candidates.width
-        self.clusters = library.Clusters(
-            len(clusters.number), *(place(field, np.int64) for field in clusters),
-            *(place(field, np.float64) for field in starts),
-        )  # fmt: skip
-        self.settings, self.shape = _as_structure(settings)
-
-    def run(self, name: str, *arguments: object) -> int:
-        """Calls a function of the library."""
-        function = getattr(library.load(), name)
-        structures = (ctypes.byref(part) for part in (self.block, self.clusters, self.settings))
-        result = function(*structures, *arguments)
-        if result < 0:
-            raise MemoryError("no memory for a window of so many samples and echoes")
-        return result
+def _as_problem(
+    samples: Samples, candidates: Candidates, clusters: Clusters, settings: Settings
+) -> tuple[library.Block, library.Clusters, library.Settings]:
+    """The structures of one call; each holds the arrays to which it points."""
+    samples = samples.checked()
+    candidates, clusters = _check(samples, candidates, clusters)
+    windows = library.Clusters(
+        len(clusters.number), *(place(field, np.int64) for field in clusters),
+        *(place(field, np.float64) for field in (candidates.amplitude, candidates.time, candidates.width)),
+    )  # fmt: skip
+    windows.arrays = candidates, clusters
+    return samples.as_block(), windows, _as_structure(settings)
 
 
-def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tuple[Samples, Candidates, Clusters]:
-    """The arrays as the library reads them; raises ValueError where it would read outside of them."""
-    counts, baseline, std, missing = samples
-    n, s = counts.shape
-    if counts.dtype not in (np.uint8, np.uint16, np.uint32, np.float32):
-        raise ValueError(f"samples of type {counts.dtype} cannot be decomposed")
-    if baseline.shape not in ((n,), (n, s)) or std.shape != (n,) or (missing is not None and missing.shape != (n, s)):
-        raise ValueError(f"level, noise or gaps do not have the shape of {n} waveforms of {s} samples")
+def _check(samples: Samples, candidates: Candidates, clusters: Clusters) -> tuple[Candidates, Clusters]:
+    """The same as the library reads them; raises ValueError where it would read outside of them."""
+    n, s = samples.counts.shape
     waveform, low, high, first, number = clusters
     m = len(candidates.time)
+    if {len(column) for column in clusters} != {len(number)} or {len(column) for column in candidates[1:]} != {m}:
+        raise ValueError("the columns of clusters or candidates differ in length")
     inside = (waveform >= 0) & (waveform < n) & (low >= 0) & (low < high) & (high <= s)
     if not (inside & (number > 0) & (first >= 0) & (first + number <= m)).all():
         raise ValueError("a window lies outside of its waveform, or its candidates outside of their table")
-    finite = all(np.isfinite(column).all() for column in (baseline, std, *candidates[1:]))
-    if not (finite and (std > 0).all()):
-        raise ValueError("levels, noise and candidates must be finite, and the noise above 0")
-    flat = [np.ascontiguousarray(field) for field in (counts, baseline, std)]
+    if not all(np.isfinite(column).all() for column in candidates[1:]):
+        raise ValueError("candidates must be finite")
     return (
-        Samples(flat[0], flat[1].astype(np.float32, copy=False), flat[2].astype(np.float32, copy=False),
-                None if missing is None else np.ascontiguousarray(missing)),
         Candidates(*(np.ascontiguousarray(field, np.float64) for field in candidates)),
         Clusters(*(np.ascontiguousarray(field, np.int64) for field in clusters)),
-    )  # fmt: skip
+    )
 
 
-def _as_structure(settings: Settings) -> tuple[library.Settings, tuple[np.ndarray, ...]]:
-    """The settings for the library, and the arrays that they point to."""
+def _as_structure(settings: Settings) -> library.Settings:
+    """The settings for the library."""
     shape = settings.shape
     components = np.array(shape.components, np.float64).reshape(-1, 3)
     rows = (np.zeros(2, np.float32),) * 2 if shape.table is None else (shape.table.value, shape.table.slope)
+    if not 0 < settings.width_ref < np.inf or not 2 <= len(rows[0]) == len(rows[1]):
+        raise ValueError("the width of the pulse must be above 0, and its table have a slope for each of its rows")
     first, step = (0.0, 1.0) if shape.table is None else shape.table[:2]
     pulse = library.Pulse(
         _kind(shape), shape.kappa, shape.power, len(components), place(components, np.float64),
@@ -150,7 +116,9 @@ def _as_structure(settings: Settings) -> tuple[library.Settings, tuple[np.ndarra
     )  # fmt: skip
     values = settings._asdict() | {"pulse": pulse, "clip": np.inf if settings.clip is None else settings.clip}
     del values["shape"]
-    return library.Settings(**values), (components, *rows)
+    structure = library.Settings(**values)
+    structure.arrays = components, *rows
+    return structure
 
 
 def _kind(shape: PulseShape) -> int:

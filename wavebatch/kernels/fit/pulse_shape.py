@@ -12,6 +12,7 @@ import numpy as np
 import scipy  # parts of it load when they are first asked for
 
 from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.kernels.elementary import exp, log, log1p
 from wavebatch.kernels.signal.runs import lobe_edges
 
 NO_SKEW = 1e-6
@@ -98,7 +99,7 @@ def evaluate_unit(z: np.ndarray) -> tuple[np.ndarray, ...]:
 def _evaluate_gaussian(z: np.ndarray) -> tuple[np.ndarray, ...]:
     pulse = z * z
     pulse *= np.float32(-0.5)
-    np.exp(pulse, out=pulse)
+    pulse = exp(pulse)
     by_time = pulse * z
     z *= by_time
     return pulse, by_time, z
@@ -109,9 +110,9 @@ def _evaluate_skewed(kappa: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
     inside = np.float32(kappa) * z
     gone = inside <= np.float32(-0.999999)
     inside[gone] = 0
-    level = np.log1p(inside)
+    level = log1p(inside)
     level *= np.float32(1 / kappa)
-    pulse = np.exp(np.float32(-0.5) * level * level)
+    pulse = exp(np.float32(-0.5) * level * level)
     pulse[gone] = 0
     inside += np.float32(1)
     by_time = pulse * level
@@ -123,8 +124,8 @@ def _evaluate_power(power: float, z: np.ndarray) -> tuple[np.ndarray, ...]:
     """f = exp(-|z|^p / 2)."""
     kind = z.dtype.type
     distance = np.maximum(np.abs(z), kind(1e-6))
-    by_width = np.exp(kind(power) * np.log(distance))
-    pulse = np.exp(kind(-0.5) * by_width)
+    by_width = exp(kind(power) * log(distance))
+    pulse = exp(kind(-0.5) * by_width)
     by_width *= kind(0.5 * power) * pulse
     return pulse, np.copysign(by_width / distance, z), by_width
 
@@ -203,7 +204,7 @@ def pulse_tail(shape: PulseShape, width: float) -> PulseTail | None:
     lag = np.arange(-np.ceil(reach / TAIL_STEP), np.ceil(reach / TAIL_STEP) + 1) * TAIL_STEP
     time, wide = np.zeros(1), np.full(1, width)
     whole = evaluate_pulse(shape, lag[:, None], time, wide)[0][:, 0]
-    value = np.where(np.abs(lag) > CORE * width, whole - np.exp(-0.5 * (lag / width) ** 2), 0.0)
+    value = np.where(np.abs(lag) > CORE * width, whole - exp(-0.5 * (lag / width) ** 2), 0.0)
     return PulseTail(float(lag[0]), value)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from wavebatch.kernels.elementary import exp, log1p
 from wavebatch.kernels.fit.pulse_shape import NO_SKEW, PulseShape, evaluate_pulse
 
 ROWS = 8192
@@ -109,9 +110,9 @@ def skewed_pulse(x: np.ndarray, t: np.ndarray, s: np.ndarray, skew: np.ndarray) 
     grown = skew * z
     inside = grown > -0.999999
     small = np.abs(skew) < SERIES
-    near = z - 0.5 * skew * z * z + skew * skew * z**3 / 3.0
-    level = np.where(small, near, np.log1p(np.where(inside, grown, 0.0)) / np.where(small, 1.0, skew))
-    return np.where(inside, np.exp(-0.5 * level * level), 0.0)
+    near = z - 0.5 * skew * z * z + skew * skew * z * z * z / 3.0
+    level = np.where(small, near, log1p(np.where(inside, grown, 0.0)) / np.where(small, 1.0, skew))
+    return np.where(inside, exp(-0.5 * level * level), 0.0)
 
 
 def render_skewed(

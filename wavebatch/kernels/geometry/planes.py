@@ -126,11 +126,6 @@ def is_flat(spreads: np.ndarray) -> np.ndarray:
     return spreads[:, 0] <= FLAT * spreads[:, 1]
 
 
-def fit_normal(xyz: np.ndarray) -> np.ndarray:
-    """Unit normal, float64 (3,), of the robust plane through points (k, 3), k > 0."""
-    return fit_planes(xyz - xyz.mean(axis=0), np.zeros(len(xyz), np.int64), 1).normal[0]
-
-
 def measure_angles(planes: Planes, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Angle between rays and the normals of planes.
 

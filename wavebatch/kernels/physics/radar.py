@@ -7,10 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-
-def pass_atmosphere(distance: np.ndarray, attenuation: float) -> np.ndarray:
-    """Share of the light left after `distance` [m], one way; attenuation [dB/km]."""
-    return 10.0 ** (-distance * attenuation / 10_000.0)
+from wavebatch.kernels.physics.radiometry import transmit
 
 
 def receive_power(
@@ -46,8 +43,7 @@ def receive_power(
     -------
     float64 (m,), unit of `transmitted`
     """
-    transmission = pass_atmosphere(distance, attenuation)
-    whole = transmitted * aperture**2 * efficiency * transmission**2 * cross_section
+    whole = transmitted * aperture**2 * efficiency * transmit(distance, attenuation) * cross_section
     return whole / (4.0 * np.pi * divergence**2 * distance**4)
 
 

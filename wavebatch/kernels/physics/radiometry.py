@@ -59,43 +59,6 @@ def attenuation_of_visibility(visibility: float, wavelength: float) -> float:
     return 10.0 / math.log(10.0) * 3.912 / visibility * (wavelength / 550.0) ** -exponent
 
 
-def calibrate_echoes(
-    reflectance: np.ndarray | float,
-    incidence: np.ndarray | float,
-    distance: np.ndarray,
-    amplitude: np.ndarray,
-    sigma: np.ndarray,
-    attenuation: float,
-) -> np.ndarray:
-    """Calibration constant C' from each echo of a Lambertian reference of known reflectance.
-
-    Parameters
-    ----------
-    reflectance : float
-        Of the reference.
-    incidence : float, rad
-        Angle of incidence.
-    distance : float (m,), m
-        Sensor to echo.
-    amplitude, sigma : float (m,), count, ns
-        Of the echo.
-    attenuation : float, dB/km
-        Of the air, one way.
-
-    Returns
-    -------
-    float64 (m,), 1/(m2 count ns)
-        C_cal is C' pi divergence^2 / 4.
-
-    References
-    ----------
-    Wagner et al. (2010); docs/algorithms.md 5.
-    """
-    distance = known_distance(distance)
-    light = distance * distance * np.asarray(amplitude, np.float64) * np.asarray(sigma, np.float64)
-    return 4.0 * np.asarray(reflectance) * np.cos(incidence) * transmit(distance, attenuation) / _positive(light)
-
-
 def backscatter(
     constant: np.ndarray | float, distance: np.ndarray, amplitude: np.ndarray, sigma: np.ndarray, attenuation: float
 ) -> np.ndarray:
@@ -104,9 +67,13 @@ def backscatter(
     Parameters
     ----------
     constant : float, 1/(m2 count ns)
-        C' of `calibrate_echoes`.
-    distance, amplitude, sigma, attenuation
-        As for `calibrate_echoes`.
+        Calibration constant C' (docs/algorithms.md 5).
+    distance : float (m,), m
+        Sensor to echo.
+    amplitude, sigma : float (m,), count, ns
+        Of the echo.
+    attenuation : float, dB/km
+        Of the air, one way.
 
     Returns
     -------
@@ -215,7 +182,7 @@ def backscatter_error(
 
 
 def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
-    """Relative error of a reflectance for which a surface of unknown slope was taken as level.
+    """Relative error of a reflectance for which a surface of unknown slope was taken as level, of its value.
 
     Parameters
     ----------
@@ -227,14 +194,17 @@ def slope_error(incidence: np.ndarray, slope: float) -> np.ndarray:
     Returns
     -------
     float64 (m,)
-        Root mean square over the directions of cos(true angle) / cos(incidence) - 1.
+        Root mean square over the directions of cos(incidence) / cos(true angle) - 1; for slopes that some rays graze
+        it is large, not infinite.
 
     Notes
     -----
     A surface of slope d whose steepest direction is turned by p from the ray has cos(true angle) = cos(a) cos(d) -
-    sin(a) sin(d) cos(p), a the angle to level ground.
+    sin(a) sin(d) cos(p), a the angle to level ground; the true reflectance is the value times cos(a) / cos(true angle).
     """
-    return np.hypot(1.0 - math.cos(slope), np.tan(incidence) * (math.sin(slope) / math.sqrt(2.0)))
+    mean, turning = math.cos(slope), np.tan(incidence) * math.sin(slope)
+    square = np.maximum(mean * mean - turning * turning, 0.01)
+    return np.sqrt(np.maximum(mean / square**1.5 - 2.0 / np.sqrt(square) + 1.0, 0.0))
 
 
 def reflectance_error(relative: np.ndarray, incidence: np.ndarray, incidence_err: np.ndarray) -> np.ndarray:

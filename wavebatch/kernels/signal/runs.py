@@ -1,12 +1,36 @@
-"""Runs of samples and flanks of peaks: highest samples, moments, and where a flank crosses a level.
+"""Runs of samples and flanks of peaks: highest samples, and where a flank crosses a level.
 
-Used by stages/detect; `lobe_edges` also by the pulse models. Runs come from `find_runs` in kernels/fit/cluster: starts
-and ends (one after the last) as waveform * s + sample.
+Used by stages/detect; `lobe_edges` also by the pulse models. A run is given by its start and its end
+(one after the last sample) as waveform * s + sample.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def find_runs(smoothed: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Runs of samples above a level.
+
+    Parameters
+    ----------
+    smoothed : float32 (s, n), count
+        Signal, usually smoothed.
+    level : float (n,), count
+        Level of each waveform.
+
+    Returns
+    -------
+    starts, ends : int64 (k,)
+        First sample and one after the last, as waveform * s + sample; both sorted. A run ends with its waveform.
+    """
+    s, n = smoothed.shape
+    above = np.zeros((n, s + 2), np.int8)
+    above[:, 1:-1] = (smoothed > level).T
+    edge = np.diff(above, axis=1).ravel()
+    starts = np.flatnonzero(edge == 1)
+    ends = np.flatnonzero(edge == -1)
+    return starts - starts // (s + 1), ends - ends // (s + 1)
 
 
 def list_samples(starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -40,34 +64,6 @@ def highest_samples(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) ->
     first = np.cumsum(ends - starts) - (ends - starts)
     at = np.flatnonzero(value == np.maximum.reduceat(value, first)[run])
     return sample[at[np.append(True, np.diff(run[at]) > 0)]]
-
-
-def run_moments(signal: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre of gravity and standard deviation of the positive signal in each run.
-
-    Parameters
-    ----------
-    signal : float (s, n)
-        Waveforms.
-    starts, ends : int64 (k,)
-        Runs.
-
-    Returns
-    -------
-    centre, spread : float64 (k,), samples
-        The middle of the run and 0 where no sample is positive.
-    """
-    s, n = signal.shape
-    run, place = list_samples(starts, ends)
-    sample = place % s
-    weight = np.maximum(signal.reshape(-1)[sample * n + place // s], 0).astype(np.float64)
-    middle = 0.5 * (starts + ends - 1) - starts // s * s
-    lag = sample - middle[run]
-    # bincount adds sample after sample, so that sums do not depend on the rest of the block.
-    total, first, second = (np.bincount(run, weight * lag**p, minlength=len(starts)) for p in range(3))
-    total = np.where(total > 0, total, 1.0)
-    mean = first / total
-    return middle + mean, np.sqrt(np.maximum(second / total - mean**2, 0.0))
 
 
 def lobe_edges(x: np.ndarray, curve: np.ndarray, level: float) -> tuple[float, float]:

@@ -29,12 +29,9 @@ def _need_free_skew(step: Step, chain: Chain, system: SystemPulse | None) -> str
     """Refuse a chain in which no echo has a skew of its own."""
     decomposer = chain.steps[2]
     free = decomposer.stage.name == "decompose.skewed" and decomposer.effective()["kappa"] == "free"
-    if free or decomposer.stage.name == "decompose.log_normal" or "skew" in decomposer.stage.makes:
+    if free or "skew" in decomposer.stage.makes:
         return ""
-    return (
-        f'{decomposer.stage.name} fits no skew per echo; use decompose.skewed with kappa = "free" or '
-        "decompose.log_normal before it"
-    )
+    return f'{decomposer.stage.name} fits no skew per echo; use decompose.skewed with kappa = "free" before it'
 
 
 @stage("attribute", makes=("echo_width", "echo_width_err"))
@@ -63,7 +60,7 @@ def _width_factor(kappa: np.ndarray) -> np.ndarray:
 
 @stage("attribute", makes=("skew", "skew_err"), check=_need_free_skew)
 def skew(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Skew of each echo and its error: after decompose.skewed with kappa = "free", or decompose.log_normal.
+    """Skew of each echo and its error, after decompose.skewed with kappa = "free".
 
     Ground and plants differ in it. 0 is a Gaussian; of a log-normal it is the sigma of its logarithm.
 
@@ -98,7 +95,7 @@ def _need_one_pulse(step: Step, chain: Chain, system: SystemPulse | None) -> str
     """Refuse decomposers that give every echo a pulse of its own: none is common to compare with."""
     decomposer = chain.steps[2]
     own = decomposer.effective().get("kappa") == "free" or decomposer.effective().get("model") == "generalized"
-    if own or decomposer.stage.name in ("decompose.log_normal", "decompose.generalized_gaussian"):
+    if own or "skew" in decomposer.stage.makes or decomposer.stage.name == "decompose.generalized_gaussian":
         return f"{decomposer.stage.name} gives every echo a shape of its own; use it after decompose.adaptive"
     return ""
 

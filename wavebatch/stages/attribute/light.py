@@ -17,6 +17,7 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.no_data import SUFFIX, NoData, explain
 from wavebatch.core.units import FWHM_PER_SIGMA, SQRT_2PI
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp, log
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.pulse_tables import BROADEST, describe_echoes, model_parameters, pulse_shape, shape_limits
 
@@ -70,25 +71,6 @@ def is_alone(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     return echoes.count(len(block))[echoes.waveform] == 1
 
 
-def level_angle(block: WaveformBlock) -> np.ndarray:
-    """Compute the angle at which each ray strikes level ground.
-
-    Parameters
-    ----------
-    block : WaveformBlock
-        n waveforms with directions.
-
-    Returns
-    -------
-    float64 array, shape (n,)
-        Angle [rad].
-    """
-    x, y, z = block.direction.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        down = -z / np.sqrt(x * x + y * y + z * z)
-    return np.arccos(np.clip(down, -1.0, 1.0))
-
-
 def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """Measure the energy of each echo as the amplitude times sigma of a Gaussian.
 
@@ -115,7 +97,7 @@ def echo_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable) -> 
     amplitude, sigma = echoes.amplitude.astype(np.float64), echoes.sigma.astype(np.float64)
     shape, limits = pulse_shape(system, block.spacing), shape_limits(system, block.spacing, most=BROADEST)
     if not shape.components:
-        return amplitude * sigma * area_factor(system, echoes) / np.exp(0.5 * system.kappa**2)
+        return amplitude * sigma * area_factor(system, echoes) / exp(0.5 * system.kappa**2)
     whole = np.stack([amplitude, np.zeros(len(sigma)), sigma / block.spacing], axis=1)
     height, _, width = model_parameters(shape, limits, whole).T
     facing, _ = describe_echoes(shape, limits, np.array([[1.0, 0.0, limits.ref]]), np.ones((1, 3)), np.zeros((1, 2)))
@@ -139,10 +121,10 @@ def area_factor(system: SystemPulse, echoes: EchoTable) -> np.ndarray:
     """
     if "power" in echoes.attributes:
         power = echoes.attributes["power"].astype(np.float64)
-        half_width = 2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA
+        half_width = 2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA
         return 2 ** (1 + 1 / power) * scipy.special.gamma(1 + 1 / power) / half_width / SQRT_2PI
     skew = np.asarray(echoes.attributes.get("skew", system.kappa), np.float64)
-    return np.broadcast_to(np.exp(0.5 * skew**2), len(echoes))
+    return np.broadcast_to(exp(0.5 * skew**2), len(echoes))
 
 
 def light_error(echoes: EchoTable) -> np.ndarray:
@@ -165,6 +147,14 @@ def light_error(echoes: EchoTable) -> np.ndarray:
     return np.where(np.isnan(fitted), lone, fitted)
 
 
+AIR_DOUBT = 0.5
+"""Relative error of the attenuation of the air where none is given: clear air has 0.1 to 0.5 dB/km."""
+
+BOUND_ERROR = 0.5
+"""Least relative error of the light of an echo whose fit ended at a bound: what it lacks its neighbours have, so that
+sums over a pulse stay right."""
+
+
 class Light(NamedTuple):
     """What m echoes of a block return; arrays (m,)."""
 
@@ -173,6 +163,8 @@ class Light(NamedTuple):
     gamma: np.ndarray
     relative_error: np.ndarray
     """Of a quantity that grows with R^power."""
+    bound: np.ndarray
+    """Whether the fit ended at a bound: the light is an estimate."""
     cases: Cases
     """Why gamma may be missing."""
 
@@ -200,22 +192,22 @@ def measure_light(block: WaveformBlock, system: SystemPulse, echoes: EchoTable, 
     guess = (echoes.flags & np.uint16(EchoFlag.AMPLITUDE_UNRELIABLE)) != 0
     bound = (echoes.flags & np.uint16(EchoFlag.AT_BOUND)) != 0
     energy, shot_error = (values[echoes.waveform] for values in _emitted(block, system))
-    light = np.where(guess | bound, np.nan, echo_light(block, system, echoes))
+    light = np.where(guess, np.nan, echo_light(block, system, echoes))
     with np.errstate(over="ignore", invalid="ignore"):
         gamma = radiometry.backscatter(constant, distance, light, 1.0, system.attenuation) / energy
-    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
+    away = np.hypot(system.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(
         np.hypot(light_error(echoes), shot_error), distance, away, constant_err, system.attenuation,
         power=power, attenuation_err=system.attenuation_error,
     )  # fmt: skip
+    relative = np.where(bound, np.hypot(relative, BOUND_ERROR), relative)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NOT_CALIBRATED, np.isnan(constant)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
         (NoData.SATURATED, guess),
-        (NoData.UNSETTLED, bound),
     )
-    return Light(distance, gamma, relative, cases)
+    return Light(distance, gamma, relative, bound, cases)
 
 
 def normalize_amplitude(
@@ -246,10 +238,11 @@ def normalize_amplitude(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         value = radiometry.backscatter(air / reference**2, distance, amplitude, 1.0, system.attenuation) / energy
         fit = echoes.amplitude_err.astype(np.float64) / amplitude
-    away = np.hypot(system.sensor_error, _fit_range_error(echoes))
+    away = np.hypot(system.sensor_error, fit_range_error(echoes))
     relative = radiometry.backscatter_error(np.hypot(fit, shot_error), distance, away, 0.0, system.attenuation)
     # An error of the attenuation counts over the way by which the range differs from the reference.
-    beyond = 2.0e-4 * np.log(10.0) * system.attenuation_error * np.abs(distance - reference)
+    air_error = system.attenuation_error or AIR_DOUBT * system.attenuation
+    beyond = 2.0e-4 * log(10.0) * air_error * np.abs(distance - reference)
     cases = (
         (NoData.NO_SENSOR, np.isnan(distance)),
         (NoData.NO_PULSE_ENERGY, np.isnan(energy)),
@@ -259,7 +252,7 @@ def normalize_amplitude(
     return value, np.hypot(relative, beyond), cases
 
 
-def _fit_range_error(echoes: EchoTable) -> np.ndarray:
+def fit_range_error(echoes: EchoTable) -> np.ndarray:
     """Error of the range by the fit [m], f8 (m,); 0 where no stage has computed it."""
     return echoes.attributes.get("range_err", np.zeros(len(echoes), np.float32)).astype(np.float64)
 
@@ -269,12 +262,13 @@ def _emitted(block: WaveformBlock, system: SystemPulse) -> tuple[np.ndarray, np.
     n = len(block)
     if block.pulse_energy is None:
         return np.ones(n), np.full(n, system.shot_error)
-    return block.pulse_energy, np.zeros(n)
+    error = np.zeros(n) if block.pulse_energy_err is None else block.pulse_energy_err / block.pulse_energy
+    return block.pulse_energy, error
 
 
 def without_calibration(system: SystemPulse) -> SystemPulse:
     """Replace the calibration by a constant of exactly 1, for quantities in units of the strip."""
-    return replace(system, calibration=1.0, calibration_err=0.0, channels={})
+    return replace(system, calibration=1.0, calibration_err=0.0, channels={}, swath=())
 
 
 def add_column(

@@ -9,6 +9,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.stages.attribute.light import POSITION, add_column, normalize_amplitude
 from wavebatch.stages.chain import Range, stage
 
@@ -59,6 +60,6 @@ def amplitude_normalized_db(
     """
     value, relative, cases = normalize_amplitude(block, system, echoes, reference_range)
     with np.errstate(invalid="ignore", divide="ignore"):
-        decibel = DECIBEL * np.log(value)
+        decibel = DECIBEL * log(value)
         share = DECIBEL * relative / np.maximum(np.abs(decibel), 1e-30)
     return add_column(echoes, "amplitude_normalized_db", decibel, share, *cases)

@@ -17,20 +17,30 @@ from wavebatch.stages.attribute.light import (
     POSITION,
     add_column,
     add_reason,
+    fit_range_error,
     measure_light,
     sensor_distance,
     without_calibration,
 )
 from wavebatch.stages.chain import stage
 
+RETURNS = 0.02
+"""Scatter of vendors' returns along the ray [m], by data sheets: echoes are placed relative to these, and where a
+packet has one return nothing shows how far it is off."""
 
-@stage("attribute", makes=("range",), needs=POSITION)
+
+@stage("attribute", makes=("range", "range_error"), needs=POSITION)
 def range(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable) -> EchoTable:
-    """Distance from the sensor to each echo [m]; no-data where the sensor's position is not known."""
+    """Distance from the sensor to each echo [m], and its error; no-data where the sensor's position is not known.
+
+    The error holds that of the fit (range_err), of the sensor's position and mounting, and the scatter of the vendor's
+    returns (2 cm). It is no-data where nothing shows how well the sensor's position is known.
+    """
     distance = sensor_distance(block, echoes)
-    return add_reason(
-        echoes.with_attributes(range=distance.astype(np.float32)), "range", (NoData.NO_SENSOR, np.isnan(distance))
-    )
+    error = np.hypot(np.hypot(fit_range_error(echoes), system.sensor_error), RETURNS)
+    error[np.isnan(distance) | (system.sensor_error <= 0)] = np.nan
+    columns = {"range": distance.astype(np.float32), "range_error": error.astype(np.float32)}
+    return add_reason(echoes.with_attributes(**columns), "range", (NoData.NO_SENSOR, np.isnan(distance)))
 
 
 @stage("attribute", makes=("backscatter_coefficient", "backscatter_coefficient_err"), needs=POSITION)
@@ -38,7 +48,8 @@ def backscatter_coefficient(block: WaveformBlock, noise: Noise, system: SystemPu
     """Cross section of each echo per illuminated area (gamma), and its error; no-data without sensor or calibration.
 
     gamma = C' R^2 A sigma / eta(R). Echoes of one pulse share its light: only the sum over the pulse is then a gamma.
-    Unreliable (saturated) amplitudes and fits that ended at a bound give no-data. The error holds that of the fit (with
+    Unreliable (saturated) amplitudes give no-data; fits that ended at a bound (AT_BOUND) an estimate with an error of
+    50 % at least, for sums over pulses. The error holds that of the fit (with
     the covariance of amplitude and width), range, air and constant, and the energy's scatter from shot to shot that the
     calibration measured.
 

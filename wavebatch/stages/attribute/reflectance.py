@@ -13,14 +13,13 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.no_data import NoData
-from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock, angle_to_vertical
 from wavebatch.kernels.physics import radiometry
 from wavebatch.stages.attribute.light import (
     POSITION,
     Light,
     add_column,
     is_alone,
-    level_angle,
     measure_light,
     without_calibration,
 )
@@ -124,7 +123,7 @@ def level_reflectance(
     ----------
     docs/algorithms.md 5.
     """
-    light, angle = measure_light(block, system, echoes, 2), level_angle(block)[echoes.waveform]
+    light, angle = measure_light(block, system, echoes, 2), angle_to_vertical(block.direction)[echoes.waveform]
     relative = np.hypot(light.relative_error, radiometry.slope_error(angle, np.radians(slope)))
     return _divide(block, echoes, "level_reflectance", light, angle, relative)
 
@@ -150,7 +149,10 @@ def _divide(
 ) -> EchoTable:
     """The column gamma / (4 cos(angle)) of echoes that are alone, with relative errors (m,)."""
     alone = is_alone(block, echoes)
-    rho = np.where(alone, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
+    rho = np.where(alone & ~light.bound, radiometry.diffuse_reflectance(light.gamma, angle), np.nan)
     steep = angle >= radiometry.STEEPEST
-    more = (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)), (NoData.TOO_STEEP, steep)
+    more = (
+        (NoData.UNSETTLED, light.bound), (NoData.SHARED_PULSE, ~alone), (NoData.NO_ANGLE, np.isnan(angle)),
+        (NoData.TOO_STEEP, steep),
+    )  # fmt: skip
     return add_column(echoes, name, rho, relative, *light.cases, *more)

@@ -43,16 +43,21 @@ def _check_widths(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     """Refuse decomposers whose widths never are those of one pulse."""
     decomposer = chain.steps[2]
     name = decomposer.stage.name
-    if name == "decompose.log_normal" or decomposer.effective().get("kappa") == "free":
+    if "skew" in decomposer.stage.makes or decomposer.effective().get("kappa") == "free":
         return f"{name} fits a skew per echo, which takes part of the width; use decompose.adaptive"
     return ""
+
+
+LEAST_SKEW = 0.25
+"""Skew of the strip's pulse from which the pulse t^2 exp(-t) of mode `pulse` describes it: it has 0.48 itself."""
 
 
 def _other_pulse(system: SystemPulse, mode: str) -> bool:
     """Whether widths were fitted with another pulse than a mode compares them with: angles would be off by degrees."""
     if mode == "system":
         return system.other_pulse
-    return bool(system.components) or abs(system.kappa) >= NO_SKEW
+    symmetric = mode == "pulse" and system.skew is not None and system.skew < LEAST_SKEW
+    return bool(system.components) or abs(system.kappa) >= NO_SKEW or symmetric
 
 
 @stage(
@@ -130,7 +135,8 @@ def incidence_angle(
         *((reason, (echoes.flags & np.uint16(flags)) != 0) for reason, flags in _UNCLEAN.items()),
         (NoData.TOO_STEEP, steep),
         (NoData.OTHER, np.isnan(error)),
-        (NoData.UNCERTAIN, weak & ~clear),
+        # Weak echoes just above the limit may have any angle down to 0; as 0 they pulled the mean down by 3 to 11 deg.
+        (NoData.UNCERTAIN, weak & ~(clear & (angle > 0))),
     )
     bad = np.logical_or.reduce([np.broadcast_to(where, len(echoes)) for _, where in cases])
     angle, error = (np.degrees(np.where(bad, np.nan, values)).astype(np.float32) for values in (angle, error))

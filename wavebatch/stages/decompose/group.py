@@ -9,7 +9,7 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters, cluster_candidates
 from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.fit.pulse_shape import pulse_tail, tail_at, tail_reach
-from wavebatch.kernels.signal.signal import smooth_121, transpose_samples
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import ShapeLimits, clip_level, model_parameters
 
 MARGIN = 1.2
@@ -61,22 +61,16 @@ def find_clusters(
     candidates = Candidates(echoes.waveform.astype(np.int64), time, amplitude, np.clip(width, limits.low, limits.high))
     candidates = _join_plateaus(block, candidates, clip_level(block, system))
     candidates, tail = _explain_tails(candidates, noise, settings)
-    present, row = np.unique(candidates.waveform, return_inverse=True)
-    signal = transpose_samples(block.samples[present])
-    signal -= noise.level[present].T
-    if block.missing is not None:
-        signal[block.missing[present].T] = 0
     ref = system.sigma_ref / block.spacing
     clusters = cluster_candidates(
-        candidates._replace(waveform=row),
-        smooth_121(signal),
-        noise.std[present],
+        samples_of(block, noise),
+        candidates,
         margin=int(np.ceil(MARGIN * ref)),
         reach=int(np.ceil(REACH * ref)),
         most=most,
         tail=tail,
     )
-    return candidates, clusters._replace(waveform=present[clusters.waveform])
+    return candidates, clusters
 
 
 def _join_plateaus(block: WaveformBlock, candidates: Candidates, clip: float) -> Candidates:

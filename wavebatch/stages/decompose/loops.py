@@ -1,4 +1,4 @@
-"""Decomposers that decide what is fitted: Wang's residual loop, and the ASDF with a fit only where it is needed."""
+"""Decomposers that decide what is fitted: Wang's residual loop, and an ASDF without a fit."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from wavebatch.stages.chain import Chain, Range, Step, stage
 from wavebatch.stages.decompose.fit import gaussian
 from wavebatch.stages.decompose.merge import join_tables
 from wavebatch.stages.decompose.models import generalized_gaussian, reference
-from wavebatch.stages.decompose.rebuild import loop_shape, render_table
+from wavebatch.stages.decompose.rebuild import loop_model, loop_shape, render_table
 from wavebatch.stages.decompose.skew import skewed, system_skew
 from wavebatch.stages.decompose.solve import LeastWidth, MostWidth, fit_gaussian
 from wavebatch.stages.detect.candidates import candidate_table, find_varying, signal_above
-from wavebatch.stages.detect.maximum import maximum
 from wavebatch.stages.flags import flag_echoes
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH
 
 
 def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
     """The system with the pulse that `residual_loop` fits."""
-    model = parameters["model"]
+    model = loop_model(system, parameters["model"])
     if model == "learned":
         return system
     return replace(system, components=(), kappa=system_skew(system)) if model == "skewed" else fit_gaussian(system, {})
@@ -38,7 +37,7 @@ def _fit_loop(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse
 @stage("decompose", fits=_fit_loop)
 def residual_loop(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    model: Literal["gaussian", "skewed", "generalized", "learned"] = "gaussian",
+    model: Literal["auto", "gaussian", "skewed", "generalized", "learned"] = "auto",
     t_diff: Annotated[float, Range(0.0, 1e6)] = 4.0,
     t_unit: Literal["noise", "count", "amplitude"] = "noise",
     max_echoes: Annotated[int, Range(1, 1000)] = 6,
@@ -50,12 +49,14 @@ def residual_loop(
     """Pulses of a model, with one more at the largest residual of the waveform while that exceeds a threshold.
 
     Only their residual supports the added echoes: on pulses that are not those of the model there are many. On a real
-    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2).
+    strip of Leica Gaussians add an echo to most single returns, the learned pulse to few (docs/algorithms.md 1.2); so
+    the model is that of the survey unless another one is given.
 
     Parameters
     ----------
-    model : {"gaussian", "skewed", "generalized", "learned"}
-        Gaussians, skewed pulses with the skew of the survey, generalized Gaussians, or the pulse of the survey.
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
+        The pulse that the survey chose (auto: learned, skewed or Gaussian); Gaussians, as in the paper; skewed pulses
+        with the skew of the survey; generalized Gaussians; or the learned pulse.
     t_diff : float
         Largest residual that adds no echo, T_diff of the paper, in the unit below.
     t_unit : {"noise", "count", "amplitude"}
@@ -76,6 +77,7 @@ def residual_loop(
     ----------
     Wang, Wang and Tseng; docs/algorithms.md 1.2.
     """
+    model = loop_model(system, model)
     shape = loop_shape(system, block.spacing, model)
     options = {"max_iterations": max_iterations, "tolerance": 0.1, "significance": significance}
     options |= {"least_width": least_width, "most_width": most_width}
@@ -139,8 +141,19 @@ _ASDF_LIKE = ("detect.asdf", "detect.correlation", "detect.matched_filter")
 """Detectors whose times are those of the best place of a reference pulse: their error is known without a fit."""
 
 
-def _need_asdf(step: Step, chain: Chain, system: SystemPulse | None) -> str:
-    """Refuse detectors whose times have another error than that of a reference pulse."""
+def need_asdf(step: Step, chain: Chain, system: SystemPulse | None) -> str:
+    """Say what is wrong with a detector whose times have another error than that of a reference pulse.
+
+    Parameters
+    ----------
+    step, chain, system
+        As for the `check` of a stage.
+
+    Returns
+    -------
+    str
+        Empty if nothing.
+    """
     name = chain.steps[1].stage.name
     if name in _ASDF_LIKE:
         return ""
@@ -150,56 +163,26 @@ def _need_asdf(step: Step, chain: Chain, system: SystemPulse | None) -> str:
     )
 
 
-@stage("decompose", fits=fit_gaussian, check=_need_asdf)
+@stage("decompose", fits=fit_gaussian, check=need_asdf)
 def asdf_only(
     block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    mode: Literal["shortcut", "mixed"] = "shortcut",
     describe: Literal["samples", "detector"] = "samples",
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
 ) -> EchoTable:  # fmt: skip
-    """Echoes of the detector before it, with its times and without a fit; or a fit where detectors disagree.
+    """Echoes of the detector before it, with its times and without a fit.
 
     The detector is `detect.asdf` with any rule and reference, `detect.correlation` or `detect.matched_filter`. Errors
-    are those expected of isolated echoes. Mixed: waveforms in which the detector and `detect.maximum` disagree in the
-    number or the times of the echoes are fitted with Gaussians, from the maxima.
+    are those expected of isolated echoes.
 
     Parameters
     ----------
-    mode : {"shortcut", "mixed"}
-        `shortcut` to fit nothing, `mixed` to fit where detectors disagree.
     describe : {"samples", "detector"}
         Amplitude and width: a log-parabola through five samples at the detector's time, or what the detector says. An
         ASDF says the width of its reference, and an amplitude that is too low for echoes that are broader.
-    tolerance : float
-        Largest distance in time of echoes that agree [widths of the system pulse].
 
     References
     ----------
     Wagner et al. (2007); docs/algorithms.md 1.1.
     """
-    quick = _describe(block, noise, system, echoes, describe)
-    if mode == "shortcut":
-        return quick
-    maxima = maximum(block, noise, system)
-    differ = _disagree(len(block), maxima, quick, tolerance * system.sigma_ref)
-    rows = np.flatnonzero(differ)
-    chosen = maxima.take(np.flatnonzero(differ[maxima.waveform]))
-    chosen = _renumber(chosen, np.searchsorted(rows, chosen.waveform))
-    fitted = gaussian(block.rows(rows), noise.rows(rows), system, chosen)
-    agreed = quick.take(np.flatnonzero(~differ[quick.waveform]))
-    return join_tables(agreed, _renumber(fitted, rows[fitted.waveform]))
-
-
-def _disagree(n: int, first: EchoTable, second: EchoTable, tolerance: float) -> np.ndarray:
-    """Find waveforms in which two tables have different numbers of echoes, or one at a different time."""
-    differ = first.count(n) != second.count(n)
-    a, b = (table.take(np.flatnonzero(~differ[table.waveform])) for table in (first, second))
-    differ[a.waveform[np.abs(a.time - b.time) > tolerance]] = True
-    return differ
-
-
-def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, source: str) -> EchoTable:
-    """Give echoes amplitude, width, the expected errors and the misfit; their times stay."""
     spacing, last = block.spacing, block.samples.shape[1] - 1
     sample = np.clip(np.rint(echoes.time / spacing), 0, last).astype(np.int64)
     waveform = echoes.waveform.astype(np.int64)
@@ -213,7 +196,7 @@ def _describe(block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: E
     time_err = np.hypot(loss * bound_time(height, width, std, spacing), np.nan_to_num(echoes.time_err))
     amplitude_err, width_err = start_errors(height, width / spacing, std)
     table = replace(measured, time_err=time_err.astype(np.float32))
-    if source == "detector":
+    if describe == "detector":
         sigma = np.maximum(echoes.sigma, np.float32(LEAST_WIDTH * system.sigma_ref))
         # What the detector says of them may be wrong by its distance from what the samples say.
         amplitude_err = np.hypot(amplitude_err, measured.amplitude - echoes.amplitude)

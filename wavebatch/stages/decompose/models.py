@@ -11,6 +11,7 @@ import numpy as np
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import log
 from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Solution, choose
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, tabulate_pulse
@@ -23,8 +24,8 @@ from wavebatch.stages.decompose.solve import (
     fit_candidates,
     fit_gaussian,
     make_settings,
-    samples_of,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape, shape_limits
 from wavebatch.stages.reference_pulse import reference_pulse
 
@@ -183,44 +184,7 @@ def half_width_factor(power: float) -> float:
     float
         1 for a Gaussian.
     """
-    return float(2 * (2 * np.log(2)) ** (1 / power) / FWHM_PER_SIGMA)
-
-
-@stage("decompose", fits=fit_gaussian)
-def gauss_newton(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    max_iterations: Annotated[int, Range(1, 1000)] = 20,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.01,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
-) -> EchoTable:  # fmt: skip
-    """Sum of Gaussians by undamped Gauss-Newton steps, for comparison: starts more than one sigma off are lost.
-
-    A fit that is lost returns its start, flagged as not converged.
-
-    Parameters
-    ----------
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
-
-    References
-    ----------
-    Jutzi and Stilla (2005); docs/algorithms.md 1.3.
-    """
-    settings = make_settings(
-        block, system, GAUSSIAN, widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False, undamped=True,
-    )._replace(noise_gain=0.0)  # fmt: skip
-    return fit_candidates(block, noise, system, echoes, settings, significance=significance)
+    return float(2 * (2 * log(2)) ** (1 / power) / FWHM_PER_SIGMA)
 
 
 def _as_half_width(solution: Solution, factor: float) -> Solution:

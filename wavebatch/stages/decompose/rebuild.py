@@ -17,6 +17,26 @@ from wavebatch.stages.decompose.skew import skewed_shape
 from wavebatch.stages.pulse_tables import BROADEST, model_parameters, pulse_shape, shape_limits
 
 
+def loop_model(system: SystemPulse, model: str) -> str:
+    """Return the model that a residual loop fits.
+
+    Parameters
+    ----------
+    system : SystemPulse
+        Result of the survey.
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
+        As for `decompose.residual_loop`.
+
+    Returns
+    -------
+    str
+        The model; for `auto` the pulse that the survey chose.
+    """
+    if model != "auto":
+        return model
+    return "learned" if system.components else "skewed" if system.kappa else "gaussian"
+
+
 def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
     """Return the pulse that a residual loop fits.
 
@@ -26,7 +46,7 @@ def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
         Result of the survey.
     spacing : float
         Time between two samples [ns].
-    model : {"gaussian", "skewed", "generalized", "learned"}
+    model : {"auto", "gaussian", "skewed", "generalized", "learned"}
         As for `decompose.residual_loop`.
 
     Returns
@@ -34,6 +54,7 @@ def loop_shape(system: SystemPulse, spacing: float, model: str) -> PulseShape:
     PulseShape
         Pulse in samples; of the generalized model echoes carry their exponents.
     """
+    model = loop_model(system, model)
     if model == "learned":
         return pulse_shape(system, spacing)
     return skewed_shape(system, 0.0) if model == "skewed" else GAUSSIAN
@@ -51,14 +72,14 @@ MODELS: dict[str, Callable[[SystemPulse, float, Mapping[str, Any]], PulseShape] 
     **dict.fromkeys(
         [
             f"decompose.{name}"
-            for name in ("asdf_only", "closed_form", "gauss_newton", "gaussian", "generalized_gaussian", "log_normal")
+            for name in ("asdf_only", "closed_form", "gaussian", "generalized_gaussian")
         ],
         lambda *_: GAUSSIAN,
     ),
     "decompose.none": None,
 }
 """The pulse that a decomposer fits, from system, spacing and parameters; None where nothing is fitted. Echoes with a
-skew or an exponent of their own carry it as a column."""
+skew or an exponent of their own carry it as a column. A plug-in adds its decomposers."""
 
 
 def fitted_pulse(decomposer: Step, system: SystemPulse, spacing: float) -> PulseShape | None:

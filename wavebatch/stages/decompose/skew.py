@@ -1,4 +1,4 @@
-"""Decomposers with skewed pulses: the log-normal of Wang et al. with a skew per strip or per echo, or as printed."""
+"""Decomposers with skewed pulses: the log-normal of Wang et al. with a skew per strip or per echo."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from wavebatch.stages.decompose.solve import (
     describe_solution,
     fit_candidates,
     make_settings,
-    samples_of,
 )
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.pulse_tables import LEAST_WIDTH, MOST_WIDTH, pulse_shape
 
 UNKNOWN_SPREAD = 0.15
@@ -125,57 +125,10 @@ def skewed(
     if kappa != "free":
         return fit_candidates(block, noise, system, echoes, settings, significance=significance)
     free = settings._replace(skew_mean=shape.kappa, skew_spread=system.skew_spread or UNKNOWN_SPREAD)
-    return _fit_each(block, noise, system, echoes, free, significance)
+    return fit_each(block, noise, system, echoes, free, significance)
 
 
-def _fit_log_normal(system: SystemPulse, parameters: Mapping[str, Any]) -> SystemPulse:
-    return replace(system, components=(), kappa=0.0)
-
-
-@stage("decompose", fits=_fit_log_normal)
-def log_normal(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, echoes: EchoTable, *,
-    origin: Literal["segment", "waveform"] = "segment",
-    max_iterations: Annotated[int, Range(1, 1000)] = 60,
-    tolerance: Annotated[float, Range(0.0, 1e6)] = 0.5,
-    significance: Annotated[float, Range(0.0, 1e6)] = 5.0,
-    least_width: LeastWidth = LEAST_WIDTH,
-    most_width: MostWidth = MOST_WIDTH,
-) -> EchoTable:  # fmt: skip
-    """Sum of log-normals as the paper prints them, a exp(-(ln x - mu)^2 / (2 sigma^2)): three parameters per echo.
-
-    For comparison. The formula needs an origin of x, which the paper does not name, and the origin decides the skew: it
-    is the width over the distance of the peak from the origin. Counted from the start of the waveform there is hardly
-    any skew; counted from the start of the echo's own samples it depends on the amplitude. `decompose.skewed` has the
-    same pulse with a skew that the data choose.
-
-    Parameters
-    ----------
-    origin : {"segment", "waveform"}
-        Sample with x = 1: the first one of the samples that are fitted together, or of the waveform.
-    max_iterations : int
-        An echo that has not converged after so many is flagged.
-    tolerance : float
-        A fit ends with the step that promises a smaller fall of chi2.
-    significance : float
-        Least energy of an echo [standard deviations of the noise's energy].
-    least_width : float
-        Smallest width of an echo [widths of the system pulse].
-    most_width : float
-        Largest width of an echo [widths of the system pulse].
-
-    References
-    ----------
-    Wang, Wang and Tseng eq. 2; docs/algorithms.md 1.2.
-    """
-    settings = make_settings(
-        block, system, PulseShape(origin=origin), widths=(least_width, most_width), tolerance=tolerance,
-        max_iterations=max_iterations, grow=False,
-    )  # fmt: skip
-    return _fit_each(block, noise, system, echoes, settings, significance)
-
-
-def _fit_each(
+def fit_each(
     block: WaveformBlock,
     noise: Noise,
     system: SystemPulse,
@@ -183,7 +136,20 @@ def _fit_each(
     settings: Settings,
     significance: float,
 ) -> EchoTable:
-    """Fits with a skew per echo; the skews and their errors as columns."""
+    """Fit with a skew per echo, which becomes a column with its error.
+
+    Parameters
+    ----------
+    block, noise, system, echoes, significance
+        As for a stage.
+    settings : Settings
+        Pulse, limits and options of the fit.
+
+    Returns
+    -------
+    EchoTable
+        Fitted echoes with the columns skew and skew_err.
+    """
     candidates, clusters = find_clusters(block, noise, system, echoes, settings)
     solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
     columns = {

@@ -13,13 +13,15 @@ from wavebatch.core.echoes import EchoFlag, EchoTable
 from wavebatch.core.units import SQRT_PI
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.fit.cluster import Candidates, Clusters
-from wavebatch.kernels.fit.decompose import Samples, decompose_clusters
+from wavebatch.kernels.fit.decompose import decompose_clusters
 from wavebatch.kernels.fit.problem import Settings, Solution
 from wavebatch.kernels.fit.pulse_shape import GAUSSIAN, PulseShape, evaluate_pulse, measure_pulse
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.stages.chain import Range
 from wavebatch.stages.decompose.group import MOST_JOINED, find_clusters
 from wavebatch.stages.decompose.merge import drop_twins, merge_unresolved
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.flags import clear_lone, drop_unproven, flag_echoes
 from wavebatch.stages.pulse_tables import (
     BROADEST,
@@ -138,22 +140,6 @@ def fit_candidates(
     candidates, clusters = find_clusters(block, noise, system, echoes, settings, most)
     solution = decompose_clusters(samples_of(block, noise), candidates, clusters, settings)
     return describe_solution(block, noise, system, clusters, solution, settings, significance)
-
-
-def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
-    """Put the waveforms of a block and their noise together, as the fit takes them.
-
-    Parameters
-    ----------
-    block, noise
-        As for a stage.
-
-    Returns
-    -------
-    Samples
-        Raw counts with their levels.
-    """
-    return Samples(block.samples, noise.for_fits, noise.std, block.missing)
 
 
 def describe_solution(

@@ -6,6 +6,7 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.library import Samples
 from wavebatch.kernels.signal.runs import gap_distance
 from wavebatch.kernels.signal.signal import transpose_samples
 
@@ -30,6 +31,22 @@ def signal_above(block: WaveformBlock, noise: Noise) -> np.ndarray:
     if block.missing is not None:
         signal[block.missing.T] = 0
     return signal
+
+
+def samples_of(block: WaveformBlock, noise: Noise) -> Samples:
+    """Put the waveforms of a block and their noise together, as kernels take them.
+
+    Parameters
+    ----------
+    block, noise
+        As for a stage.
+
+    Returns
+    -------
+    Samples
+        Raw counts with their levels.
+    """
+    return Samples(block.samples, noise.for_fits, noise.std, block.missing)
 
 
 def make_table(

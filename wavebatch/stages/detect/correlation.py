@@ -11,6 +11,8 @@ import numpy as np
 
 from wavebatch.core.echoes import EchoTable
 from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
+from wavebatch.kernels.elementary import exp
+from wavebatch.kernels.elementary import log as logarithm
 from wavebatch.kernels.signal.filters import refine_peaks
 from wavebatch.kernels.signal.signal import find_peaks
 from wavebatch.kernels.signal.square_differences import (
@@ -173,7 +175,7 @@ def parabola_bias(width: float) -> float:
     docs/algorithms.md 1.1, item 3.
     """
     phase = np.linspace(-0.5, 0.5, 41)
-    near = [-np.exp(-((lag - phase) ** 2) / (4 * width * width)) for lag in (-1, 0, 1)]
+    near = [-exp(-((lag - phase) ** 2) / (4 * width * width)) for lag in (-1, 0, 1)]
     return float(np.sqrt(np.mean((parabola_shift(*near) - phase) ** 2)))
 
 
@@ -183,7 +185,7 @@ def _refine(values: np.ndarray, correlations: np.ndarray, minima: Minima, log: b
     shift = parabola_shift(*(values[waveform, row + d] for d in (-1, 0, 1)))
     near = [correlations[row + d, waveform] for d in (-1, 0, 1)]
     positive = (near[0] > 0) & (near[1] > 0) & (near[2] > 0)
-    by_log = parabola_shift(*(-np.log(np.where(positive, y, 1).astype(np.float64)) for y in near))
+    by_log = parabola_shift(*(-logarithm(np.where(positive, y, 1).astype(np.float64)) for y in near))
     peaked = positive & (np.abs(by_log) < 1.5)
     return np.where(peaked & log, by_log, shift), peaked
 

@@ -16,9 +16,10 @@ from wavebatch.kernels.signal.filters import (
     gaussian_taps,
     refine_peaks,
 )
+from wavebatch.kernels.signal.maxima import find_maxima
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, find_peaks, smooth_121
 from wavebatch.stages.chain import Range, stage
-from wavebatch.stages.detect.candidates import make_table, signal_above
+from wavebatch.stages.detect.candidates import make_table, samples_of, signal_above
 
 TWICE_SMOOTHED_GAIN = float(np.sqrt(70.0) / 16.0)
 """Standard deviation of white noise after two passes of the [1 2 1]/4 filter."""
@@ -50,17 +51,32 @@ def maximum(
     Wagner et al. (2007), max-detection; smoothing as in docs/algorithms.md 1.1.
     """
     ref = system.sigma_ref / block.spacing
-    smoothed, even, gain, broad = smooth_to_pulse(signal_above(block, noise), ref)
-    waveform, sample = find_peaks(even, np.float32(threshold * gain) * noise.std)
-    amplitude, time, width = estimate_starts(smoothed, waveform, sample, ref)
-    gap = _nearest_gap(waveform, sample)
-    crowded = np.flatnonzero(gap < 4.0 * ref)
-    time[crowded], amplitude[crowded] = refine_peaks(smoothed, waveform[crowded], sample[crowded])
-    width = np.minimum(width, 0.5 * gap)
-    if broad:
-        width = np.sqrt(np.maximum(width * width - broad * broad, 0.25 * ref * ref))
-        amplitude *= np.hypot(1.0, broad / width)
-    return make_table(block, waveform, time, amplitude, np.clip(width, 0.7 * ref, 4.0 * ref))
+    samples, broad, taps, gain = samples_of(block, noise), 0.0, None, TWICE_SMOOTHED_GAIN
+    if ref > BROAD:
+        broad, taps = broad_taps(ref)
+        gain = np.sqrt(filter_energy(taps))
+    waveform, time, amplitude, width = find_maxima(samples, threshold * gain, ref, broad, taps)
+    return make_table(block, waveform, time, amplitude, width)
+
+
+def broad_taps(ref: float) -> tuple[float, np.ndarray]:
+    """Return the Gaussian that smooths waveforms with pulses broader than BROAD.
+
+    Parameters
+    ----------
+    ref : float
+        Width of the system pulse [samples].
+
+    Returns
+    -------
+    broad : float
+        Width of the Gaussian [samples].
+    taps : float array, shape (k,)
+        Half of it, of unit sum.
+    """
+    broad = 0.5 * (ref - BROAD) + 1.0
+    taps = gaussian_taps(broad)
+    return broad, taps / (taps[0] + 2 * taps[1:].sum())
 
 
 def smooth_to_pulse(signal: np.ndarray, ref: float) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -85,21 +101,9 @@ def smooth_to_pulse(signal: np.ndarray, ref: float) -> tuple[np.ndarray, np.ndar
     if ref <= BROAD:
         smoothed = smooth_121(signal)
         return smoothed, smooth_121(smoothed), TWICE_SMOOTHED_GAIN, 0.0
-    broad = 0.5 * (ref - BROAD) + 1.0
-    taps = gaussian_taps(broad)
-    taps /= taps[0] + 2 * taps[1:].sum()
+    broad, taps = broad_taps(ref)
     smoothed = filter_symmetric(signal, taps)
     return smoothed, smoothed, float(np.sqrt(filter_energy(taps))), broad
-
-
-def _nearest_gap(waveform: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Distance in samples to the nearest other maximum of the waveform (m,), infinite without one.
-
-    Echoes closer than two widths have one maximum (docs/algorithms.md 2.2), so half of the gap bounds the width.
-    """
-    gap = np.full(len(sample) + 1, np.inf)
-    gap[1:-1] = np.where(np.diff(waveform) == 0, np.diff(sample), np.inf)
-    return np.minimum(gap[:-1], gap[1:])
 
 
 @stage("detect")

@@ -7,10 +7,10 @@ resampling blocks of the overlap, since neighbouring cells share roads, fields a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
 from wavebatch.core.units import MAD_TO_STD
@@ -39,25 +39,46 @@ class Adjustment:
     value: np.ndarray
     """Logarithm of the constant, f8 (n,)."""
     error: np.ndarray
-    """Standard deviation without that of the targets' reflectance, f8 (n,)."""
+    """Standard deviation without that of the targets' reflectance, f8 (n,); with the terms, over its ties."""
     trials: np.ndarray
     """The values of the resamples, f8 (TRIALS, n): for errors of differences."""
     ties: np.ndarray
     """Tie cells of each source, i8 (n,)."""
     residual: np.ndarray
     """Brightness that each row of the ties has beyond the adjusted one, f8 (k,)."""
+    scatter: float = 0.0
+    """Robust standard deviation of the brightness of one row, beyond what the errors of the ties explain."""
+    terms: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """Coefficients of the columns that were fitted too, f8 (m,)."""
+    term_trials: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    """Those of the resamples, f8 (TRIALS, m)."""
 
 
-def adjust_constants(ties: Ties, given: np.ndarray, given_error: np.ndarray) -> Adjustment:
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchors:
+    """What targets say of the n sources."""
+
+    value: np.ndarray
+    """Logarithm of the constant that they gave each source, f8 (n,); NaN where none did."""
+    error: np.ndarray
+    """Standard deviation of each, f8 (n,)."""
+    columns: np.ndarray | None = None
+    """The fitted columns at the targets, f8 (n, m)."""
+
+
+def adjust_constants(
+    ties: Ties, anchors: Anchors, columns: np.ndarray | None = None, trials: int = TRIALS
+) -> Adjustment:
     """Adjust the constants of sources.
 
     Parameters
     ----------
     ties : Ties
-    given : float64 (n,)
-        Logarithm of the constant that targets gave each source; NaN where none did.
-    given_error : float64 (n,)
-        Standard deviation of each.
+    anchors : Anchors
+    columns : float64 (k, m), optional
+        Of each row of the ties, functions of how it was seen: their coefficients are fitted too.
+    trials : int
+        Resamples for the errors; 0 leaves them unknown.
 
     Returns
     -------
@@ -65,31 +86,55 @@ def adjust_constants(ties: Ties, given: np.ndarray, given_error: np.ndarray) -> 
 
     Notes
     -----
-    value_ks = r_k - c_s, by least squares with weights 1 / (error^2 + scatter^2), where the scatter between cells
-    comes from the residuals; Huber's weights in eight rounds. docs/algorithms.md 5.3.
+    value_ks = r_k - c_s - columns_ks . terms, by least squares with weights 1 / (error^2 + scatter^2), where the
+    scatter between cells comes from the residuals; Huber's weights in eight rounds. docs/algorithms.md 5.3.
     """
-    n = len(given)
-    known = np.flatnonzero(np.isfinite(given))
-    reached = _reach(ties, known, n)
+    n = len(anchors.value)
+    columns = np.empty((len(ties.cell), 0)) if columns is None else columns
+    reached = _reach(ties, np.flatnonzero(np.isfinite(anchors.value)), n)
     use = reached[ties.source]
-    cell, source, value = ties.cell[use], ties.source[use], ties.value[use]
-    weight = ties.error[use] ** -2.0
-    found = np.full(n, np.nan)
+    cell, source, value, error = ties.cell[use], ties.source[use], ties.value[use], ties.error[use]
+    one = csr_array((np.ones(len(cell)), (np.arange(len(cell)), source)), (len(cell), n))
+    design = hstack([one, csr_array(columns[use])], format="csr")
+    weight = error**-2.0
+    found = np.append(np.where(reached, anchors.value, np.nan), np.zeros(columns.shape[1]))
     rest = np.zeros(len(cell))
     for _ in range(_ROUNDS if len(cell) else 0):
-        found = _solve(cell, source, value, weight, given, given_error, reached)
-        rest = _residuals(cell, source, value, weight, found)
+        found = _solve(design, cell, value, weight, anchors, reached)
+        rest = _residuals(design, cell, value, weight, found)
         scatter = max(MAD_TO_STD * float(np.median(np.abs(rest))), _LEAST_SCATTER)
         # Errors of fits are in the residuals already: the larger of the two is what a row is known to.
-        spread = np.maximum(ties.error[use], scatter)
+        spread = np.maximum(error, scatter)
         weight = spread**-2.0 * np.minimum(1.0, HUBER * scatter / np.maximum(np.abs(rest), 1e-12))
-    if not len(cell):
-        found = np.where(reached, given, np.nan)
-    trials = _resample(ties.centre[use], cell, source, value, weight, given, given_error, reached)
+    again = _resample(ties.centre[use], design, cell, value, weight, anchors, reached, trials)
     residual = np.full(len(ties.cell), np.nan)
     residual[use] = rest
-    number = np.bincount(source, minlength=n) if len(cell) else np.zeros(n, np.int64)
-    return Adjustment(found, np.std(trials, axis=0, ddof=1), trials, number, residual)
+    errors = _errors(design, source, again, n) if trials else np.full(n, np.nan)
+    number = np.bincount(source, minlength=n)
+    return Adjustment(
+        found[:n], errors, again[:, :n], number, residual, _excess(rest, cell, error), found[n:], again[:, n:]
+    )
+
+
+def _errors(design: csr_array, source: np.ndarray, trials: np.ndarray, n: int) -> np.ndarray:
+    """Standard deviations f8 (n,) of the constants; of sources with ties, of constants and terms over their ties."""
+    error = np.std(trials[:, :n], axis=0, ddof=1)
+    if trials.shape[1] > n and design.shape[0]:
+        square = np.var(design @ np.nan_to_num(trials).T, axis=1, ddof=1)
+        count = np.bincount(source, minlength=n)
+        error = np.where(count > 0, np.sqrt(np.bincount(source, square, n) / np.maximum(count, 1)), error)
+    return error
+
+
+def _excess(rest: np.ndarray, cell: np.ndarray, error: np.ndarray) -> float:
+    """Robust standard deviation of the brightness of a row beyond its error; a cell's mean takes a part of it away."""
+    count = np.bincount(cell)[cell]
+    shared = count > 1
+    if not shared.any():
+        return 0.0
+    free = np.sqrt(count[shared] / (count[shared] - 1))
+    scatter = MAD_TO_STD * float(np.median(np.abs(rest[shared]) * free))
+    return float(np.sqrt(max(scatter**2 - float(np.median(error)) ** 2, 0.0)))
 
 
 def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
@@ -102,45 +147,52 @@ def _reach(ties: Ties, known: np.ndarray, n: int) -> np.ndarray:
     return np.isin(group, group[known])
 
 
-def _solve(cell, source, value, weight, given, given_error, reached) -> np.ndarray:
-    """Constants f8 (n,) for these weights; NaN for sources that are not reached."""
-    n, known = len(given), np.isfinite(given)
-    normal, right = np.zeros((n, n)), np.zeros(n)
+def _solve(
+    design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray, anchors: Anchors, reached: np.ndarray
+) -> np.ndarray:
+    """Constants and coefficients f8 (n + m,) for these weights; NaN for sources that are not reached."""
+    n, known = len(reached), np.flatnonzero(np.isfinite(anchors.value))
+    more = np.zeros((n, design.shape[1] - n)) if anchors.columns is None else anchors.columns
+    fixed = np.concatenate([np.eye(n)[known], more[known]], axis=1)
+    firm = anchors.error[known] ** -2.0
+    normal, right = fixed.T @ (firm[:, None] * fixed), fixed.T @ (firm * anchors.value[known])
     if len(cell):
+        # The brightness of each cell is eliminated: only what differs within cells counts.
         cells = int(cell.max()) + 1
-        table = csr_array((weight, (cell, source)), (cells, n))
         whole = np.maximum(np.bincount(cell, weight, cells), 1e-300)
-        mean = np.bincount(cell, weight * value, cells) / whole
-        shared = csr_array((weight / whole[cell], (cell, source)), (cells, n))
-        normal = np.diag(np.bincount(source, weight, n)) - (shared.T @ table).toarray()
-        right = -np.bincount(source, weight * (value - mean[cell]), n)
-    fixed = np.zeros(n)
-    fixed[known] = given_error[known] ** -2.0
-    right = right + np.where(known, fixed * np.where(known, given, 0.0), 0.0)
-    normal = normal + np.diag(fixed)
-    found = np.full(n, np.nan)
-    some = np.flatnonzero(reached)
+        gather = csr_array((weight, (cell, np.arange(len(cell)))), (cells, len(cell)))
+        table = gather @ design
+        normal += (design.T @ (design.multiply(weight[:, None]))).toarray()
+        normal -= (table.T @ (table.multiply(1.0 / whole[:, None]))).toarray()
+        right -= design.T @ (weight * value) - table.T @ (gather @ value / whole)
+    found = np.full(design.shape[1], np.nan)
+    some = np.flatnonzero(np.append(reached, np.ones(design.shape[1] - n, bool)))
     found[some] = np.linalg.lstsq(normal[np.ix_(some, some)], right[some], rcond=1e-12)[0]
     return found
 
 
-def _residuals(cell, source, value, weight, found) -> np.ndarray:
-    bright = value + found[source]
+def _residuals(
+    design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray, found: np.ndarray
+) -> np.ndarray:
+    bright = value + design @ np.nan_to_num(found)
     cells = int(cell.max(initial=-1)) + 1
     mean = np.bincount(cell, weight * bright, cells) / np.maximum(np.bincount(cell, weight, cells), 1e-300)
     return bright - mean[cell]
 
 
-def _resample(centre, cell, source, value, weight, given, given_error, reached) -> np.ndarray:
-    """Constants with blocks of cells drawn again, and targets changed by their errors; f8 (TRIALS, n)."""
+def _resample(
+    centre: np.ndarray, design: csr_array, cell: np.ndarray, value: np.ndarray, weight: np.ndarray,
+    anchors: Anchors, reached: np.ndarray, trials: int,
+) -> np.ndarray:  # fmt: skip
+    """Solutions with blocks of cells drawn again, and targets changed by their errors; f8 (trials, n + m)."""
     rng = np.random.default_rng(0)
     _, block = np.unique(np.floor(centre / BLOCK), axis=0, return_inverse=True)
     blocks = int(block.max(initial=-1)) + 1
-    trials = []
-    for _ in range(TRIALS):
+    found = np.empty((trials, design.shape[1]))
+    for row in found:
         drawn = np.bincount(rng.integers(0, max(blocks, 1), blocks), minlength=blocks).astype(float)
         # A little of every block stays: without it a source that few blocks tie could be lost.
         part = weight * np.maximum(drawn[block.ravel()], 1e-3) if blocks else weight
-        moved = given + given_error * rng.standard_normal(len(given))
-        trials.append(_solve(cell, source, value, part, moved, given_error, reached))
-    return np.array(trials)
+        moved = replace(anchors, value=anchors.value + anchors.error * rng.standard_normal(len(anchors.value)))
+        row[:] = _solve(design, cell, value, part, moved, reached)
+    return found

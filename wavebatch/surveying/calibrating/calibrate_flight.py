@@ -7,16 +7,17 @@ to a target has no constant, and a constant never goes from one channel to anoth
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import angle_to_vertical, swath_columns
 from wavebatch.files.disk.fingerprint import take_fingerprint
 from wavebatch.files.strip.reader import StripReader
-from wavebatch.surveying.calibrating.adjust_flight import Adjustment, adjust_constants
+from wavebatch.surveying.calibrating.adjust_flight import Adjustment, Anchors, adjust_constants
 from wavebatch.surveying.calibrating.flight_overlaps import PairOverlap, compare_pairs, find_doubts
 from wavebatch.surveying.calibrating.strip_echoes import ECHO, SCANNERS, EchoSource, see_channels
 from wavebatch.surveying.calibrating.target_file import Target
@@ -28,11 +29,17 @@ from wavebatch.surveying.calibrating.targets import (
     measure_ranging,
     open_strip_source,
 )
-from wavebatch.surveying.calibrating.tie_cells import TIE, Ties, choose_size, hash_squares, measure_ties
-from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult
+from wavebatch.surveying.calibrating.tie_cells import TIE, VIEW, Ties, choose_size, hash_squares, measure_ties
+from wavebatch.surveying.calibrating.trends import LEAST_SPREAD, Trend, find_trend, fit_swath
+from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant, TargetResult, check_attenuation
 
 MOST_TIES = 200_000
 """Most waveforms of a strip that are decomposed for ties; they come from whole squares of 10 m, spread by chance."""
+
+_UNEXPLAINED = (
+    "the strips' light from one place differs by more than their constants explain: check targets, trajectory and "
+    "whether the overlaps are wet, rough or planted"
+)
 
 _Box = tuple[np.ndarray, np.ndarray]
 """Lower and upper corner in x and y [m]."""
@@ -64,6 +71,8 @@ class _Strip:
     """Relative error of a constant from the error of the sensor's position."""
     ties: np.ndarray
     """Array of TIE, with channels as sources."""
+    seen: Mapping[int, np.void]
+    """How the targets were seen by each channel, as VIEW."""
 
 
 def calibrate_flight(
@@ -94,6 +103,7 @@ def calibrate_flight(
     docs/algorithms.md 5.3.
     """
     options = options or CalibrationOptions()
+    check_attenuation(options.attenuation)
     boxes = [_find_box(path) for path in paths]
     origin = boxes[0][0]
     strips = [_read_strip(path, i, boxes, targets, options) for i, path in enumerate(paths)]
@@ -101,16 +111,41 @@ def calibrate_flight(
     if not good:
         raise InputError(strips[0].refused if len(strips) == 1 else "; ".join(strip.refused for strip in strips))
     sources = [(i, channel) for i, strip in enumerate(strips) for channel in strip.channels]
-    if len(sources) == 1:
+    if len(sources) == 1 and not options.scan_angle:
         return FlightCalibration(good[0].found)
     ties = _tie(strips, sources, origin)
-    given, given_error = _list_given(strips, sources, options)
-    adjusted = adjust_constants(ties, given, given_error)
-    calibration = _assemble(strips, sources, adjusted, options)
+    anchors, seen = _list_given(strips, sources, options)
+    swath: tuple[float, ...] = ()
+    if options.scan_angle:
+        adjusted, swath = fit_swath(ties, anchors, seen)
+        ties = replace(ties, value=ties.value + swath_columns(ties.view["angle"], swath[0]) @ swath[1:])
+        anchors = replace(anchors, value=anchors.value - swath_columns(seen["angle"], swath[0]) @ swath[1:])
+    else:
+        adjusted = adjust_constants(ties, anchors)
+    calibration = replace(_assemble(strips, sources, adjusted, options), swath=swath)
     names = [_name(strips, source) for source in sources]
     pairs = tuple(compare_pairs(ties, adjusted, names))
     notes = [*calibration.notes, *find_doubts(names, adjusted, calibration.strips, pairs)]
-    return FlightCalibration(replace(calibration, notes=tuple(notes)), pairs, ties.size)
+    calibration, more = _widen(calibration, adjusted, find_trend(ties, anchors, seen, adjusted))
+    return FlightCalibration(replace(calibration, notes=(*notes, *more)), pairs, ties.size)
+
+
+def _widen(calibration: Calibration, adjusted: Adjustment, trend: Trend | None) -> tuple[Calibration, list[str]]:
+    """The calibration with what the overlaps leave unexplained in its errors, and the sentence about it where it is
+    more than these."""
+    spread = adjusted.scatter if trend is None else max(adjusted.scatter, trend.spread)
+    if spread < LEAST_SPREAD:
+        return calibration, []
+    stated = max(row.relative_error for row in calibration.strips)
+    reason = _UNEXPLAINED if trend is None else trend.doubt
+    note = f"{reason}; the error of the constants grows from {100 * stated:.1f} by {100 * spread:.1f} %"
+    channels, strips = (
+        tuple(replace(row, relative_error=math.hypot(row.relative_error, spread)) for row in rows)
+        for rows in (calibration.channels, calibration.strips)
+    )
+    whole = math.hypot(calibration.relative_error, spread)
+    notes = [note] if spread > stated else []
+    return replace(calibration, relative_error=whole, channels=channels, strips=strips), notes
 
 
 def _find_box(path: Path) -> _Box:
@@ -155,7 +190,19 @@ def _read_strip(
             described=tuple(describe_channel(row, source) for row in blank),
             ranging=measure_ranging(source.sensor, distance, options.attenuation),
             ties=ties,
+            seen=_see_targets(on_targets),
         )
+
+
+def _see_targets(on_targets: Sequence[np.ndarray]) -> dict[int, np.void]:
+    """How each channel saw the targets in the middle, as VIEW; good targets are level."""
+    rows, seen = np.concatenate(on_targets), {}
+    for channel in np.unique(rows["channel"]).tolist():
+        mine, view = rows[rows["channel"] == channel], np.zeros(1, VIEW)[0]
+        view["angle"] = view["incidence"] = np.median(angle_to_vertical(mine["ray"]))
+        view["distance"], view["time"] = np.median(mine["distance"]), np.median(mine["time"])
+        seen[channel] = view
+    return seen
 
 
 class _TieArea:
@@ -199,7 +246,9 @@ def _collect(source: EchoSource, targets: Sequence[Target], area: _TieArea) -> t
 def _shorten(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:
     short = np.empty(len(rows), TIE)
     short["xyz"] = rows["xyz"] - [*origin, 0.0]
-    short["ray"], short["light"], short["source"] = rows["ray"], rows["light"], rows["channel"]
+    short["source"] = rows["channel"]
+    for name in ("ray", "light", "distance", "time"):
+        short[name] = rows[name]
     return short
 
 
@@ -216,17 +265,19 @@ def _tie(strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], origin: n
 
 def _list_given(
     strips: Sequence[_Strip], sources: Sequence[tuple[int, int]], options: CalibrationOptions
-) -> tuple[np.ndarray, np.ndarray]:
-    """Logarithms of the constants by targets, f8 (n,), NaN without, and their errors without that of the reflectance,
-    which strips that see the same targets share."""
+) -> tuple[Anchors, np.ndarray]:
+    """Constants by targets with their errors without that of the reflectance, which strips that see the same targets
+    share; and how each source saw its targets, array of VIEW (n,), NaN without."""
     value, error = np.full((2, len(sources)), np.nan)
+    seen = np.full(len(sources), np.nan, VIEW)
     for number, (i, channel) in enumerate(sources):
         found = strips[i].found
         for row in found.channels if found else ():
             if SCANNERS * row.digitizer + row.scanner == channel:
                 rest = row.relative_error**2 - _reflectance_error([found], options) ** 2
                 value[number], error[number] = math.log(row.constant), math.sqrt(max(rest, 1e-6))
-    return value, error
+                seen[number] = strips[i].seen[channel]
+    return Anchors(value, error), seen
 
 
 def _reflectance_error(found: Sequence[Calibration], options: CalibrationOptions) -> float:

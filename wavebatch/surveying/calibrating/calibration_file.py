@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -33,6 +34,7 @@ _NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
     ),
     "height_m": ("height", 0.0, 1e7, None, "of the sensor above the targets, median"),
     "distance_m": ("distance", 0.0, 1e7, None, "from the sensor to the targets, median: runs at others are less sure"),
+    "pulse_rate_hz": ("rate", 1e-3, 1e12, None, "by GPS times: a laser has another energy at another rate"),
     "section_constant": (
         "section_constant", 0.0, 1e30, None, "C_cal: cross section = C_cal R^4 amplitude sigma / transmission"
     ),
@@ -41,7 +43,9 @@ _NUMBERS: dict[str, tuple[str, float, float, Any, str]] = {
 
 _DAY = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 
-_TEXTS = ("strip", "date", "conditions", "sensor", "flight", "chain", "decomposer")
+_TEXTS = ("strip", "date", "conditions", "sensor", "software", "flight", "chain", "decomposer")
+_SWATH = {"most_deg": (1e-3, 90.0), "square": (-10.0, 10.0), "fourth": (-10.0, 10.0)}
+"""Keys of [scan_angle] with their limits: the constant grows by exp(square u^2 + fourth u^4), u = angle / most_deg."""
 _HEADING = "A calibration: `wavebatch run --calibration` takes it for strips of the same sensor and settings."
 
 
@@ -53,6 +57,9 @@ def format_calibration(found: Calibration) -> str:
         "version": __version__,
         **{key: getattr(found, key) for key in _TEXTS},
         **{key: None if value is None else float(value) for key, value in numbers.items()},
+        "scan_angle": dict(zip(_SWATH, (math.degrees(found.swath[0]), *found.swath[1:]), strict=True))
+        if found.swath
+        else None,
         "channel": [asdict(row) for row in found.channels] or None,
         "flight_strip": [asdict(row) for row in found.strips] or None,
         "target": [asdict(row) for row in found.targets] or None,
@@ -87,7 +94,8 @@ def parse_calibration(text: str, name: str) -> Calibration:
     """
     table = parse_toml(text, name)
     table.check_kind("calibration")
-    table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, "channel", "flight_strip", "target", "fingerprint"))
+    tables = ("scan_angle", "channel", "flight_strip", "target", "fingerprint")
+    table.check_keys(("schema", "version", *_TEXTS, *_NUMBERS, *tables))
     table.check_schema(CALIBRATION_SCHEMA)
     values = {field: table.number(key, *limits) for key, (field, *limits) in _NUMBERS.items()}
     section = values.pop("section_constant")
@@ -105,10 +113,17 @@ def parse_calibration(text: str, name: str) -> Calibration:
             raise ConfigError(f"{row.where}: digitizer {key[0]} with scanner channel {key[1]} is there already")
         channels[key] = channel
     strips = tuple(map(_read_strip, table.tables("flight_strip")))
-    found = Calibration(**values, **texts, channels=tuple(channels.values()), strips=strips)
+    swath = _read_swath(table.table("scan_angle")) if "scan_angle" in table.values else ()
+    found = Calibration(**values, **texts, channels=tuple(channels.values()), strips=strips, swath=swath)
     if section is not None:
         _check_section(section, found, name)
     return found
+
+
+def _read_swath(table: TomlTable) -> tuple[float, ...]:
+    table.check_keys(_SWATH)
+    most, *terms = (table.number(key, *limits) for key, limits in _SWATH.items())
+    return (math.radians(most), *terms)
 
 
 def _check_section(section: float, found: Calibration, name: str) -> None:
@@ -134,6 +149,8 @@ def _read_channel(table: TomlTable) -> ChannelConstant:
         spacing_ns=table.number("spacing_ns", 1e-6, 1e9, None),
         gain=table.number("gain", default=None),
         pulse_ns=table.number("pulse_ns", 1e-6, 1e9, None),
+        noise_dn=table.number("noise_dn", 0.0, 1e12, None),
+        brightest=table.number("brightest", 0.0, 1e30, None),
     )
 
 

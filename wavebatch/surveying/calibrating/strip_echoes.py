@@ -18,11 +18,13 @@ from wavebatch.core.echoes import UNCLEAN, EchoFlag, EchoTable
 from wavebatch.core.errors import InputError
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.las.header import decode_text
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy, read_blocks
 from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader
 from wavebatch.files.strip.scan_result import StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.surveying.auto_chain import widest_chain
+from wavebatch.surveying.calibrating.setting import Setting, check_energies, measure_setting
 from wavebatch.surveying.choose_chain import Choice, Request, make_choice
 from wavebatch.surveying.sensor import SensorRequest, SensorSource, find_sensor
 from wavebatch.surveying.systems.saved_check import check_saved
@@ -32,9 +34,10 @@ SCANNERS = 4
 
 ECHO = np.dtype([
     ("xyz", "<f8", 3), ("ray", "<f8", 3), ("distance", "<f8"), ("light", "<f8"), ("light_err", "<f8"),
-    ("channel", "<i4"),
+    ("channel", "<i4"), ("time", "<f8"),
 ])  # fmt: skip
-"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel."""
+"""An echo: position [m], unit direction of its ray, range [m], R^2 A sigma / eta and the error of its fit, channel, GPS
+time [s]."""
 
 _BLOCK = 8192
 """Waveforms that are read at a time."""
@@ -60,6 +63,8 @@ class EchoSource:
     """The chosen one, and the stage that gives the energy."""
     system: SystemPulse
     sensor: SensorSource
+    setting: Setting
+    energy: PulseEnergy | None = None
 
     @property
     def path(self) -> Path:
@@ -71,7 +76,7 @@ class EchoSource:
 
         wanted: which returns at positions f8 (k, 3) are of interest, bool (k,); only their waveforms are decomposed.
         """
-        for block in self.reader.all_blocks(self.scan, _BLOCK):
+        for block in read_blocks(self.reader, self.scan, _BLOCK, self.energy):
             near = np.unique(block.returns.waveform[wanted(block.returns.xyz)])
             if len(near):
                 part = self.sensor.fill(block.rows(near))
@@ -87,6 +92,7 @@ def open_source(
     request: Request,
     attenuation: float,
     direction: str,
+    energy: str | None,
 ) -> Iterator[EchoSource]:
     """Open a strip, choose pulse and chain as `wavebatch run` does, and find the sensor.
 
@@ -101,6 +107,8 @@ def open_source(
         Of the air, one way [dB/km].
     direction : str
         Where packet vectors point: auto, toward or away.
+    energy : str or None
+        Of each emitted pulse; see `find_pulse_energy`.
 
     Yields
     ------
@@ -119,7 +127,11 @@ def open_source(
         choice = make_choice(reader, scan, chain or widest_chain(), request)
         # The error of the sensor's position is the same for all echoes: it belongs to the constant, not to them.
         system = replace(choice.survey.system, attenuation=attenuation, sensor_error=0.0)
-        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source)
+        setting = measure_setting(reader, scan, source, attenuation)
+        sent = find_pulse_energy(reader, scan, energy)
+        if energy is not None and sent is not None:
+            check_energies(reader, scan, sent)
+        yield EchoSource(reader, scan, choice, with_energy(choice.chain), system, source, setting, sent)
 
 
 def with_energy(chain: Chain) -> Chain:
@@ -144,6 +156,7 @@ def take_clean(block: WaveformBlock, echoes: EchoTable) -> np.ndarray:
     rows["light"] = echoes.attributes[_LIGHT]
     rows["light_err"] = echoes.attributes[f"{_LIGHT}_err"]
     scanner = 0 if block.scanner is None else block.scanner[echoes.waveform].astype(np.int32)
+    rows["time"] = block.gps_time[echoes.waveform]
     rows["channel"] = SCANNERS * block.digitizer.index + scanner
     known = np.isfinite(rows["ray"]).all(axis=1) & (rows["light"] > 0) & np.isfinite(rows["light_err"])
     return rows[known]

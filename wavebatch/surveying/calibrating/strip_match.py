@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import date
 
 import numpy as np
 
@@ -19,10 +18,17 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import Digitizer, SystemPulse, WaveformBlock
 from wavebatch.files.disk.fingerprint import take_fingerprint
-from wavebatch.files.strip.facts import StripFacts
 from wavebatch.files.strip.reader import StripReader, StripScan
 from wavebatch.stages.chain import STAGES, Chain, Step
-from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name, see_channels
+from wavebatch.surveying.angle_limits import sample_reference
+from wavebatch.surveying.calibrating.strip_conditions import (
+    compare_air,
+    compare_divergence,
+    compare_setting,
+    doubt_calibration,
+    find_growth,
+)
+from wavebatch.surveying.calibrating.strip_echoes import see_channels
 from wavebatch.surveying.calibration import Calibration, ChannelConstant, StripConstant
 from wavebatch.surveying.sensor import SensorSource
 
@@ -32,16 +38,6 @@ one, and the error grows by the difference. Surveys of a sensor's strips agree w
 
 SAME = 1e-3
 """Relative difference up to which spacings and gains are equal: headers round them."""
-
-OTHER_DAY, OTHER_MONTH = 0.02, 0.05
-"""Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
-are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
-
-AIR_DOUBT = 0.5
-"""Relative error of the attenuation of the air, for strips at other distances than the targets."""
-
-FAR = 1.3
-"""Ratio of distances from which the strip's and the targets' are named."""
 
 _CHAIN_SAMPLE = 2048
 """Waveforms on which two chains are compared."""
@@ -67,6 +63,7 @@ def match_strip(
     system: SystemPulse,
     sensor: SensorSource,
     chain: Chain | None = None,
+    attenuation: float | None = None,
 ) -> StripMatch:
     """Fit a calibration to a strip.
 
@@ -80,6 +77,8 @@ def match_strip(
     sensor : SensorSource
     chain : Chain, optional
         That the strip runs with.
+    attenuation : float, optional
+        Of the air [dB/km], where it is not that of the calibration.
 
     Returns
     -------
@@ -94,20 +93,20 @@ def match_strip(
     -----
     docs/algorithms.md 5.2.
     """
-    warnings: list[str] = []
+    warnings = list(doubt_calibration(calibration))
     if not any(row.is_described for row in calibration.channels):
-        warnings.append(
-            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
-            "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
-        )
         return StripMatch(calibration, tuple(warnings))
-    growth, reasons = _find_growth(calibration, reader, sensor)
-    warnings += [*reasons, *_compare_divergence(calibration, system)]
+    growth, reasons = find_growth(calibration, reader, sensor)
+    own_strip = take_fingerprint(reader.facts.path, reader.facts.packets.file)["sha256_sampled"]
+    if all(row.sha256 != own_strip for row in calibration.strips):
+        more, lines = compare_setting(calibration, reader, scan, system, sensor)
+        growth, reasons = math.hypot(growth, more), [*reasons, *lines]
+    warnings += [*reasons, *compare_divergence(calibration, system)]
     growth = math.hypot(growth, _compare_decomposers(calibration, reader, scan, system, chain, warnings))
     rows, reasons = [], {}
+    pulses = _find_pulses(calibration, reader, scan, system, sensor)
     for index in sorted(scan.by_descriptor):
-        own = system.digitizers.get(index, system)
-        pulse = own.sigma_ref * FWHM_PER_SIGMA
+        pulse = pulses.get(index, pulses[0])
         found, reasons[index] = _match_digitizer(calibration, reader.facts.digitizers[index], pulse, warnings)
         rows += found
     have, seen = {(row.digitizer, row.scanner) for row in rows}, see_channels(reader, scan)
@@ -127,9 +126,34 @@ def match_strip(
     ]
     rows = [replace(row, relative_error=math.hypot(row.relative_error, growth)) for row in rows]
     if calibration.strips:
-        rows = list(_take_strip_constants(calibration.strips, rows, reader.facts))
+        rows = list(_take_strip_constants(calibration.strips, rows, own_strip))
+    air = compare_air(calibration, reader, sensor, attenuation, warnings)
+    rows = [replace(row, relative_error=math.hypot(row.relative_error, air)) for row in rows]
     fitted = replace(calibration, constant=math.nan, channels=tuple(rows), strips=())
     return StripMatch(fitted, tuple(dict.fromkeys(warnings)))
+
+
+def _find_pulses(
+    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
+) -> dict[int, float]:
+    """Widths at half maximum of the pulses of all digitizers that have one of their own, and of the others as 0 [ns].
+
+    A hillside widens every echo, so that the survey of its strip finds a wider pulse than the sensor has: where a pulse
+    is wider than the calibration's, what the slopes of the strip's surfaces add to it is taken off.
+    """
+    systems = {0: system, **system.digitizers}
+    known = [row.pulse_ns for row in calibration.channels if row.pulse_ns]
+    divergence = system.divergence or calibration.divergence
+    widest = max(one.sigma_ref for one in systems.values()) * FWHM_PER_SIGMA
+    if known and divergence and widest > NEAR_PULSE * min(known):
+        main = max(scan.by_descriptor, key=lambda index: (index not in system.digitizers, scan.by_descriptor[index]))
+        spacing = reader.facts.digitizers[main].spacing
+        seen = sample_reference(reader, scan, sensor, replace(system, divergence=divergence), spacing).system
+        systems = {0: seen, **seen.digitizers}
+    return {
+        index: FWHM_PER_SIGMA * math.sqrt(max(one.sigma_ref**2 + one.level_variance, 0.0))
+        for index, one in systems.items()
+    }
 
 
 def _match_digitizer(
@@ -174,7 +198,8 @@ def _contradict(row: ChannelConstant, digitizer: Digitizer, pulse: float) -> str
             return f"digitizer {digitizer.index} has a {name} of {own:g} {unit}, the calibration {other:g}"
     ratio = pulse / (row.pulse_ns or pulse)
     if max(ratio, 1 / ratio) > OTHER_PULSE:
-        return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns"
+        slopes = " (if slopes widen it, put divergence_mrad of the data sheet into CAL.toml)" if ratio > 1 else ""
+        return f"its pulse is {pulse:.3g} ns wide, that of the calibration {row.pulse_ns:.3g} ns{slopes}"
     return ""
 
 
@@ -196,44 +221,6 @@ def _pool_lengths(rows: list[ChannelConstant], digitizer: Digitizer) -> list[Cha
             replace(some[0], digitizer=digitizer.index, constant=float(constants.mean()), relative_error=error)
         )
     return pooled
-
-
-def _find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSource) -> tuple[float, list[str]]:
-    """Error that day, distance and sensor add to the constant, relative, and the warnings."""
-    parts, lines = [], []
-    day = read_day(reader)
-    if day and calibration.flight and day != calibration.flight:
-        apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
-        parts.append(OTHER_MONTH if apart > 30 else OTHER_DAY)
-        lines.append(
-            f"calibration: measured on {calibration.flight}, this strip was flown on {day}: the error of the constant "
-            f"grows by {100 * parts[-1]:.0f} %"
-        )
-    if calibration.distance and sensor.distance:
-        slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
-        parts.append(slope * abs(sensor.distance - calibration.distance))
-        ratio = sensor.distance / calibration.distance
-        if max(ratio, 1 / ratio) > FAR:
-            lines.append(
-                f"calibration: measured at {calibration.distance:.0f} m, this strip is {sensor.distance:.0f} m away: "
-                f"the air between adds {100 * parts[-1]:.1f} % to the error of the constant"
-            )
-    name = read_sensor_name(reader.facts)
-    if calibration.sensor and name and name != calibration.sensor:
-        lines.append(
-            f"calibration: measured with sensor {calibration.sensor!r}, the header of this strip names {name!r}; "
-            "bits, spacing, gain and pulse agree"
-        )
-    return float(np.sqrt(np.sum(np.square(parts)))), lines
-
-
-def _compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
-    own, other = system.divergence, calibration.divergence
-    if own is not None and other is not None and abs(own / other - 1.0) > NEAR_PULSE - 1.0:
-        yield (
-            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "
-            f"one of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
-        )
 
 
 def _compare_decomposers(
@@ -279,10 +266,9 @@ def _compare_energies(block: WaveformBlock, system: SystemPulse, pair: tuple[Cha
 
 
 def _take_strip_constants(
-    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], facts: StripFacts
+    strips: tuple[StripConstant, ...], rows: list[ChannelConstant], key: str
 ) -> Iterator[ChannelConstant]:
-    """The rows; where the strip itself was calibrated, with the constants of the strip."""
-    key = take_fingerprint(facts.path, facts.packets.file)["sha256_sampled"]
+    """The rows; where the strip itself, known by its fingerprint, was calibrated, with the constants of the strip."""
     own = {(row.digitizer, row.scanner): row for row in strips if row.sha256 == key}
     for row in rows:
         found = own.get((row.digitizer, row.scanner))

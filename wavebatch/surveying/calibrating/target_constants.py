@@ -26,6 +26,9 @@ MOST_FACING_ERROR = 0.05
 GIVEN_ANGLE_ERROR = np.radians(1.0)
 """Error of an incidence that the target file gives."""
 
+MOST_OFF = 4.0
+"""A given incidence contradicts the plane of the echoes by so many standard errors."""
+
 INSET = 1.5
 """Echoes count this many 1/e2 radii inside the outline: 0.13 % of a footprint's light lies beyond a straight edge."""
 
@@ -71,6 +74,13 @@ def measure_target(
     if len(rows) < LEAST_ECHOES:
         return replace(blank, refused=f"{len(rows)} clean single echoes, {LEAST_ECHOES} are needed"), *nothing
     facet = fit_facet(rows["xyz"], rows["ray"])
+    seen, seen_err = float(np.median(facet.angles(rows["ray"]))), float(np.hypot(facet.angle_error, GIVEN_ANGLE_ERROR))
+    if target.incidence is not None and abs(np.radians(target.incidence) - seen) > MOST_OFF * seen_err:
+        reason = (
+            f"its incidence of {target.incidence:g} deg contradicts the plane of its echoes, which rays strike at "
+            f"{np.degrees(seen):.1f} +- {np.degrees(seen_err):.1f} deg: correct incidence, or leave it out"
+        )
+        return replace(blank, refused=reason), *nothing
     if target.incidence is None:
         angle, angle_err, facing_err = facet.angles(rows["ray"]), facet.angle_error, facet.facing_error
     else:
@@ -94,7 +104,8 @@ def measure_target(
             f"{inset:.2f} m inside its outline, {LEAST_ECHOES} are needed"
         )
         return replace(blank, refused=reason, inset_m=round(inset, 3)), *nothing
-    constant = 4.0 * target.reflectance * np.cos(angle[used]) / rows["light"][used]
+    bright = target.reflectance * (1.0 + target.hot_spot)
+    constant = 4.0 * bright * np.cos(angle[used]) / rows["light"][used]
     relative = _by_channel(constant, rows["channel"][used])
     edge, edge_err = _compare_edge(relative, depth[used])
     result = replace(
@@ -106,7 +117,8 @@ def measure_target(
         strange=_share_strange(relative),
     )
     inner = MEDIAN_ERROR * result.spread / np.sqrt(result.echoes - 1)
-    error = float(np.sqrt(reflectance_error**2 + facing_err**2 + inner**2 + edge_err**2))
+    hot_err = 0.5 * target.hot_spot / (1.0 + target.hot_spot)
+    error = float(np.sqrt(reflectance_error**2 + hot_err**2 + facing_err**2 + inner**2 + edge_err**2))
     return replace(result, relative_error=error), rows[used], constant
 
 

@@ -24,6 +24,17 @@ _CORNERS = 64
 """Corners of the polygon that stands for a circle."""
 
 
+HOT_SPOT, BRIGHT = 0.25, 0.5
+"""What reflectances measured from aside lack of those that a lidar sees along its own light, and from which reflectance
+on; in proportion below it. Half of it is its error. White standards reflect 1.3 to 1.5 times as much within a degree of
+the light (Egan and Hilgeman 1976); natural bright targets 1.2 to 1.3."""
+
+NARROW = 3.0
+"""Angle between light and detector up to which a measurement sees the hot spot [deg]."""
+
+GEOMETRIES = ("backscatter", "directional", "hemispherical")
+"""How a reflectance was measured: along the light, at an angle to it (column `angle`), into all directions."""
+
 LEAST_REFLECTANCE = 1e-6
 """Of a target: the blackest coatings reflect 100 times as much."""
 
@@ -38,6 +49,8 @@ class Target:
     """Corners of its outline, f8 (k, 2) [m]."""
     incidence: float | None = None
     """Angle between ray and normal [deg]; None: taken from the plane of the target's echoes."""
+    hot_spot: float = 0.0
+    """What the lidar sees more than the reflectance says, relative, because that was measured from aside."""
     file: AreaFile | None = None
     """Where the coordinates of a GeoJSON file lie; None: in the CRS of the strip."""
 
@@ -68,8 +81,9 @@ def load_targets(path: Path | str) -> list[Target]:
     ----------
     path : path
         GeoJSON: polygons with the property reflectance. CSV: the column reflectance, and x, y, radius, or vertices as
-        `x y x y x y ...`. Both may have name and incidence [deg]. Coordinates of CSV are those of the strip; those of
-        GeoJSON are placed in each strip by `Target.place`.
+        `x y x y x y ...`. Both may have name, incidence [deg], and how the reflectance was measured: geometry (one of
+        GEOMETRIES) and angle [deg]. Coordinates of CSV are those of the strip; those of GeoJSON are placed in each
+        strip by `Target.place`.
 
     Returns
     -------
@@ -130,4 +144,18 @@ def _read_target(row: Mapping[str, Any], where: str) -> Target:
         raise ConfigError(f"{where}: reflectance must lie {limits}, and the outline needs three corners")
     if incidence is not None and not 0 <= incidence < 85:
         raise ConfigError(f"{where}: incidence must lie in 0 to 85 degrees, it is {incidence:g}")
-    return Target(str(fields.get("name", where.rsplit(": ", 1)[-1])), reflectance, corners, incidence)
+    name = str(fields.get("name", where.rsplit(": ", 1)[-1]))
+    return Target(name, reflectance, corners, incidence, _find_hot_spot(fields, reflectance, where))
+
+
+def _find_hot_spot(fields: Mapping[str, Any], reflectance: float, where: str) -> float:
+    geometry = str(fields.get("geometry", GEOMETRIES[0])).strip().lower()
+    if geometry not in GEOMETRIES or (geometry == "directional") != ("angle" in fields):
+        kinds = " or ".join(GEOMETRIES)
+        raise ConfigError(f"{where}: geometry must be {kinds}, and only directional has an angle [deg] to the light")
+    try:
+        angle = float(fields.get("angle", 90.0))
+    except ValueError as error:
+        raise ConfigError(f"{where}: not numbers: {error}") from error
+    aside = geometry == "hemispherical" or (geometry == "directional" and not abs(angle) <= NARROW)
+    return HOT_SPOT * min(reflectance / BRIGHT, 1.0) if aside else 0.0

@@ -17,6 +17,7 @@ from wavebatch.core.errors import InputError
 from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.files.area_crs import describe_miss
 from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.las.header import decode_text
 from wavebatch.kernels.physics.radiometry import backscatter_error
 from wavebatch.stages.chain import Chain
 from wavebatch.surveying.calibrating.strip_echoes import (
@@ -59,6 +60,10 @@ class CalibrationOptions:
     """Standard deviation of the targets' reflectances, relative."""
     direction: str = "auto"
     """Where packet vectors point: auto, toward or away."""
+    scan_angle: bool = False
+    """Fit how the light depends on the scan angle, where strips overlap."""
+    energy: str | None = None
+    """Energy of each emitted pulse, as for `wavebatch run`; see `find_pulse_energy`."""
 
 
 def open_strip_source(path: Path, options: CalibrationOptions):
@@ -70,6 +75,7 @@ def open_strip_source(path: Path, options: CalibrationOptions):
         request=options.request,
         attenuation=options.attenuation,
         direction=options.direction,
+        energy=options.energy,
     )
 
 
@@ -133,6 +139,8 @@ def build_calibration(
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         conditions=f"sensor from {source.sensor.kind}, pulse {pulse:.4g} ns, {whole.echoes} echoes",
         sensor=read_sensor_name(facts),
+        software=decode_text(facts.header.generating_software).strip(),
+        rate=source.setting.rate,
         flight=read_day(source.reader),
         chain=source.choice.chain.name,
         decomposer=decomposer,
@@ -178,6 +186,8 @@ def describe_channel(row: ChannelConstant, source: EchoSource) -> ChannelConstan
     system = source.system.digitizers.get(row.digitizer, source.system)
     return replace(
         row,
+        noise_dn=system.noise_std,
+        brightest=source.setting.brightest.get(row.digitizer),
         bits=digitizer.bits,
         samples=digitizer.n_samples,
         spacing_ns=digitizer.spacing,

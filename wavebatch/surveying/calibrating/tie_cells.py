@@ -11,10 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from wavebatch.core.units import MAD_TO_STD, MEDIAN_ERROR
+from wavebatch.core.waveforms import angle_to_vertical
 from wavebatch.kernels.geometry.planes import fit_planes
 
-TIE = np.dtype([("xyz", "<f4", 3), ("ray", "<f4", 3), ("light", "<f4"), ("source", "<i4")])
-"""A single echo: position from a common origin [m], unit direction of its ray, R^2 A sigma / eta, number of source."""
+TIE = np.dtype([
+    ("xyz", "<f4", 3), ("ray", "<f4", 3), ("light", "<f4"), ("source", "<i4"), ("distance", "<f4"), ("time", "<f8"),
+])  # fmt: skip
+"""A single echo: position from a common origin [m], unit direction of its ray, R^2 A sigma / eta, number of source,
+range [m], GPS time [s]."""
+
+VIEW = np.dtype([("angle", "<f8"), ("incidence", "<f8"), ("distance", "<f8"), ("time", "<f8")])
+"""How a source saw a cell: angle of the ray to the vertical and to the normal [rad], range [m], GPS time [s]."""
 
 LEAST_ECHOES = 5
 """Echoes that a source needs in a cell."""
@@ -51,6 +58,8 @@ class Ties:
     """Centre of the cell, f8 (k, 2) [m]."""
     size: float
     """Edge of a cell [m]."""
+    view: np.ndarray | None = None
+    """Array of VIEW (k,): by the middle echo in time of each row."""
 
 
 def choose_size(rows: np.ndarray) -> float:
@@ -98,14 +107,17 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
     rows, cell, pair = _keep_shared(rows, cell)
     if not len(rows):
         empty = np.empty(0)
-        return Ties(empty.astype(int), empty.astype(int), empty, empty, empty, empty, np.empty((0, 2)), size)
+        return Ties(
+            empty.astype(int), empty.astype(int), empty, empty, empty, empty, np.empty((0, 2)), size, np.empty(0, VIEW)
+        )
     _, cell = np.unique(cell, return_inverse=True)
     off, facing, tilt, flat = _fit_cells(rows, cell, np.unique(pair, return_inverse=True)[1], slope)
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.log(rows["light"].astype(np.float64) / (4.0 * facing))
     good = flat & np.isfinite(value)
-    rows, cell, value, off, tilt = rows[good], cell[good], value[good], off[good], tilt[good]
-    rows, kept_cell, pair, value, off, tilt = _keep_shared(rows, cell, value, off, tilt)
+    rows, kept_cell, pair, value, off, tilt, facing = _keep_shared(
+        rows[good], cell[good], value[good], off[good], tilt[good], facing[good]
+    )
     if not len(rows):
         return measure_ties(rows, size)
     _, at, number = np.unique(pair, return_index=True, return_counts=True)
@@ -114,7 +126,17 @@ def measure_ties(rows: np.ndarray, size: float, slope: float | None = None) -> T
     centre = (np.floor(rows["xyz"][at, :2] / size) + 0.5) * size
     height, _ = _medians(off, pair)
     error = MEDIAN_ERROR * np.maximum(spread, 1e-3) / np.sqrt(number)
-    return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size)
+    view = _describe_view(rows, facing, at + number // 2)
+    return Ties(cells, rows["source"][at], middle, error, height, tilt[at], centre.astype(np.float64), size, view)
+
+
+def _describe_view(rows: np.ndarray, facing: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """How the rows `at` were seen, array of VIEW."""
+    view = np.empty(len(at), VIEW)
+    view["angle"] = angle_to_vertical(rows["ray"][at])
+    view["incidence"] = np.arccos(np.clip(facing[at], 0.0, 1.0))
+    view["distance"], view["time"] = rows["distance"][at], rows["time"][at]
+    return view
 
 
 def _keep_shared(rows: np.ndarray, cell: np.ndarray, *more: np.ndarray) -> tuple[np.ndarray, ...]:

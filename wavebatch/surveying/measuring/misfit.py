@@ -17,7 +17,7 @@ from wavebatch.kernels.fit.decompose import promise_echoes
 from wavebatch.kernels.fit.problem import Settings
 from wavebatch.kernels.signal.filters import filter_energy, filter_symmetric, gaussian_taps
 from wavebatch.stages.decompose.fit import adaptive
-from wavebatch.stages.decompose.solve import samples_of
+from wavebatch.stages.detect.candidates import samples_of
 from wavebatch.stages.noise import pooled as pooled_noise
 from wavebatch.stages.pulse_tables import clip_level, model_parameters, pulse_shape, shape_limits
 from wavebatch.surveying.measuring.lone_echoes import find_strongest

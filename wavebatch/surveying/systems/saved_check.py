@@ -26,7 +26,7 @@ from wavebatch.surveying.flight import (
 )
 
 HELD = 1024
-"""Waveforms of the strip that are held against the survey."""
+"""Waveforms of the strip that are compared with the survey."""
 
 LARGEST_WIDTH, LEAST_WIDTH, LARGEST_MISFIT, LARGEST_NOISE = 1.4, 0.7, 0.15, 3.0
 """Limits for files without the figures of a look, such as shipped or hand-written ones: width of a Gaussian fit over

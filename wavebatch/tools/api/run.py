@@ -20,10 +20,11 @@ from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.files.disk.raw_bytes import open_regular, reporting_reads
 from wavebatch.files.inputs import find_strips
+from wavebatch.files.pulse_energy import NONE
 from wavebatch.stages.chain import Chain
 from wavebatch.stages.chain_file import list_profiles
 from wavebatch.surveying.calibrating.calibration_file import load_calibration
-from wavebatch.surveying.calibration import needs_sensor
+from wavebatch.surveying.calibration import check_attenuation, needs_sensor
 from wavebatch.surveying.choose_chain import Request, widest
 from wavebatch.surveying.sensor import SensorRequest
 from wavebatch.surveying.survey import Survey
@@ -45,7 +46,7 @@ def run(
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
-    pulse_energy: Path | str | None = None,
+    energy: Path | str | None = None,
     where: Condition | str | None = None,
     drop_flags: str | None = None,
     classes: Sequence[int] | None = None,
@@ -92,7 +93,7 @@ def run(
     force : bool
         Use the survey of `system` also for strips that contradict it.
     survey : {"each", "flight"}
-        Survey each strip by itself, or all of them once; that survey is kept as flight.system.toml in `out`, and used
+        Survey each strip alone, or all of them once; that survey is kept as flight.system.toml in `out`, and used
         again by later runs into it. A strip that does not fit it gets one of its own.
     sensor : SensorRequest, optional
         Where the sensor was: trajectory file, lever arm, CRS, flight height. Default: from the packets' vectors.
@@ -101,9 +102,10 @@ def run(
     attenuation : float or (float, float), optional
         Of the air during the flight, one way, and its standard deviation [dB/km]; default: that of the calibration,
         else 0.22.
-    pulse_energy : path or str, optional
+    energy : path or str, optional
         Energy of each emitted pulse, by which columns of light are divided: name of an extra byte of the strips, or a
-        text file with columns time and energy.
+        text file with columns time and energy; "none" divides by nothing. Default: the extra byte pulse_energy, where
+        it is there.
     where : str, optional
         Write only points that meet this, e.g. "classification == 2 and echo_width < 8"; see docs/selection.md.
     drop_flags : str, optional
@@ -167,7 +169,7 @@ def run(
     """
     plan = plan_run(
         strips, out, chain=chain, tolerance=tolerance, system=system, force=force, survey=survey, sensor=sensor,
-        calibration=calibration, attenuation=attenuation, pulse_energy=pulse_energy, where=where, drop_flags=drop_flags,
+        calibration=calibration, attenuation=attenuation, energy=energy, where=where, drop_flags=drop_flags,
         classes=classes, bbox=bbox, polygon=polygon, columns=columns, points=points,
         format=format, point_format=point_format, las_version=las_version, no_data=no_data, strict=strict, names=names,
         keep_packets=keep_packets, direction=direction, headerless=headerless, jobs=jobs, scheduler=scheduler,
@@ -188,7 +190,7 @@ def plan_run(
     sensor: SensorRequest | None = None,
     calibration: Path | str | None = None,
     attenuation: float | tuple[float, float] | None = None,
-    pulse_energy: Path | str | None = None,
+    energy: Path | str | None = None,
     where: Condition | str | None = None,
     drop_flags: str | None = None,
     classes: Sequence[int] | None = None,
@@ -208,7 +210,7 @@ def plan_run(
 
     Parameters
     ----------
-    strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, pulse_energy, columns, jobs
+    strips, out, chain, tolerance, system, force, survey, sensor, calibration, attenuation, energy, columns, jobs
         As for `run`.
     where, drop_flags, classes, bbox, polygon
         As for `run`.
@@ -246,11 +248,11 @@ def plan_run(
     air = None if attenuation is None else _read_air(attenuation)
     template = StripJob(Path(), found, RunOptions(columns=name_columns(columns)), request, sensor, known, air)
     chosen = build_selection(where=where, drop_flags=drop_flags, classes=classes, bbox=bbox, polygon=polygon)
-    template = replace(template, pulse_energy=None if pulse_energy is None else str(pulse_energy), selection=chosen)
+    template = replace(template, pulse_energy=None if energy is None else str(energy), selection=chosen)
     # A chain that the user wrote stays as it is; a shipped one gets the stages that the given files allow.
     if chain is None or isinstance(chain, str) and chain in (AUTO, *list_profiles()):
         found = template.extend(found)
-    _check_use(found, sensor, known, air, pulse_energy)
+    _check_use(found, sensor, known, air, None if energy == NONE else energy)
     options = RunOptions(columns=choose_columns(found, columns), **output)
     paths = find_strips([str(strips)] if isinstance(strips, Path | str) else map(str, strips), recursive=recursive)
     processes, block = plan_memory(jobs or os.cpu_count() or 1, memory)
@@ -304,6 +306,7 @@ def _read_air(attenuation: float | tuple[float, float]) -> tuple[float, float]:
     value, error = attenuation if isinstance(attenuation, tuple) else (attenuation, 0.0)
     if not (0 <= value <= 100 and 0 <= error <= 100):
         raise ConfigError(f"attenuation: {value:g} +- {error:g} dB/km must lie in 0 to 100; clear air has 0.1 to 0.5")
+    check_attenuation(value)
     return float(value), float(error)
 
 
@@ -313,11 +316,11 @@ def _check_use(chain: Chain, sensor: SensorRequest, calibration: Any, air: Any, 
         raise ConfigError("--trajectory and --flight-height exclude each other; give one of them")
     _check_trajectory(sensor)
     given = {"--trajectory": sensor.trajectory, "--flight-height": sensor.height, "--calibration": calibration,
-             "--attenuation": air, "--pulse-energy": energy}  # fmt: skip
+             "--attenuation": air, "--energy": energy}  # fmt: skip
     option = next((name for name, value in given.items() if value is not None), None)
     if option is not None and not needs_sensor(chain):
         stages = {"--calibration": "backscatter_coefficient", "--attenuation": "amplitude_normalized",
-                  "--pulse-energy": "amplitude_normalized"}  # fmt: skip
+                  "--energy": "amplitude_normalized"}  # fmt: skip
         stage = f"attribute.{stages.get(option, 'range')}"
         raise ConfigError(f"{option}: chain {chain.name} computes nothing from it; add stage {stage}")
 

@@ -17,6 +17,7 @@ from wavebatch.surveying import Survey, survey_blocks
 from wavebatch.surveying.angle_limits import survey_angles
 from wavebatch.surveying.auto_chain import decide
 from wavebatch.surveying.choose_chain import read_sample
+from wavebatch.surveying.outgoing import compare_outgoing
 from wavebatch.surveying.systems.saved_check import with_look
 
 BLOCK_SIZE = 16_384
@@ -164,7 +165,7 @@ def survey(
     if not sample:
         path = strip.facts.path
         raise InputError(f"{path}: holds no waveform to be surveyed; `wavebatch check` says what it holds")
-    found = with_look(survey_blocks(sample), sample)
+    found = with_look(compare_outgoing(survey_blocks(sample), strip.facts.path), sample)
     if divergence is not None:
         found = survey_angles(strip.reader, strip.scan, found, divergence)
     elif find_divergence:

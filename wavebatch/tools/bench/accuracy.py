@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from wavebatch.core.echoes import EchoTable
+from wavebatch.core.echoes import UNCLEAN, EchoTable
 from wavebatch.core.units import FWHM_PER_SIGMA, HALF_C
 from wavebatch.core.waveforms import SystemPulse, WaveformBlock
-from wavebatch.stages.score import QUANTITIES, find_isolated, match_echoes
+from wavebatch.stages.score import ISOLATED, QUANTITIES, find_isolated, list_pairs, match_echoes
 from wavebatch.surveying import Survey, survey_block
 from wavebatch.tools.bench.figures import Figure, root_mean_square, share
 from wavebatch.tools.bench.truth import describe_truth, find_bounds
@@ -94,6 +94,22 @@ def make_group(
     )
 
 
+def find_hidden(truth: EchoTable, matched: np.ndarray) -> np.ndarray:
+    """Which true echoes (m,) have a neighbour within ISOLATED widths that was not found, so that one echo holds both.
+
+    matched: the true echoes that were found, bool (m,).
+    """
+    seen, lost = np.flatnonzero(matched), np.flatnonzero(~matched)
+    sigma = truth.sigma.astype(np.float64)
+    reach = ISOLATED * sigma.max(initial=0.0)
+    row, other = list_pairs(truth.waveform[seen], truth.time[seen], truth.waveform[lost], truth.time[lost], reach)
+    row, other = seen[row], lost[other]
+    near = np.abs(truth.time[row] - truth.time[other]) < ISOLATED * np.maximum(sigma[row], sigma[other])
+    hidden = np.zeros(len(truth), bool)
+    hidden[row[near]] = True
+    return hidden
+
+
 def describe_found(found: EchoTable) -> EchoTable:
     """The echoes with sigma replaced by echo_width over 2.354820, where the chain computes echo_width."""
     if "echo_width" not in found.attributes:
@@ -127,6 +143,8 @@ class Tally:
             "group": np.full(len(match.truth), group.number),
             "isolated": group.isolated[match.truth],
             "clear": group.clear[match.truth],
+            "flagged": (found.flags[match.found] & np.uint16(UNCLEAN)) != 0,
+            "hidden": find_hidden(truth, matched)[match.truth],
         }
         for place, name in enumerate(QUANTITIES):
             error = getattr(found, name)[match.found].astype(np.float64) - getattr(truth, name)[match.truth]
@@ -177,6 +195,11 @@ class Tally:
                 figures[f"{name}_ratio_{kind}"] = _spread(e, f"{name}_ratio", clear & ~gross)
                 known = np.isfinite(e[f"{name}_scaled"])
                 figures[f"{name}_calibration_{kind}"] = _spread(e, f"{name}_scaled", clear & ~gross & known)
+        known = e["clear"] & np.isfinite(e["time_scaled"])
+        figures["hidden"] = share(known & e["hidden"], known, e["group"])
+        for kind in ("flagged", "hidden"):
+            for name, rows in ((kind, e[kind]), (f"not_{kind}", ~e[kind])):
+                figures[f"time_calibration_{name}"] = _spread(e, "time_scaled", known & rows)
         return figures
 
 

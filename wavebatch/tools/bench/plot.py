@@ -6,7 +6,6 @@ paper is known only then.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,6 @@ PANELS = (
     ("wrong", 100.0, "echoes missed or false [%]"),
     ("rmse_all_cm", 1.0, "rms error of the range, all echoes [cm]"),
 )
-
-
-def can_plot() -> bool:
-    """Whether matplotlib is installed (extra `plot`)."""
-    return importlib.util.find_spec("matplotlib") is not None
 
 
 def plot_scene(section: Mapping[str, Any], target: Path) -> None:

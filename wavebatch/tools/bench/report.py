@@ -1,7 +1,7 @@
 """Text tables of a benchmark document, and its files: bench.json, bench.txt and plots.
 
 `wavebatch bench` calls `format_document` and `write_outputs`. A column of a table names a figure of the rows; `align`
-makes the text, for `promises` and the examples too.
+makes the text, for the examples and tests/bench too.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from wavebatch.files.disk.publish import reporting
+from wavebatch.files.figure_file import has_matplotlib
 from wavebatch.files.text_file import write_text
 from wavebatch.stages.score import QUANTITIES
-from wavebatch.tools.bench.plot import NO_PLOT, can_plot, plot_scene
+from wavebatch.tools.bench.plot import NO_PLOT, plot_scene
 
 Column = tuple[str, str, float, int]
 """Head, name of the figure, factor, decimals."""
@@ -33,6 +34,15 @@ LENGTHS: tuple[Column, ...] = (
     ("overlapped cm", "rmse_overlapped_cm", 1, 2),
 )
 
+REPORTED: tuple[Column, ...] = (
+    ("no flag", "time_calibration_not_flagged", 1.0, 2),
+    ("flag", "time_calibration_flagged", 1.0, 2),
+    ("neighbours found", "time_calibration_not_hidden", 1.0, 2),
+    ("one not found", "time_calibration_hidden", 1.0, 2),
+    ("share of these %", "hidden", 100, 2),
+)
+"""Errors of times over the reported ones: echoes without and with a flag of UNCLEAN, and by what was found around."""
+
 
 def _ratios(kind: str) -> tuple[Column, ...]:
     columns = tuple((name, f"{name}_ratio_{kind}", 1.0, 3) for name in QUANTITIES)
@@ -46,8 +56,6 @@ def format_document(document: Mapping[str, Any]) -> str:
         "(1.41 times that of the figure).",
         *(_format_scene(section, document.get("tolerance_cm")) for section in document["scenes"]),
     ]
-    if "stability" in document:
-        parts.append(_format_stability(document))
     return "\n\n".join(parts)
 
 
@@ -64,6 +72,7 @@ def _format_scene(section: Mapping[str, Any], tolerance_cm: float | None) -> str
     parts.append(_figure_table("rms error of the range", rows, LENGTHS))
     for kind in ("isolated", "overlapped"):
         parts.append(_figure_table(f"{kind}: rms error / Cramer-Rao bound, SNR >= 10", rows, _ratios(kind)))
+    parts.append(_figure_table("rms error of the time / its error column, SNR >= 10", rows, REPORTED))
     if tolerance_cm is not None:
         parts.append([_format_cheapest(section, tolerance_cm)])
     return "\n\n".join(map("\n".join, parts))
@@ -127,61 +136,6 @@ def align(lines: Sequence[Sequence[str]]) -> list[str]:
     return [form.format(*line).rstrip() for line in lines]
 
 
-def _format_stability(document: Mapping[str, Any]) -> str:
-    rows = document["stability"]
-    parts = [
-        "== stiff and extreme cases: s is the width of the system pulse, false the share of single echoes split or of "
-        "empty waveforms with an echo, err the rms error / Cramer-Rao bound"
-    ]
-    for chain in dict.fromkeys(row["chain"] for row in rows if not row["is_method"]):
-        parts.append("\n".join(align(_stability_lines([row for row in rows if row["chain"] == chain], chain))))
-    methods = [row for row in rows if row["is_method"]]
-    if methods:
-        parts.append("\n".join(align(_method_lines(methods))))
-    return "\n\n".join(parts)
-
-
-def _method_lines(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """A line per method: waveforms with the exact number of echoes, mean of the cases of each hazard, and failures."""
-    hazards = list(dict.fromkeys(row["hazard"] for row in rows))
-    lines = [["every method: exact %, mean of the cases", *hazards, "failures"]]
-    for name in dict.fromkeys(row["chain"] for row in rows):
-        of_chain = [row for row in rows if row["chain"] == name]
-        cells = []
-        for hazard in hazards:
-            exact = [row["figures"]["exact_count"]["value"] for row in of_chain if row["hazard"] == hazard]
-            cells.append(f"{100 * sum(exact) / len(exact):.1f}")
-        lines.append([name, *cells, _list_failures(of_chain)])
-    return lines
-
-
-def _list_failures(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Sums per kind of failure over the rows; `none` without any."""
-    kinds = {name: sum(row["failures"][name] for row in rows) for name in rows[0]["failures"]}
-    return ", ".join(f"{number} {name}" for name, number in kinds.items() if number) or "none"
-
-
-def _stability_lines(rows: Sequence[Mapping[str, Any]], chain: str) -> list[list[str]]:
-    heads = ("found %", "exact %", "false %", "err time", "err amplitude", "err sigma", "gross %")
-    title = f"{chain} (is auto)" if all(row["is_auto"] for row in rows) and chain != "auto" else chain
-    lines = [[title, "waveforms", *heads, "failures", "flags of the echoes"]]
-    for row in rows:
-        known = {name for name, figure in row["figures"].items() if figure["value"] is not None}
-        kind = "isolated" if "found_isolated" in known else "overlapped"
-        names = ["completeness", "exact_count", "false_splits" if "false_splits" in known else "false_alarms"]
-        figures = [figure_text(row, ("", name, 100, 1)) for name in names]
-        figures += [figure_text(row, ("", f"{name}_ratio_{kind}", 1, 2)) for name in QUANTITIES]
-        figures.append(figure_text(row, ("", f"gross_{kind}", 100, 1)))
-        cells = [f"{row['hazard']:<4}{row['case']}", str(row["waveforms"])]
-        lines.append([*cells, *figures, _list_failures([row]), _list_flags(row)])
-    return lines
-
-
-def _list_flags(row: Mapping[str, Any]) -> str:
-    shares = {name: number / max(row["echoes"], 1) for name, number in row["flags"].items()}
-    return ", ".join(f"{name} {share:.0%}" if share >= 0.005 else f"{name} <1%" for name, share in shares.items())
-
-
 def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[str]:
     """Writes bench.json, bench.txt and a PNG per scene, replacing old ones; returns messages for the user.
 
@@ -189,7 +143,7 @@ def write_outputs(document: Mapping[str, Any], text: str, folder: Path) -> list[
     """
     texts = {"bench.json": json.dumps(document, indent=1, sort_keys=True), "bench.txt": text}
     written = write_texts(folder, texts)
-    if not can_plot():
+    if not has_matplotlib():
         return [written, NO_PLOT]
     for section in document["scenes"]:
         name = f"bench-{Path(section['scene']).stem}.png"

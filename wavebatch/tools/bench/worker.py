@@ -1,7 +1,7 @@
 """A separate process for measurements: one thread, clean memory, and it may crash or hang without harm.
 
-`speed` and `peers` run functions in it. It is a plain subprocess, not multiprocessing, because that would import the
-caller's main module into the measured process.
+`speed`, and tests/bench, run functions in it. It is a plain subprocess, not multiprocessing, because that would import
+the caller's main module into the measured process.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ class Worker(Closing):
     """Runs functions in another Python process, one after another; a context manager."""
 
     def __init__(self) -> None:
-        root = str(Path(__file__).resolve().parents[3])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        environment = {**os.environ, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": path}
+        path = [str(Path(__file__).resolve().parents[3]), *filter(None, [os.environ.get("PYTHONPATH")]), *sys.path]
+        environment = {**os.environ, **dict.fromkeys(ONE_THREAD, "1"), "PYTHONPATH": os.pathsep.join(path)}
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
         )

@@ -65,9 +65,13 @@ def read_echoes(reader: CloudReader) -> Iterator[np.ndarray]:
         yield rows[(rows["flags"] & np.uint16(PASSED_THROUGH)) == 0]
 
 
-def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Comparison:
-    """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does."""
+def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5, where: Condition | None = None) -> Comparison:
+    """Compares the echoes of a cloud with the truth of its simulated strip; raises as compare_clouds does.
+
+    where: only points of the cloud that meet it; the truth is whole, so that true echoes of other points are missed.
+    """
     with CloudReader(a) as cloud, TruthReader(truth) as reference:
+        select_points(cloud, where)
         points = max(cloud.point_count, reference.meta.get("packets", 0))
         names = ("gps_time", "x", "y", "z", "time", "amplitude", "sigma", "flags", "isolated")
         with CloudTask(True, check_tolerance(tolerance_ns), points, reference.meta) as task:
@@ -77,7 +81,7 @@ def compare_truth(a: Path, truth: Path, *, tolerance_ns: float = 1.5) -> Compari
                 task.add(1, _shape_truth(piece))
             for piece in reference.read_pieces("packet_gps_time"):
                 task.add(2, piece["packet_gps_time"].view(PACKET_DTYPE))
-            return task.finish(str(a), str(truth))
+            return replace(task.finish(str(a), str(truth)), left_out_a=cloud.left_out)
 
 
 def _share_times(first: CloudReader, second: CloudReader) -> bool:

@@ -1,5 +1,5 @@
 """Report pages: one HTML file that needs no network, for `--html` of run, survey, bench, calibrate and compare.
 
 `*_page.py` hold one page each and are imported only when `--html` is given. `page` writes the file, `markup` makes
-tables and text, `drawing` the pictures: matplotlib is not needed.
+tables and text, `charts` the pictures, with matplotlib where it is installed.
 """

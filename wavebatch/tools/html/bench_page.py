@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from wavebatch.tools.bench.report import LENGTHS, SHARES, figure_text, rate_text
+from wavebatch.tools.bench.report import LENGTHS, SHARES, Column, figure_text, rate_text
 from wavebatch.tools.html import markup
-from wavebatch.tools.html.drawing.charts import draw_scatter, figures
+from wavebatch.tools.html.charts import draw_scatter, figures
 from wavebatch.tools.html.page import write_page
 
 
@@ -26,7 +26,7 @@ def write_real_page(target: Path, reports: Sequence[tuple[str, str]]) -> None:
 
 
 def _parts(document: Mapping[str, Any], report: str) -> Iterator[str]:
-    rows = {"wavebatch": document["version"], "seed": document["seed"], "+- is": document["error_means"]}
+    rows = {"wavebatch": document["version"], "seed": document["seed"], "\u00b1 is": document["error_means"]}
     yield markup.section("Summary", markup.facts(rows))
     for section in document["scenes"]:
         yield _draw_scene(section)
@@ -38,7 +38,7 @@ def _draw_scene(section: Mapping[str, Any]) -> str:
     rows = section["rows"]
     head = ["chain", "waveforms/s (kernels)", *(column[0] for column in (*SHARES, *LENGTHS)), "on the front"]
     lines = [[_name(row), markup.Cell(markup.text(rate_text(row["kernels"])), _rate(row)),
-              *(markup.Cell(markup.text(figure_text(row, column)), row["figures"][column[1]]["value"])
+              *(markup.Cell(_figure(row, column), row["figures"][column[1]]["value"])
                 for column in (*SHARES, *LENGTHS)), "yes" if row["pareto"] else ""] for row in rows]  # fmt: skip
     charts = []
     for name, factor, label in (
@@ -60,3 +60,7 @@ def _name(row: Mapping[str, Any]) -> str:
 
 def _rate(row: Mapping[str, Any]) -> float | str:
     return 1e6 / row["kernels"]["median"] if row["kernels"]["median"] else ""
+
+
+def _figure(row: Mapping[str, Any], column: Column) -> str:
+    return markup.text(figure_text(row, column).replace("+-", "\u00b1 "))

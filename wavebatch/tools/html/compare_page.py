@@ -15,7 +15,7 @@ from wavebatch.tools.compare.chains import Matchup
 from wavebatch.tools.compare.overlap import OverlapComparison
 from wavebatch.tools.compare.pairing import Comparison
 from wavebatch.tools.html import markup
-from wavebatch.tools.html.drawing.charts import draw_counts, draw_histogram, figures
+from wavebatch.tools.html.charts import draw_counts, draw_histogram, figures
 from wavebatch.tools.html.page import write_page
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import html
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -38,9 +37,14 @@ def share(part: float, whole: float) -> str:
     return f"{100 * part / whole:.2f} %" if whole else NO_VALUE
 
 
-def identifier(name: str) -> str:
-    """A name as the target of a link; different names may give the same, so add a number where that matters."""
-    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "part"
+def rounded(value: float | None, form: str) -> Cell:
+    """The cell of a number in this form; the table sorts by the number."""
+    return Cell(number(value, form), "" if value is None or not math.isfinite(value) else float(value))
+
+
+def percent(value: float | None) -> Cell:
+    """The cell of a share, in percent."""
+    return rounded(None if value is None else 100 * value, ".2f")
 
 
 def section(title: str, *parts: str, level: int = 2, mark: str = "") -> str:
@@ -85,14 +89,25 @@ class Cell(str):
         return cell
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[Any]], *, sortable: bool = False, caption: str = "") -> str:
-    """A table; numbers stand to the right. sortable: a click on a head sorts the rows by it."""
+FILTER = (
+    '<p class="filter"><label>Show strips whose row contains <input type="search"></label> '
+    '<label><input type="checkbox"> only marked</label> <span class="soft">A click on a head sorts the table.</span>'
+    "</p>"
+)
+"""Fields that hide rows of the next table; page.js does it."""
+
+
+def table(
+    head: Sequence[str], rows: Iterable[Sequence[Any]], *, sortable: bool = False, tall: bool = False,
+    caption: str = "",
+) -> str:  # fmt: skip
+    """A table; numbers stand to the right. sortable: a click on a head sorts by it; tall: it scrolls in its place."""
     title = f"<caption>{text(caption)}</caption>" if caption else ""
     heads = "".join(_head(name, sortable) for name in head)
     body = "\n".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in rows)
     kind = ' class="sortable"' if sortable else ""
     whole = f"{title}<thead><tr>{heads}</tr></thead>\n<tbody>\n{body}\n</tbody>"
-    return f'<div class="scroll"><table{kind}>{whole}</table></div>'
+    return f'<div class="scroll{" tall" if tall else ""}"><table{kind}>{whole}</table></div>'
 
 
 def _head(name: str, sortable: bool) -> str:
@@ -108,6 +123,6 @@ def _cell(value: Any) -> str:
         return f"<td{kind}{sort}>{value}</td>"
     if value is None or isinstance(value, int | float):
         order = "" if value is None or not math.isfinite(value) else repr(float(value))
-        form = "," if isinstance(value, int) else ".6g"
+        form = "," if isinstance(value, int) else ".4g"
         return f'<td class="n" data-sort="{order}">{number(value, form)}</td>'
     return f"<td>{text(value)}</td>"

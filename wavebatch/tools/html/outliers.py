@@ -61,18 +61,30 @@ def _known(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def find_outliers(strips: Sequence[Mapping[str, float]]) -> list[dict[str, str]]:
-    """For each strip: the keys of the figures in which it differs from the others, and how, in words."""
+def describe_sensor(report: Mapping[str, Any]) -> str:
+    """How a strip was recorded: only strips of one sensor have the same usual values."""
+    found = report["strip"]["survey"]["figures"]
+    return f"{found.get('bits', 0):.0f} bits, {found.get('spacing_ns', 0):g} ns"
+
+
+def find_outliers(strips: Sequence[Mapping[str, float]], sensors: Sequence[str]) -> list[dict[str, str]]:
+    """For each strip: the keys of the figures in which it differs from the others of its sensor, and how, in words."""
     found: list[dict[str, str]] = [{} for _ in strips]
+    for sensor in dict.fromkeys(sensors):
+        _mark(strips, [place for place, one in enumerate(sensors) if one == sensor], found)
+    return found
+
+
+def _mark(strips: Sequence[Mapping[str, float]], places: Sequence[int], found: list[dict[str, str]]) -> None:
+    """Marks the strips at these places."""
     for key, (_, form, least) in FIGURES.items():
-        values = np.array([strip.get(key, math.nan) for strip in strips], np.float64)
+        values = np.array([strips[place].get(key, math.nan) for place in places], np.float64)
         known = values[np.isfinite(values)]
         if len(known) < FEWEST:
             continue
         median = float(np.median(known))
         spread = MAD_TO_STD * float(np.median(np.abs(known - median)))
         limit = max(FARTHEST * spread, LEAST_SHARE * abs(median), least)
-        for place, value in enumerate(values):
+        for place, value in zip(places, values, strict=True):
             if abs(value - median) > limit:
-                found[place][key] = f"{value:{form}}; the strips' median is {median:{form}}, +-{limit:{form}} is usual"
-    return found
+                found[place][key] = f"{value:{form}}; usual is {median:{form}} \u00b1 {limit:{form}}"

@@ -21,3 +21,14 @@ for (const table of document.querySelectorAll("table.sortable")) {
     table.tBodies[0].append(...rows.map((pair) => pair[1]));
   }));
 }
+// A filter hides the rows of the next table that do not contain its words, or have no mark.
+for (const filter of document.querySelectorAll(".filter")) {
+  const [words, marked] = filter.querySelectorAll("input");
+  const body = filter.nextElementSibling.querySelector("tbody");
+  filter.addEventListener("input", () => {
+    for (const row of body.rows) {
+      const fits = row.textContent.toLowerCase().includes(words.value.toLowerCase());
+      row.hidden = !fits || (marked.checked && row.querySelector(".mark") === null);
+    }
+  });
+}

@@ -14,9 +14,11 @@ from pathlib import Path
 
 from wavebatch import __version__
 from wavebatch.core.errors import ConfigError
+from wavebatch.core.optional import advise_install
 from wavebatch.files.disk.protect import refuse_input
 from wavebatch.files.disk.publish import Draft, reporting
-from wavebatch.tools.html.markup import text
+from wavebatch.files.figure_file import has_matplotlib
+from wavebatch.tools.html.markup import paragraph, text
 
 SIGN = '<!doctype html>\n<html lang="en">\n<!-- wavebatch report -->'
 """Start of every page: by it `check_page` knows a page of ours, which may be replaced."""
@@ -44,6 +46,9 @@ def write_page(target: Path, title: str, parts: Iterable[str]) -> None:
     with Draft(target, overwrite=True) as draft:
         with reporting(target):
             draft.file.write(_head(title).encode())
+            if not has_matplotlib():
+                words = f"This page has no pictures, which need matplotlib: {advise_install('matplotlib')}"
+                draft.file.write(f"{paragraph(words, 'warning')}\n".encode())
             for part in parts:
                 draft.file.write(part.encode(errors="backslashreplace") + b"\n")
             draft.file.write(f"</main>\n<script>{_read('page.js')}</script>\n</body>\n</html>\n".encode())

@@ -15,13 +15,19 @@ from wavebatch import __version__
 from wavebatch.batch.report_file import cloud_path, report_path
 from wavebatch.batch.run import BatchResult, Outcome
 from wavebatch.tools.html import markup
-from wavebatch.tools.html.drawing.charts import figures, figures_of
-from wavebatch.tools.html.outliers import FEWEST, FIGURES, find_outliers, measure_strip
+from wavebatch.tools.html.charts import figures, figures_of
+from wavebatch.tools.html.outliers import FEWEST, FIGURES, describe_sensor, find_outliers, measure_strip
 from wavebatch.tools.html.page import write_page
 from wavebatch.tools.html.strip_part import count_tables, draw_strip, flag_table
 
-MOST_PARTS = 40
-"""Strips with a part of their own: a part has up to 500 kB, and a browser must still open the page."""
+FEW = 4
+"""So many strips all have a part."""
+
+MOST_PARTS = 8
+"""Strips with a part of their own: a part has about 200 kB, and a browser must still open the page."""
+
+PART_WAVEFORMS = 200_000
+"""Waveforms of a larger batch for each part but the first: the run of a tenth of these takes as long as a part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +41,17 @@ class _Strip:
     has_report: bool
     """False where it failed, or its report cannot be read."""
     figures: dict[str, float]
+    sensor: str
 
 
 def write_run_page(target: Path, result: BatchResult, folder: Path, command: str = "") -> None:
     """Write the page of a finished batch; folder: of its outputs. Raises InputError if it cannot be written."""
     strips = [_read_strip(outcome, place, folder) for place, outcome in enumerate(result.outcomes)]
-    marks = find_outliers([strip.figures for strip in strips])
+    marks = find_outliers([strip.figures for strip in strips], [strip.sensor for strip in strips])
     # Strips to look at come first where there are too many to show all.
     order = sorted(strips, key=lambda strip: (not marks[strip.number], strip.number))
-    shown = {strip.number for strip in [one for one in order if one.has_report][:MOST_PARTS]}
+    most = min(MOST_PARTS, 1 + result.report.count("waveforms") // PART_WAVEFORMS) if len(strips) > FEW else FEW
+    shown = {strip.number for strip in [one for one in order if one.has_report][:most]}
     write_page(target, _title(strips), _parts(result, strips, marks, shown, command))
 
 
@@ -55,8 +63,8 @@ def _title(strips: Sequence[_Strip]) -> str:
 def _read_strip(outcome: Outcome, number: int, folder: Path) -> _Strip:
     place = report_path(outcome.job, folder)
     report = None if outcome.status == "failed" else _read_report(place)
-    figures_ = {} if report is None else measure_strip(report)
-    return _Strip(outcome, number, cloud_path(outcome.job, folder), place, report is not None, figures_)
+    figures_, sensor = ({}, "") if report is None else (measure_strip(report), describe_sensor(report))
+    return _Strip(outcome, number, cloud_path(outcome.job, folder), place, report is not None, figures_, sensor)
 
 
 def _read_report(path: Path) -> dict[str, Any] | None:
@@ -73,6 +81,8 @@ def _parts(
     whole = result.report.to_json()
     counts = whole["counts"]
     yield _summary(result, counts)
+    if len(strips) > 1:
+        yield _navigate([strip for strip in strips if strip.number in shown])
     failed = [f"{one.outcome.job.path}: {' '.join(str(one.outcome.error).split())}" for one in strips
               if one.outcome.error is not None]  # fmt: skip
     if failed:
@@ -88,9 +98,16 @@ def _parts(
             body = draw_strip(strip.outcome.job.path, strip.cloud, report)
             notes = [f"{FIGURES[key][0]}: {words}" for key, words in marks[strip.number].items()]
             unusual = markup.bullets([f"differs from the other strips: {note}" for note in notes], "warning")
-            heading = markup.section(strip.outcome.job.path.name, unusual, body, mark=f"strip-{strip.number}")
+            name = strip.outcome.job.path.name if len(strips) > 1 else "Strip"  # the page has its name then
+            heading = markup.section(name, unusual, body, mark=f"strip-{strip.number}")
             yield heading.replace("<section ", '<section class="strip" ', 1)
     yield _provenance(result, command)
+
+
+def _navigate(shown: Sequence[_Strip]) -> str:
+    parts = [("strips", "All strips"), *((f"strip-{one.number}", one.outcome.job.path.name) for one in shown)]
+    links = "".join(f'<a href="#{mark}">{markup.text(name)}</a>' for mark, name in [*parts, ("run", "Run")])
+    return f'<nav aria-label="parts of the page">{links}</nav>'
 
 
 def _summary(result: BatchResult, counts: dict[str, Any]) -> str:
@@ -126,19 +143,18 @@ def _index(strips: Sequence[_Strip], marks: Sequence[dict[str, str]], shown: set
                      *([None] * 4 if strip.outcome.status == "failed" else numbers),
                      *(_figure_cell(strip, key, marks[place]) for key in FIGURES)])  # fmt: skip
     notes = [
-        f"{sum(map(bool, marks))} of {len(strips)} strips differ from the others in a figure: these are marked with "
-        "\u25b2. It is a reason to look at the strip, not a fault."
+        f"{sum(map(bool, marks))} of {len(strips)} strips differ in a figure from the others of their sensor: these "
+        "are marked with \u25b2. It is a reason to look at the strip, not a fault."
         if len(strips) >= FEWEST
-        else f"Strips are held against each other where there are at least {FEWEST}."
+        else f"Strips are compared with each other if there are at least {FEWEST} of one sensor."
     ]
     if len(shown) < sum(strip.has_report for strip in strips):
         notes.append(
-            f"{len(shown)} strips have a part of their own below, marked ones first; `run --resume --html` of single "
-            "strips shows the others."
+            "Names with a link have a part below, marked strips first. For another strip: `wavebatch run STRIP -o DIR "
+            "--resume --html PAGE.html` with the same options."
         )
-    notes.append("A click on a head of the table sorts it.")
-    index = markup.table(head, rows, sortable=True)
-    return markup.section("Strips", *map(markup.paragraph, notes), index, mark="strips")
+    index = markup.table(head, rows, sortable=True, tall=True)
+    return markup.section("Strips", *map(markup.paragraph, notes), markup.FILTER, index, mark="strips")
 
 
 def _figure_cell(strip: _Strip, key: str, marks: dict[str, str]) -> markup.Cell:
@@ -154,4 +170,4 @@ def _provenance(result: BatchResult, command: str) -> str:
     rows = {"wavebatch": __version__, "elapsed": f"{timing['elapsed_seconds']:.1f} s"}
     if timing["waveforms_per_process_second"]:
         rows["waveforms per second of the processes"] = f"{timing['waveforms_per_process_second']:,}"
-    return markup.section("Run", markup.facts(rows), markup.code(command) if command else "")
+    return markup.section("Run", markup.facts(rows), markup.code(command) if command else "", mark="run")

@@ -16,8 +16,8 @@ from wavebatch.core.errors import ConfigError, InputError, StageError
 from wavebatch.core.no_data import REASONS, NoData
 from wavebatch.stages.chain_file import parse_chain
 from wavebatch.tools.html import markup
+from wavebatch.tools.html.charts import figures, figures_of
 from wavebatch.tools.html.cloud_pictures import picture_cloud
-from wavebatch.tools.html.drawing.charts import figures, figures_of
 from wavebatch.tools.html.strip_views import draw_views, read_views
 from wavebatch.tools.html.survey_part import draw_survey, list_decisions, read_system
 
@@ -34,7 +34,7 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
     parts = [
         warnings,
         markup.section("Counts", count_tables(report["counts"], report["options"]["points"]), level=3),
-        markup.section("Survey", markup.paragraph(f"The survey is from: {survey['from']}."),
+        markup.section("Survey", markup.paragraph(_name_source(survey["from"])),
                        draw_survey(system, survey["figures"], survey["waveforms"]), level=3),
         markup.section("Decisions", markup.paragraph(f"Chain: {choice['chain']}, chosen by: {choice['by']}."),
                        list_decisions(choice["decisions"]), level=3),
@@ -46,6 +46,12 @@ def draw_strip(strip: Path, cloud: Path, report: Mapping[str, Any]) -> str:
         markup.section("Provenance", *_list_provenance(strip, report), level=3),
     ]  # fmt: skip
     return "\n".join(filter(None, parts))
+
+
+def _name_source(source: str) -> str:
+    return {"strip": "This strip was surveyed.", "flight": "The flight was surveyed, all strips together."}.get(
+        source, "The survey comes from a file (--system)."
+    )
 
 
 def count_tables(counts: Mapping[str, Any], points: str) -> str:

@@ -18,14 +18,14 @@ from wavebatch.stages.chain import Chain
 from wavebatch.stages.decompose.rebuild import rebuild_waveforms
 from wavebatch.stages.pulse_tables import clip_level
 from wavebatch.surveying.choose_chain import sample_size
-from wavebatch.tools.html.drawing.charts import draw_waveform, figures
+from wavebatch.tools.html.charts import draw_sheet, figures
 from wavebatch.tools.html.markup import paragraph, section
 from wavebatch.tools.plots.waveform import WaveformView, build_views
 
 SEARCHED = 4096
 """Waveforms among which the worst fits are looked for."""
 
-SHOWN_RANDOM, SHOWN_WORST = 24, 8
+SHOWN_RANDOM, SHOWN_WORST = 8, 4
 """Waveforms drawn of each kind."""
 
 
@@ -101,15 +101,14 @@ def measure_residuals(block: WaveformBlock, chain: Chain, system: SystemPulse) -
 
 def draw_views(views: Views, chain: str, level: int = 3) -> str:
     """The sheet of random waveforms and the worst fits, as sections of a page."""
-    legend = (
-        "Grey: samples and noise; line: fit; dots: echoes; dashed: returns of the input. The command wavebatch plot "
-        "waveform STRIP --point N -o FILE.png draws one of them large."
-    )
     whole = f"all {views.searched:,} waveforms"
     part = f"{views.searched:,} waveforms that are spread over the strip ({views.total:,} in all)"
-    head = f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {chain}."
-    sheet = figures([draw_waveform(view) for view in views.random], "sheet")
-    parts = [section("Random waveforms", paragraph(head), paragraph(legend, "soft"), sheet, level=level)]
+    head = (
+        f"Drawn at random from {whole if views.searched >= views.total else part}. Chain: {chain}. `wavebatch plot "
+        "waveform STRIP --point N -o FILE.png` draws one of them large."
+    )
+    sheet = figures([draw_sheet(views.random, "Random waveforms")], "sheet")
+    parts = [section("Random waveforms", paragraph(head), sheet, level=level)]
     if views.worst:
         words = (
             f"The largest residuals among these {views.searched:,} waveforms, as root mean square in standard "
@@ -117,6 +116,7 @@ def draw_views(views: Views, chain: str, level: int = 3) -> str:
         )
         if views.searched < views.total:
             words += f" The other {views.total - views.searched:,} waveforms of the strip were not searched."
-        worst = [draw_waveform(view, f"residual {rms:.2f}") for view, rms in views.worst]
-        parts.append(section("Worst fits", paragraph(words), figures(worst, "sheet"), level=level))
+        notes = [f"residual {rms:.2f}" for _, rms in views.worst]
+        worst = draw_sheet([view for view, _ in views.worst], "Worst fits", notes)
+        parts.append(section("Worst fits", paragraph(words), figures([worst], "sheet"), level=level))
     return "\n".join(parts)

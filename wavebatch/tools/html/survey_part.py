@@ -9,7 +9,7 @@ from wavebatch.core.units import FWHM_PER_SIGMA
 from wavebatch.core.waveforms import SystemPulse
 from wavebatch.files.toml_file import format_toml
 from wavebatch.surveying.system_file import SYSTEM_SCHEMA, parse_survey
-from wavebatch.tools.html.drawing.charts import draw_counts, draw_pulse, figures
+from wavebatch.tools.html.charts import draw_counts, draw_pulse, figures
 from wavebatch.tools.html.markup import facts, paragraph, significant, table
 
 
@@ -44,7 +44,7 @@ def _list_figures(system: SystemPulse, found: Mapping[str, float], waveforms: in
     yield "surveyed", f"{waveforms:,} waveforms" if waveforms else "not known"
     if {"n_samples", "bits", "spacing_ns"} <= found.keys():
         yield "samples", f"{found['n_samples']:.0f} of {found['bits']:.0f} bits, {found['spacing_ns']:g} ns apart"
-    yield "baseline", f"{system.baseline:.3f} DN, +-{system.baseline_spread:.3f} DN between waveforms"
+    yield "baseline", f"{system.baseline:.3f} \u00b1 {system.baseline_spread:.3f} DN between waveforms"
     yield "noise", f"{system.noise_std:.3f} DN"
     gain = system.noise_gain
     yield "signal noise", f"variance grows by {gain:.4f} DN2 per DN" if gain > 0 else "none"

@@ -17,14 +17,14 @@ from wavebatch.core.echoes import PASSED_THROUGH, EchoFlag
 from wavebatch.core.errors import InputError
 from wavebatch.core.no_data import without_nan
 from wavebatch.files.cloud.column_reader import ColumnReader
-from wavebatch.files.cloud.provenance import read_accounts
+from wavebatch.files.cloud.provenance import read_provenance
 from wavebatch.files.las.checked_header import CheckedHeader, read_checked_header
 from wavebatch.files.las.crs import read_crs
 from wavebatch.files.las.extra_bytes import ExtraRecord
 from wavebatch.files.las.header import LasHeader, decode_text, find_evlrs
 from wavebatch.files.las.point_formats import ANGLE_UNIT, WITHOUT_WAVES, locate, read_classes, split_numbers
 from wavebatch.surveying.inspect_strip import describe_strip
-from wavebatch.tools.inspect.account import describe_account
+from wavebatch.tools.inspect.provenance import describe_provenance
 
 _GPS_EPOCH = datetime(1980, 1, 6)
 _ADJUSTED = 1e9
@@ -46,10 +46,10 @@ def describe_file(path: Path, *, direction: str = "auto", headerless: bool = Fal
     if header.point_format in WITHOUT_WAVES and header.version >= (1, 3):
         facts |= _describe_waveforms(path, direction, headerless)
     facts |= _describe_header(path, checked)
-    accounts = read_accounts(header)
-    facts["provenance"] = [describe_account(account) for account in accounts]
+    runs = read_provenance(header)
+    facts["provenance"] = [describe_provenance(run) for run in runs]
     try:
-        facts |= _describe_points(path, header, bool(accounts))
+        facts |= _describe_points(path, header, bool(runs))
     except InputError as error:
         facts["problems"] = [*facts["problems"], " ".join(str(error).split()).removeprefix(f"{path}: ")]
     return without_nan(facts)
@@ -158,7 +158,7 @@ class _RawReader(ColumnReader):
 
 
 def _describe_points(path: Path, header: LasHeader, is_ours: bool) -> dict[str, Any]:
-    """Sums over all points; counts of echoes only of a cloud with an account, whose flags are known to be ours."""
+    """Sums over all points; counts of echoes only of a cloud with provenance, whose flags are known to be ours."""
     totals = _Totals()
     with _RawReader(path, None) as reader:
         has_flags = reader.has_flags and is_ours

@@ -19,17 +19,14 @@ from wavebatch.core.waveforms import Noise, SystemPulse, WaveformBlock
 from wavebatch.kernels.signal.deconvolve import deconvolve_richardson_lucy
 from wavebatch.kernels.signal.filters import (
     curvature_taps,
-    filter_antisymmetric,
     filter_energy,
     filter_symmetric,
     gaussian_taps,
-    slope_taps,
 )
 from wavebatch.kernels.signal.signal import SMOOTH_GAIN, smooth_121
 from wavebatch.kernels.signal.square_differences import pad_samples, slide_taps, square_differences
 from wavebatch.stages.chain import STAGES, Chain, Step
 from wavebatch.stages.detect.candidates import signal_above
-from wavebatch.stages.detect.classic import INFLECTED
 from wavebatch.stages.detect.maximum import LEAST_BLUR, smooth_to_pulse
 from wavebatch.stages.detect.wavelet import BACKGROUND, spike_reach, transform
 from wavebatch.stages.reference_pulse import reference_pulse
@@ -39,7 +36,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "wavelet": ("detect.wavelet",),
     "correlation": ("detect.correlation", "detect.matched_filter"),
     "deconvolved": ("detect.richardson_lucy",),
-    "derivative": ("detect.zero_crossing", "detect.second_derivative"),
+    "derivative": ("detect.second_derivative",),
 }
 """Kinds of signal, each with the detectors that search in it; the first one if the chain has none of them."""
 
@@ -138,10 +135,6 @@ def _see_smoothed(block: WaveformBlock, noise: Noise, system: SystemPulse, *, le
     return _level(block, "smoothed [DN]", f"level {level:g} std", smoothed, level * SMOOTH_GAIN * noise.std)
 
 
-def _see_samples(block: WaveformBlock, noise: Noise, system: SystemPulse, *, level: float, **_: Any) -> DetectorSignal:
-    return _level(block, "signal [DN]", f"runs above {level:g} std", signal_above(block, noise), level * noise.std)
-
-
 def _see_matched(block: WaveformBlock, noise: Noise, system: SystemPulse, *, threshold: float) -> DetectorSignal:
     taps = gaussian_taps(system.sigma_ref / block.spacing)
     energy = filter_energy(taps)
@@ -218,30 +211,12 @@ def _see_curvature(
     return _level(block, label, rule, curvature, threshold * np.sqrt(filter_energy(taps)) * noise.std)
 
 
-def _see_slope(
-    block: WaveformBlock, noise: Noise, system: SystemPulse, *, derivative: str, level: float, scale: float
-) -> DetectorSignal:
-    signal, ref = signal_above(block, noise), system.sigma_ref / block.spacing
-    blur = max(scale * ref, LEAST_BLUR)
-    high = f"where the smoothed signal is above {level:g} std"
-    if derivative == "first":
-        values = filter_antisymmetric(signal, slope_taps(blur))
-        return _level(block, "first derivative [DN/sample]", f"falls through zero {high}", values, 0.0 * noise.std)
-    taps = curvature_taps(blur)
-    values = filter_symmetric(signal, taps)
-    least = INFLECTED * np.sqrt(filter_energy(taps)) * noise.std
-    return _level(block, "- second derivative [DN/sample2]", f"midway between zeros {high}", values, least)
-
-
 _SIGNALS: Mapping[str, Callable[..., DetectorSignal]] = {
     "detect.maximum": _see_maximum,
     "detect.matched_filter": _see_matched,
     "detect.second_derivative": _see_curvature,
     "detect.threshold": _see_smoothed,
-    "detect.sustained_threshold": _see_samples,
-    "detect.center_of_gravity": _see_smoothed,
     "detect.constant_fraction": _see_smoothed,
-    "detect.zero_crossing": _see_slope,
     "detect.correlation": _see_correlation,
     "detect.asdf": _see_asdf,
     "detect.wavelet": _see_wavelet,

@@ -22,11 +22,19 @@ if TYPE_CHECKING:
 CELL = (2.3, 1.9)
 """Width and height of a small picture [inch]."""
 
+HEAD, FOOT = 0.45, 0.25
+"""Room for the title above and the legend below [inch]."""
+
 SHARE = 0.28
 """Of a small picture's height for the residual."""
 
 RESIDUAL = 4.0
 """Half the height of every residual panel [noise std]; larger residuals are drawn at its edge in red."""
+
+LEGEND = (
+    "dots: samples (triangles: saturated); dark line: fit; light: single echoes; diamonds: echoes; dashed: "
+    f"returns of the file; below: residual, -{RESIDUAL:g} to {RESIDUAL:g} noise std; time in ns"
+)
 
 QUIET_FLAGS = EchoFlag.OVERLAPPED | EchoFlag.WEAK
 """Flags that are too common to be named."""
@@ -47,30 +55,41 @@ def draw_sheet(
     in all [ns]; None: each is cut to its echoes and returns. Raises as figure_file.open_picture does.
     """
     columns = math.ceil(math.sqrt(len(views)))
-    rows = -(-len(views) // columns)
-    size = (CELL[0] * columns, CELL[1] * rows + 0.7)
+    size = cell_size(len(views), columns)
     with open_picture(target, size, overwrite=overwrite) as figure:
         # A layout for 200 axes takes a minute; a grid needs none.
         figure.set_layout_engine("none")
+        draw_cells(figure, views, columns, times)
         parts = (plain_text(strip), plain_text(chain, 200), f"{len(views)} waveforms")
         title = fit_text(figure, "   ".join(parts), size[0] - 0.2, size=10, weight="bold")
         figure.text(0.1 / size[0], 1 - 0.1 / size[1], title, va="top", fontsize=10, weight="bold")
-        for number, view in enumerate(views):
-            row, column = divmod(number, columns)
-            left = (column * CELL[0] + 0.3) / size[0]
-            bottom = (size[1] - 0.45 - (row + 1) * CELL[1] + 0.25) / size[1]
-            _draw_cell(figure, view, times, (left, bottom, (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1]))
-        legend = (
-            "dots: samples (triangles: saturated); dark line: fit; light: single echoes; diamonds: echoes; dashed: "
-            f"returns of the file; below: residual, -{RESIDUAL:g} to {RESIDUAL:g} noise std; time in ns"
-        )
-        legend = fit_parts(figure, legend.split("; "), size[0] - 0.2, size=7)
+        legend = fit_parts(figure, LEGEND.split("; "), size[0] - 0.2, size=7)
         figure.text(0.1 / size[0], 0.06 / size[1], legend, va="bottom", fontsize=7, color=GREY)
 
 
+def cell_size(number: int, columns: int) -> tuple[float, float]:
+    """Size of a sheet of so many pictures [inch]."""
+    return CELL[0] * columns, CELL[1] * -(-number // columns) + HEAD + FOOT
+
+
+def draw_cells(
+    figure: Figure, views: Sequence[WaveformView], columns: int, times: tuple[float, float] | None = None,
+    notes: Sequence[str] = (), head: float = HEAD,
+) -> None:  # fmt: skip
+    """Draws the pictures row by row, below a head [inch]; notes: a word for each title."""
+    size = figure.get_size_inches()
+    for number, view in enumerate(views):
+        row, column = divmod(number, columns)
+        left = (column * CELL[0] + 0.3) / size[0]
+        bottom = (size[1] - head - (row + 1) * CELL[1] + 0.25) / size[1]
+        place = (left, bottom, (CELL[0] - 0.4) / size[0], (CELL[1] - 0.5) / size[1])
+        _draw_cell(figure, view, times, place, notes[number] if notes else "")
+
+
 def _draw_cell(
-    figure: Figure, view: WaveformView, times: tuple[float, float] | None, place: tuple[float, float, float, float]
-) -> None:
+    figure: Figure, view: WaveformView, times: tuple[float, float] | None, place: tuple[float, float, float, float],
+    note: str,
+) -> None:  # fmt: skip
     left, bottom, width, height = place
     upper = figure.add_axes((left, bottom + SHARE * height, width, (1 - SHARE) * height))
     lower = figure.add_axes((left, bottom, width, (SHARE - 0.03) * height), sharex=upper)
@@ -81,9 +100,10 @@ def _draw_cell(
     for axes in (upper, lower):
         axes.tick_params(labelsize=5.5, length=2, pad=1)
         axes.grid(False)
+    upper.locator_params(nbins=4)
     upper.tick_params(labelbottom=False)
     lower.set_yticks([])
-    title = fit_text(figure, _title(view), CELL[0] - 0.45, size=6.5)
+    title = fit_text(figure, _title(view, note), CELL[0] - 0.45, size=6.5)
     upper.set_title(title, fontsize=6.5, pad=2)
 
 
@@ -92,16 +112,18 @@ def _draw_signal(axes: Axes, view: WaveformView, low: float, high: float) -> Non
     shade_gaps(axes, view)
     for place in view.returns:
         axes.axvline(place, color=VENDOR, linewidth=0.6, linestyle=(0, (4, 2)))
+    near = (view.fine >= low) & (view.fine <= high)
     for curve in view.curves:
-        axes.plot(view.fine, view.fine_level + curve, color=PULSE, linewidth=0.6)
+        axes.plot(view.fine[near], (view.fine_level + curve)[near], color=PULSE, linewidth=0.6)
     if view.fit is not None:
-        axes.plot(view.fine, view.fit, color=FIT, linewidth=0.8)
-    free = ~view.clipped
+        axes.plot(view.fine[near], view.fit[near], color=FIT, linewidth=0.8)
+    inside = (view.time >= low) & (view.time <= high)
+    free, full = inside & ~view.clipped, inside & view.clipped
     axes.plot(view.time[free], view.samples[free], "o", color=INK, markersize=1.2, zorder=3)
-    axes.plot(view.time[view.clipped], view.samples[view.clipped], "^", color=CLIPPED, markersize=2.5, zorder=3)
+    axes.plot(view.time[full], view.samples[full], "^", color=CLIPPED, markersize=2.5, zorder=3)
     peak = np.interp(view.echoes.time, view.time, view.level) + view.echoes.amplitude.astype(np.float64)
     axes.plot(view.echoes.time, peak, "D", color=ECHO, markersize=3, markerfacecolor="none", markeredgewidth=0.7)
-    shown = view.samples[(view.time >= low) & (view.time <= high) & np.isfinite(view.samples)]
+    shown = view.samples[inside & np.isfinite(view.samples)]
     bottom, top = min(shown.min(initial=view.baseline), view.baseline), max(shown.max(initial=0), peak.max(initial=0))
     span = max(top - bottom, 6 * view.std)
     axes.set_ylim(bottom - 0.06 * span, bottom + 1.1 * span)
@@ -114,12 +136,15 @@ def _draw_residual(axes: Axes, view: WaveformView) -> None:
         return
     residual = np.clip(view.residual, -RESIDUAL, RESIDUAL)
     large = np.abs(view.residual) > RESIDUAL
-    axes.vlines(view.time, 0, residual, color=np.where(large, ECHO, FIT), linewidth=0.7)
+    for rows, color in ((~large, FIT), (large, ECHO)):
+        # One broken line: hundreds of lines of their own would be most of a page.
+        ends = np.stack([np.zeros(rows.sum()), residual[rows], np.full(rows.sum(), np.nan)], axis=1)
+        axes.plot(np.repeat(view.time[rows], 3), ends.ravel(), color=color, linewidth=0.7)
 
 
-def _title(view: WaveformView) -> str:
+def _title(view: WaveformView, note: str) -> str:
     name = f"packet {view.packet}" if view.packet >= 0 else f"point {view.point}"
     strongest = f"{view.echoes.amplitude.max():.0f} DN" if len(view.echoes) else "no echo"
     flags = EchoFlag(int(np.bitwise_or.reduce(view.echoes.flags, initial=0))) & ~QUIET_FLAGS
     names = ", ".join(flag.name for flag in flags)
-    return f"{name}   {strongest}" + (f"\n{names}" if names else "")
+    return "   ".join(filter(None, (name, strongest, note))) + (f"\n{names}" if names else "")

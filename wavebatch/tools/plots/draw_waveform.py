@@ -75,6 +75,7 @@ def draw_waveforms(
             panel = _draw_panels(figure, inner[number], view, times or view.span, small=small, room=room)
             _label_axes(panel, view, left=number % columns == 0, bottom=number + columns >= len(views))
             panels.append(panel[0])
+        figure.align_ylabels()
         if text:
             axes = figure.add_subplot(outer[1])
             axes.set_axis_off()
@@ -92,7 +93,8 @@ def _label_axes(panel: Sequence[Axes], view: WaveformView, *, left: bool, bottom
         panel[0].set_ylabel("signal [DN]")
         panel[-1].set_ylabel("residual\n[noise std]")
         if view.seen is not None:
-            panel[1].set_ylabel(view.seen.label.replace(" [", "\n["))
+            # Narrow panels: longer lines would run into the labels above and below.
+            panel[1].set_ylabel(textwrap.fill(view.seen.label, 15))
     if bottom:
         panel[-1].set_xlabel("time after the first sample [ns]")
 
@@ -208,6 +210,8 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     height = np.interp(found, seen.time, tested)
     if seen.deep:
         axes.vlines(found, height, height + seen.least, color=CLIPPED, linewidth=2.0)
+        # Strong echoes are so much deeper than the threshold that a bar alone would not be seen.
+        axes.plot(found, height + seen.least, "_", color=CLIPPED, markersize=11, markeredgewidth=2.0, zorder=4)
     elif np.isfinite(seen.least):
         axes.axhline(float(seen.least), color=CLIPPED, linewidth=1.0, linestyle=_DASHED)
     axes.plot(found, height, "^" if seen.deep else "v", color=ECHO, markersize=5, markerfacecolor="none", zorder=4)
@@ -218,7 +222,8 @@ def draw_detector(axes: Axes, seen: DetectorSignal, times: tuple[float, float], 
     low, high = np.nanmin(np.concatenate(lines)), np.nanmax(np.concatenate(lines))
     span = float(high - low) or 1.0
     # Room above for the rule, which must not lie on the line.
-    axes.set_ylim(low - 0.08 * span, high + (0.3 + 0.22 * wrapped.count("\n")) * span)
+    first, more = (0.4, 0.36) if small else (0.3, 0.22)
+    axes.set_ylim(low - 0.08 * span, high + (first + more * wrapped.count("\n")) * span)
     axes.text(0.995, 0.97, wrapped, transform=axes.transAxes, ha="right", va="top", fontsize=7.5, color=GREY)
 
 

@@ -41,8 +41,8 @@ def list_echoes(views: Sequence[WaveformView], most: int = MOST_LISTED) -> str:
         front = f"{view.packet if view.packet >= 0 else '-':>8}  " * several + f"{row + 1:>4}  "
         front += "  ".join(f"{text:>15}" for text in _measures(view, row)) + "  "
         if ranged:
-            error = math.hypot(_column(view, "range_err")[row], view.sensor_error)
-            front += f"{_measure(_column(view, 'range')[row], error):>20}  "
+            found, error = (_column(view, name)[row] for name in ("range", "range_error"))
+            front += f"{_measure(found, error):>20}  "
         flags = textwrap.wrap(name_flags(int(view.echoes.flags[row])) or "-", _FLAGS_WIDE)
         lines += [(front if number == 0 else " " * len(front)) + text for number, text in enumerate(flags)]
     if len(every) > most:

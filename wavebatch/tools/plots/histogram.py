@@ -7,7 +7,7 @@ twice: for the limits, then for the counts.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -22,6 +22,9 @@ from wavebatch.tools.plots.values import Clouds, Selection, Tally, name_paths, s
 
 FEWEST, MOST_CHOSEN = 20, 120
 """Least and largest number of bins that are chosen if the user gives none."""
+
+SMALL_GROUP = 20
+"""Groups of --by with fewer values are one series: two values make bins of 50 %."""
 
 MOST_GROUPS = 12
 """Most series of --by: more cannot be told apart in a picture."""
@@ -94,7 +97,8 @@ def count_values(
 
     bins: number of bins, by default from the rule of Freedman and Diaconis; a column with a fixed step gets at most as
     many, each a whole number of steps wide. limits: lowest and highest edge, by default those of `values.shown_limits`.
-    each: one series per cloud instead of one for all. by: one series per value of this column.
+    each: one series per cloud instead of one for all. by: one series per value of this column,
+    and one for all values that fewer than SMALL_GROUP points have.
     Raises InputError without any value, ConfigError for a column of flags, columns of several units, and more than
     MOST_GROUPS groups.
     """
@@ -106,13 +110,16 @@ def count_values(
     series, total = _survey(columns, each, by)
     if not total.values:
         raise columns[0].complain(total)
+    series, merged = _merge_small(series) if by is not None else (series, {})
     keys = sorted(series, key=lambda key: (key[0], key[1], key[2]))
     kept = [series[key].sample.read().get("value", np.empty(0)) for key in keys]
     least, largest = min(one.least for one in series.values()), max(one.largest for one in series.values())
     everything = np.concatenate(kept)
     low, high = limits or _choose_limits(kept, least, largest, facts.step)
     edges = place_edges(everything, low, high, facts.step, bins, exact=limits is not None)
-    counts, below, above = _count(columns, edges, keys, each, by)
+    place = {key: row for row, key in enumerate(keys)}
+    place |= {key: place[other] for key, other in merged.items()}
+    counts, below, above = _count(columns, edges, place, each, by)
     percentiles = [np.percentile(values, PERCENTILES) if len(values) else np.full(3, np.nan) for values in kept]
     means = [one.total / one.values if one.values else math.nan for one in map(series.get, keys)]
     names = tuple(_name_series(key, columns, paths, each, by) for key in keys)
@@ -175,6 +182,9 @@ def _split(rows: np.ndarray, by: str | None) -> Iterator[tuple[float, np.ndarray
         yield math.nan, rows["value"][np.isnan(group)]
 
 
+_SMALL = math.inf
+"""Group of all values that few points have."""
+
 _UNKNOWN = -math.inf
 """Group of points without data in the column of --by: NaN is not equal to itself, so it is no key."""
 
@@ -200,6 +210,22 @@ def _survey(columns: Sequence[Clouds], each: bool, by: str | None) -> tuple[dict
     return found, total
 
 
+def _merge_small(series: dict[_Key, _Series]) -> tuple[dict[_Key, _Series], dict[_Key, _Key]]:
+    """Series in which small groups are one, if there are several; and that one for each of them."""
+    merged: dict[_Key, _Key] = {}
+    for column, cloud in {key[:2] for key in series}:
+        small = [key for key, one in series.items() if key[:2] == (column, cloud) and one.values < SMALL_GROUP]
+        if len(small) > 1:
+            merged |= dict.fromkeys(small, (column, cloud, _SMALL))
+    # Nothing but small groups: they are all that there is to see.
+    if len(merged) == len(series):
+        return series, {}
+    found = {key: one for key, one in series.items() if key not in merged}
+    for key, other in sorted(merged.items()):
+        found.setdefault(other, _Series()).add(series[key].sample.read().get("value", np.empty(0)))
+    return found, merged
+
+
 def _group(value: float) -> float:
     return _UNKNOWN if math.isnan(value) else value
 
@@ -222,6 +248,8 @@ def _name_series(key: _Key, columns: Sequence[Clouds], paths: Sequence[Path], ea
 
 
 def _name_group(column: str, value: float) -> str:
+    if value == _SMALL:
+        return f"{column} with fewer than {SMALL_GROUP} points each"
     if value == _UNKNOWN:
         return f"no {column}"
     meaning = CLASS_NAMES.get(int(value), "") if column in ("classification", "raw_classification") else ""
@@ -229,12 +257,12 @@ def _name_group(column: str, value: float) -> str:
 
 
 def _count(
-    columns: Sequence[Clouds], edges: np.ndarray, keys: Sequence[_Key], each: bool, by: str | None
+    columns: Sequence[Clouds], edges: np.ndarray, place: Mapping[_Key, int], each: bool, by: str | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The second pass: counts per series and bin, and values below and above."""
-    place = {key: row for row, key in enumerate(keys)}
-    counts = np.zeros((len(keys), len(edges) - 1), np.int64)
-    below, above = np.zeros(len(keys), np.int64), np.zeros(len(keys), np.int64)
+    """The second pass: counts per series and bin, and values below and above; place: row of each group."""
+    number = len(set(place.values()))
+    counts = np.zeros((number, len(edges) - 1), np.int64)
+    below, above = np.zeros(number, np.int64), np.zeros(number, np.int64)
     for column, clouds in enumerate(columns):
         for cloud, rows, _ in clouds.read():
             for group, value in _split(rows, by):

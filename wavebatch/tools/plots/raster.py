@@ -16,9 +16,11 @@ import numpy as np
 from wavebatch.core.errors import ConfigError, InputError
 from wavebatch.core.even_sample import EvenSample
 from wavebatch.files.cloud.column_reader import ColumnFacts
-from wavebatch.files.disk.buckets import Buckets, count_buckets
-from wavebatch.files.las.crs_name import describe_crs
+from wavebatch.files.geotiff_file import TILE
+from wavebatch.files.las.crs import describe_crs
 from wavebatch.tools.plots.values import Clouds, Selection, Tally, robust_limits
+from wavebatch.tools.rasters.cells import Grid
+from wavebatch.tools.rasters.tiles import CellOptions, Placed, compute_tiles
 
 STATISTICS = ("mean", "median", "min", "max", "count", "density")
 """Statistics of a cell; `density` is points per square metre."""
@@ -47,34 +49,7 @@ POINTS_PER_CELL = 6
 SHOWN = (2.0, 98.0)
 """Percentiles of the cells at the ends of the colour scale."""
 
-_BUCKET_POINTS = 2_000_000
 _SIDE = 128
-_PLACED = np.dtype([("cell", "<u4"), ("value", "<f8")])
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """Square cells of `size` metres, starting at the south-west corner (x, y)."""
-
-    x: float
-    y: float
-    size: float
-    rows: int
-    columns: int
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """West, east, south, north [m]."""
-        return self.x, self.x + self.columns * self.size, self.y, self.y + self.rows * self.size
-
-    def place(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Cell number of each point, row by row from the south; -1 outside, i8 (n,)."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            column, row = np.floor((x - self.x) / self.size), np.floor((y - self.y) / self.size)
-            inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
-        cell = np.full(len(x), -1, np.int64)
-        cell[inside] = row[inside].astype(np.int64) * self.columns + column[inside].astype(np.int64)
-        return cell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,11 +110,32 @@ def grid_values(
     if not sample.seen:
         where = "within the bounds" if bounds else "with finite coordinates"
         raise InputError(f"{paths[0]}: nothing to draw: no point {where} has a value")
-    grid = _choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
-    values, placed = _Cells(grid, statistic, total.values).fill(clouds)
+    grid = choose_grid(str(paths[0]), sample, box, size, fixed=bounds is not None)
+    values, placed = _fill(paths, selection, statistic, grid, total.values)
+    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, find_shown(values), crs, unit)
+
+
+def find_shown(values: np.ndarray) -> tuple[float, float]:
+    """Values at the ends of the colour scale: the percentiles SHOWN of the cells."""
     known = values[np.isfinite(values)]
-    shown = tuple(np.percentile(known, SHOWN).tolist()) if len(known) else (0.0, 1.0)
-    return Raster(clouds.facts, statistic, grid, values, total, total.values - placed, shown, crs, unit)
+    low, high = np.percentile(known, SHOWN).tolist() if len(known) else (0.0, 1.0)
+    return low, high
+
+
+def _fill(
+    paths: Sequence[Path], selection: Selection, statistic: str, grid: Grid, points: int
+) -> tuple[np.ndarray, int]:
+    """Values (rows, columns), the first row is the southernmost, and the number of values in the grid."""
+    columns = () if selection.column is None else (selection.column,)
+    options = CellOptions(
+        columns, statistic, flags_with=selection.flags_with, flags_without=selection.flags_without,
+        where=selection.where,
+    )  # fmt: skip
+    values, placed = np.full((grid.rows, grid.columns), np.nan), Placed()
+    for row, column, tile in compute_tiles(paths, options, grid, points, placed):
+        part = values[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+        part[:] = tile[0, : part.shape[0], : part.shape[1]]
+    return values[::-1], placed.values[0]
 
 
 def _check(statistic: str, size: float | None, bounds: tuple[float, float, float, float] | None) -> None:
@@ -213,9 +209,14 @@ def check_crs(paths: Sequence[Path]) -> tuple[str, str]:
     return found[first]
 
 
-def _choose_grid(
-    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool
-) -> Grid:
+def choose_grid(
+    where: str, sample: EvenSample, box: tuple[float, float, float, float], size: float | None, *, fixed: bool,
+    most: int = CHOSEN_SIDE,
+) -> Grid:  # fmt: skip
+    """Cells for points of which `sample` has positions.
+
+    size: None to choose it, for at most `most` cells along a side. fixed: the box is the user's.
+    """
     places = sample.read()["place"]
     west, south, east, north = box
     if not fixed:
@@ -225,20 +226,18 @@ def _choose_grid(
     if not extent <= LARGEST_EXTENT:
         raise InputError(f"{where}: points lie {extent:g} m apart, which must be damage; give --bounds to draw a part")
     if size is None:
-        size = _choose_size(places, sample.seen, (west, south), extent)
-    # Cell borders are multiples of the size, so that maps of neighbouring tiles fit together.
-    x, y = (math.floor(start / size) * size for start in (west, south))
-    x, y = x - size * (x > west), y - size * (y > south)
-    columns, rows = (math.floor((end - start) / size) + 1 for end, start in ((east, x), (north, y)))
-    if columns * rows > MOST_CELLS:
+        size = _choose_size(places, sample.seen, (west, south), extent, most)
+    grid = Grid.cover((west, south, east, north), size)
+    if grid.columns * grid.rows > MOST_CELLS:
         least = _nice(math.sqrt((east - west) * (north - south) / MOST_CELLS) + 4 * extent / MOST_CELLS)
         raise ConfigError(
-            f"{where}: {columns} x {rows} cells of {size:g} m are too many to draw; cells of {least:g} m will do"
+            f"{where}: {grid.columns} x {grid.rows} cells of {size:g} m are too many to draw; cells of {least:g} m "
+            "will do"
         )
-    return Grid(x, y, size, rows, columns)
+    return grid
 
 
-def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float) -> float:
+def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], extent: float, most: int) -> float:
     """Side of a cell [m], from the area that holds points: the filled cells of a coarse grid."""
     if not extent:
         return 1.0
@@ -247,68 +246,10 @@ def _choose_size(places: np.ndarray, seen: int, corner: tuple[float, float], ext
     inside = coarse[((coarse >= -1) & (coarse <= _SIDE + 1)).all(axis=1)].astype(np.int64)
     filled = len(np.unique(inside[:, 0] * 4 * _SIDE + inside[:, 1]))
     area = filled * side**2
-    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / CHOSEN_SIDE))
+    return _nice(max(math.sqrt(POINTS_PER_CELL * area / seen), extent / most))
 
 
 def _nice(size: float) -> float:
     """The next of 1, 2, 5, 10 ... times a power of ten."""
     power = 10.0 ** math.floor(math.log10(size))
     return next(float(f"{factor * power:.3g}") for factor in (1, 2, 5, 10) if factor * power >= size * (1 - 1e-9))
-
-
-_COMBINE = {"mean": (np.add, 0.0), "min": (np.minimum, np.inf), "max": (np.maximum, -np.inf)}
-"""Statistics that are combined value by value: how, and from which start."""
-
-
-class _Cells:
-    """Collects the statistic of all cells, piece by piece; points go to disk for medians only."""
-
-    def __init__(self, grid: Grid, statistic: str, points: int) -> None:
-        self._grid, self._statistic = grid, statistic
-        self._count = np.zeros(grid.rows * grid.columns, np.int64)
-        self._combine, start = _COMBINE.get(statistic, (None, 0.0))
-        self._value = np.full(len(self._count), start)
-        self._number = count_buckets(points, _BUCKET_POINTS) if statistic == "median" else 0
-        self._buckets = Buckets(_PLACED, max(self._number, 1))
-
-    def fill(self, clouds: Clouds) -> tuple[np.ndarray, int]:
-        """Values (rows, columns), and the number of points in the grid."""
-        with self._buckets:
-            for _, rows, _ in clouds.read():
-                cell = self._grid.place(rows["x"], rows["y"])
-                inside = np.flatnonzero(cell >= 0)
-                self._add(cell[inside], rows["value"][inside])
-            return self._finish().reshape(self._grid.rows, self._grid.columns), int(self._count.sum())
-
-    def _add(self, cell: np.ndarray, value: np.ndarray) -> None:
-        np.add.at(self._count, cell, 1)
-        if self._combine is not None:
-            with np.errstate(over="ignore"):
-                self._combine.at(self._value, cell, value)
-        elif self._statistic == "median":
-            placed = np.empty(len(cell), _PLACED)
-            placed["cell"], placed["value"] = cell, value
-            self._buckets.add(placed, lambda rows: (np.arange(len(rows)), rows["cell"] % self._number))
-
-    def _finish(self) -> np.ndarray:
-        filled = self._count > 0
-        if self._statistic == "median":
-            for number in range(self._number):
-                self._take_medians(self._buckets.read(number))
-        elif self._statistic == "mean":
-            self._value[filled] /= self._count[filled]
-        elif self._statistic in ("count", "density"):
-            self._value = self._count / (1.0 if self._statistic == "count" else self._grid.size**2)
-        return np.where(filled, self._value, np.nan)
-
-    def _take_medians(self, placed: np.ndarray) -> None:
-        """Medians of the cells of a bucket; of an even number of values the mean of the middle two."""
-        # Complex numbers sort by real, then by imaginary part: one fast sort by cell and value.
-        pairs = np.empty(len(placed), np.complex128)
-        pairs.real, pairs.imag = placed["cell"], placed["value"]
-        pairs.sort()
-        cell, value = pairs.real.astype(np.int64), pairs.imag
-        first = np.flatnonzero(np.r_[True, np.diff(cell) != 0]) if len(cell) else np.empty(0, np.int64)
-        count = np.diff(np.append(first, len(cell)))
-        low, high = value[first + (count - 1) // 2], value[first + count // 2]
-        self._value[cell[first]] = low + 0.5 * (high - low)

@@ -70,8 +70,6 @@ class WaveformView:
     """Times of the returns of the input [ns], f8 (r,)."""
     seen: DetectorSignal | None = None
     """What the detector saw, if it was asked for."""
-    sensor_error: float = 0.0
-    """Error of the sensor's position along the ray [m], as far as it is known."""
 
     @property
     def spacing(self) -> float:
@@ -190,7 +188,7 @@ def build_views(
             WaveformView(
                 number, int(block.point[row]), float(block.gps_time[row]), time, samples, clipped, baseline, std,
                 np.broadcast_to(noise.level[row].astype(np.float64), samples.shape), fine, curves, residual, table,
-                returns, seen[row], system.sensor_error,
+                returns, seen[row],
             )  # fmt: skip
         )
     return views

@@ -1,13 +1,50 @@
-"""Statistics of values in the cells of a tile. `grid` calls it tile by tile."""
+"""Square cells over x and y, and statistics of the values in them: for rasters, maps and the pages.
+
+`tiles` computes clouds of any size with them, tile by tile.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 STATISTICS = ("mean", "median", "min", "max", "std", "count", "density")
 """std: standard deviation with n - 1, no-data for one value; density: points with a value per area."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Square cells of one size; their borders are multiples of it, so that rasters of neighbouring clouds fit."""
+
+    size: float
+    """Side of a cell, in units of the coordinates."""
+    west: int
+    south: int
+    """Borders, in cells."""
+    rows: int
+    columns: int
+
+    @classmethod
+    def cover(cls, box: tuple[float, float, float, float], size: float) -> Grid:
+        """The cells that hold a box: west, south, east, north."""
+        west, south, east, north = (int(np.floor(value / size)) for value in box)
+        return cls(size, west, south, north - south + 1, east - west + 1)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """West, east, south, north."""
+        east, north = self.west + self.columns, self.south + self.rows
+        return self.west * self.size, east * self.size, self.south * self.size, north * self.size
+
+    def place(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row from the south and column of each point, i8 (n,), and whether it lies in the grid; -1 outside."""
+        # Whole numbers of cells first: x less the border would round away what lies on it.
+        with np.errstate(over="ignore", invalid="ignore"):
+            column, row = np.floor(x / self.size) - self.west, np.floor(y / self.size) - self.south
+            inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        return np.where(inside, row, -1).astype(np.int64), np.where(inside, column, -1).astype(np.int64), inside
 
 
 def compute_cells(statistic: str, cell: np.ndarray, values: np.ndarray, number: int, area: float) -> np.ndarray:

@@ -1,28 +1,26 @@
 """`wavebatch grid`: columns of clouds of any size as a GeoTIFF, in memory that does not grow with clouds or raster.
 
-Clouds are read twice: for the extent, then for the cells. Points go to buckets on disk by tile of the raster; one
-bucket after the other is read and its tiles are written. Tiles without a point are not written at all.
+Clouds are read twice: here for the extent, then by `tiles` for the cells. Tiles without a point are not written at all.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from wavebatch import __version__
-from wavebatch.core.condition import Condition
 from wavebatch.core.errors import ConfigError, InputError
-from wavebatch.files.cloud.column_reader import ColumnFacts, select_points
+from wavebatch.files.cloud.column_reader import ColumnFacts
 from wavebatch.files.cloud.columns_reader import ColumnsReader
-from wavebatch.files.disk.spool import Spool
-from wavebatch.files.geotiff_file import TILE, Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
+from wavebatch.files.geotiff_file import Band, RasterLayout, RasterWriter, find_crs_unit, same_crs
 from wavebatch.files.las.checked_header import read_checked_header
 from wavebatch.files.las.crs import read_crs_definition
-from wavebatch.tools.rasters.cells import STATISTICS, compute_cells
+from wavebatch.tools.rasters.cells import STATISTICS, Grid
+from wavebatch.tools.rasters.tiles import CellOptions, Placed, compute_tiles, is_inside, read_pieces
 
 LARGEST_SIZE = 1e9
 """Largest side of a cell: more than the world; larger ones overflow."""
@@ -30,47 +28,25 @@ LARGEST_SIZE = 1e9
 MOST_SIDE = 2_000_000
 """Most cells along a side: more is damage of coordinates, or a size that was meant in another unit."""
 
-HELD = 2_000_000
-"""Points in memory at a time."""
-
-MOST_BUCKETS = 4096
-"""With HELD / 2 points each they hold 4e9 points."""
-
 _EXACT = float(1 << 23)
 """Steps of a column that float32 holds apart; larger values are written as float64."""
 
 
 @dataclass(frozen=True, slots=True)
-class GridOptions:
+class GridOptions(CellOptions):
     """What is written."""
 
-    columns: tuple[str, ...]
-    """A band each; empty for count and density of all points."""
-    statistic: str = "mean"
     size: float = 1.0
     """Side of a cell, in units of the coordinates."""
-    bounds: tuple[float, float, float, float] | None = None
-    """West, south, east, north."""
-    flags_with: int = 0
-    flags_without: int = 0
-    where: Condition | None = None
-    """Points must meet this."""
     crs: str | None = None
     no_data: float = -9999.0
 
 
-@dataclass(slots=True)
-class GridResult:
+@dataclass(slots=True, kw_only=True)
+class GridResult(Placed):
     """What was written."""
 
     layout: RasterLayout
-    points: int = 0
-    left_out: int = 0
-    """Points that were left out because of their flags or by --where."""
-    outside: int = 0
-    """Points outside of the bounds, or without a position."""
-    values: tuple[int, ...] = ()
-    """Points with a value, per band."""
     filled: int = 0
     """Cells that have a value in a band at least."""
     bands: tuple[Band, ...] = ()
@@ -87,23 +63,19 @@ def write_grid(paths: Sequence[Path], target: Path, options: GridOptions, *, ove
     crs, unit = _find_crs(paths, options.crs)
     facts = _find_facts(paths, options.columns)
     box, points, largest = _find_extent(paths, options)
-    layout = _lay_out(str(paths[0]), box, options)
-    layout = replace(layout, dtype=_choose_dtype(facts, largest), crs=crs, unit=unit)
+    grid = _lay_out(str(paths[0]), box, options)
+    west, _, _, north = grid.extent
+    layout = RasterLayout(
+        west, north, grid.size, grid.rows, grid.columns, _choose_dtype(facts, largest), options.no_data, crs, unit
+    )
     bands = _describe(facts, options.statistic, unit)
-    result = GridResult(layout, bands=tuple(bands))
+    result = GridResult(layout=layout, bands=tuple(bands))
     tags = {"TIFFTAG_SOFTWARE": f"wavebatch {__version__}", "STATISTIC": options.statistic}
-    number = int(np.clip(-(-points // (HELD // 2)), 1, MOST_BUCKETS))
-    entries = Spool(number, np.dtype([("tile", "<u8"), ("cell", "<u4"), ("values", "<f8", (len(bands),))]))
-    try:
-        _fill(paths, options, layout, entries, result)
-        with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
-            for bucket in range(number):
-                for tile, values in _compute_tiles(entries.seal(), bucket, options, layout):
-                    result.filled += int(np.isfinite(values).any(axis=0).sum())
-                    writer.write_tile(*divmod(tile, _across(layout)), values)
-            writer.publish()
-    finally:
-        entries.close()
+    with RasterWriter(target, layout, bands, tags, overwrite=overwrite) as writer:
+        for row, column, values in compute_tiles(paths, options, grid, points, result):
+            result.filled += int(np.isfinite(values).any(axis=0).sum())
+            writer.write_tile(row, column, values)
+        writer.publish()
     return result
 
 
@@ -166,38 +138,14 @@ def _find_facts(paths: Sequence[Path], columns: Sequence[str]) -> tuple[ColumnFa
     return known or ()
 
 
-def _read(paths: Sequence[Path], options: GridOptions) -> Iterator[tuple[np.ndarray, int]]:
-    """Pieces of all clouds: points with the right flags that meet the condition, and the number of those left out."""
-    for path in paths:
-        with ColumnsReader(path, options.columns) as reader:
-            if (options.flags_with or options.flags_without) and not reader.has_flags:
-                raise ConfigError(f"{path}: has no column echo_flags to select points by")
-            select_points(reader, options.where)
-            seen = 0
-            for rows in reader.read_pieces():
-                keep = (rows["flags"] & np.uint16(options.flags_without)) == 0
-                if options.flags_with:
-                    keep &= (rows["flags"] & np.uint16(options.flags_with)) != 0
-                more, seen = reader.left_out - seen, reader.left_out
-                yield rows[keep], int(len(rows) - keep.sum()) + more
-
-
-def _is_inside(rows: np.ndarray, bounds: tuple[float, float, float, float] | None) -> np.ndarray:
-    inside = np.isfinite(rows["x"]) & np.isfinite(rows["y"])
-    if bounds is not None:
-        west, south, east, north = bounds
-        inside &= (rows["x"] >= west) & (rows["x"] < east) & (rows["y"] >= south) & (rows["y"] < north)
-    return inside
-
-
 def _find_extent(
     paths: Sequence[Path], options: GridOptions
 ) -> tuple[tuple[float, float, float, float], int, np.ndarray]:
     """The box of all points, their number, and the largest absolute value of each column."""
     low, high, points = np.full(2, np.inf), np.full(2, -np.inf), 0
     largest = np.zeros(len(options.columns))
-    for rows, _ in _read(paths, options):
-        rows = rows[_is_inside(rows, options.bounds)]
+    for rows, _ in read_pieces(paths, options):
+        rows = rows[is_inside(rows, options.bounds)]
         if len(rows):
             places = np.stack([rows["x"], rows["y"]], axis=1)
             low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
@@ -218,8 +166,8 @@ def _choose_dtype(facts: Sequence[ColumnFacts], largest: np.ndarray) -> str:
     return "float64" if any(wide) else "float32"
 
 
-def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOptions) -> RasterLayout:
-    """Cell borders are multiples of the size, so that rasters of neighbouring clouds fit together."""
+def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOptions) -> Grid:
+    """The cells of the raster; ConfigError for too many."""
     west, south, east, north = box
     size = options.size
     if max(east - west, north - south) / size > MOST_SIDE:
@@ -227,13 +175,11 @@ def _lay_out(where: str, box: tuple[float, float, float, float], options: GridOp
             f"{where}: {(east - west) / size:.3g} x {(north - south) / size:.3g} cells of {size:g} are too many; a "
             "coordinate may be damaged: give --bounds, or a larger --size"
         )
-    first = math.floor(west / size), math.floor(south / size)
-    last = math.floor(east / size), math.floor(north / size)
     if options.bounds is not None:  # they end at a border, where no other cell begins
-        last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
         first = round(west / size), round(south / size)
-    rows, columns = last[1] - first[1] + 1, last[0] - first[0] + 1
-    return RasterLayout(first[0] * size, (last[1] + 1) * size, size, rows, columns, "float32", options.no_data, None)
+        last = max(round(east / size) - 1, first[0]), max(round(north / size) - 1, first[1])
+        return Grid(size, *first, last[1] - first[1] + 1, last[0] - first[0] + 1)
+    return Grid.cover(box, size)
 
 
 def _describe(facts: Sequence[ColumnFacts], statistic: str, length: str) -> list[Band]:
@@ -241,75 +187,3 @@ def _describe(facts: Sequence[ColumnFacts], statistic: str, length: str) -> list
     if not facts:
         return [Band(f"{statistic} of points", unit or "")]
     return [Band(f"{statistic} of {one.name}", (one.unit.strip("-") if unit is None else unit)) for one in facts]
-
-
-def _across(layout: RasterLayout) -> int:
-    return -(-layout.columns // TILE)
-
-
-def _fill(
-    paths: Sequence[Path], options: GridOptions, layout: RasterLayout, entries: Spool, result: GridResult
-) -> None:
-    """Put every point with a value into the bucket of its tile."""
-    bands = max(len(options.columns), 1)
-    counted = np.zeros(bands, np.int64)
-    west, bottom = round(layout.west / layout.size), round(layout.north / layout.size) - layout.rows
-    for rows, left_out in _read(paths, options):
-        inside = _is_inside(rows, options.bounds)
-        result.points += len(rows) + left_out
-        result.left_out += left_out
-        # Whole numbers of cells first: x - west would round away what lies on a border.
-        with np.errstate(invalid="ignore"):
-            column = np.floor(rows["x"] / layout.size) - west
-            row = layout.rows - 1 - (np.floor(rows["y"] / layout.size) - bottom)
-            inside &= (column >= 0) & (column < layout.columns) & (row >= 0) & (row < layout.rows)
-        result.outside += int(len(rows) - inside.sum())
-        rows, column, row = rows[inside], column[inside].astype(np.int64), row[inside].astype(np.int64)
-        values = rows["values"] if options.columns else np.ones((len(rows), 1))
-        counted += np.isfinite(values).sum(axis=0)
-        found = np.empty(len(rows), entries.dtype)
-        found["tile"] = row // TILE * _across(layout) + column // TILE
-        found["cell"] = row % TILE * TILE + column % TILE
-        found["values"] = values
-        entries.append((found["tile"] % np.uint64(entries.buckets)).astype(np.int64), found)
-    result.values = tuple(counted.tolist())
-
-
-def _compute_tiles(
-    entries: Spool, bucket: int, options: GridOptions, layout: RasterLayout
-) -> Iterator[tuple[int, np.ndarray]]:
-    """Number and values (bands, TILE, TILE) of every tile of a bucket."""
-    total = sum(len(piece) for piece in entries.pieces(bucket))
-    if not total:
-        return
-    if total <= HELD:
-        rows = entries.read(bucket)
-        rows = rows[np.argsort(rows["tile"], kind="stable")]
-        tiles, first = np.unique(rows["tile"], return_index=True)
-        for tile, part in zip(tiles.tolist(), np.split(rows, first[1:]), strict=True):
-            yield tile, _compute(part, options, layout.size**2)
-        return
-    tiles = np.unique(np.concatenate([np.unique(piece["tile"]) for piece in entries.pieces(bucket)]))
-    for tile in tiles.tolist():
-        yield tile, _compute_dense(entries, bucket, tile, options, layout.size**2)
-
-
-def _compute_dense(entries: Spool, bucket: int, tile: int, options: GridOptions, area: float) -> np.ndarray:
-    """A tile of a bucket that does not fit in memory: groups of cells, each of about HELD points, one by one."""
-    count = np.zeros(TILE * TILE, np.int64)
-    for piece in entries.pieces(bucket):
-        count += np.bincount(piece["cell"][piece["tile"] == tile], minlength=len(count))
-    group = np.cumsum(count) // HELD
-    values = np.full((entries.dtype["values"].shape[0], len(count)), np.nan)
-    for number in np.unique(group[count > 0]).tolist():
-        wanted = group == number
-        parts = [piece[(piece["tile"] == tile) & wanted[piece["cell"]]] for piece in entries.pieces(bucket)]
-        part = _compute(np.concatenate(parts), options, area).reshape(len(values), -1)
-        values[:, wanted] = part[:, wanted]
-    return values.reshape(-1, TILE, TILE)
-
-
-def _compute(rows: np.ndarray, options: GridOptions, area: float) -> np.ndarray:
-    cell = rows["cell"].astype(np.int64)
-    bands = [compute_cells(options.statistic, cell, values, TILE * TILE, area) for values in rows["values"].T]
-    return np.stack(bands).reshape(-1, TILE, TILE)

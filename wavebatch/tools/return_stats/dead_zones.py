@@ -66,7 +66,7 @@ class Distances:
 
 
 def find_zone(bins: np.ndarray) -> DeadZone:
-    """The dead zone of the pairs of a histogram: the lower edge of their distances, without the closest thousandth."""
+    """The dead zone of the pairs of a histogram: the 0.1 % quantile of their distances."""
     pairs = int(bins.sum())
     if pairs < LEAST_PAIRS:
         return DeadZone(pairs, math.nan, math.nan)

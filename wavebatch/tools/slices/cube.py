@@ -1,7 +1,8 @@
 """The data cube of scan lines: samples by line, pulse and time on one axis, as an .npz, and slices of it.
 
 `wavebatch slice --cube` writes it, `wavebatch plot cube` draws slices of it. The axis of time is one for all pulses:
-windows open at other heights for every pulse, and counted from their own first samples the relief would be lost.
+windows open at other heights for every pulse, and counted from their own first samples the relief would be lost. Lines
+of an oscillating mirror run to and fro, and some begin late: pulses of equal scan angle have the same column.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
     values f4 (lines, pulses, times): samples above the level without signal [DN], NaN where nothing was recorded.
     time f8 (times,): two-way [ns], from the plane across the mean ray through the sample nearest to the sensor. offset
     f4 (lines, pulses): to add to the times of a pulse [ns], within half a sample: samples are moved, not interpolated.
-    line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no more pulses.
+    line i8 (lines,), and gps_time, origin, direction of each pulse; NaN where a line has no pulse at that scan angle.
     """
     if not lines:
         raise InputError(f"{name}: not written, because there is no scan line")
@@ -72,7 +73,8 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
         raise InputError(f"{name}: scan lines differ in their spacing of samples; choose --lines of one digitizer")
     starts = _find_starts(lines)
     shift = [np.rint(start / spacing).astype(np.int64) for start in starts]
-    pulses = max(map(len, lines))
+    columns = align_pulses(lines)
+    pulses = 1 + max(int(column.max()) for column in columns)
     times = 1 + max(int((shift[i][line.row] + np.rint(line.time / spacing)).max()) for i, line in enumerate(lines))
     if len(lines) * pulses * times > MOST_VALUES:
         raise ConfigError(
@@ -84,12 +86,55 @@ def build_cube(lines: Sequence[ScanLine], name: str) -> dict[str, np.ndarray]:
     place |= {name: np.full((*shape, 3), np.nan) for name in ("origin", "direction")}
     for i, line in enumerate(lines):
         sample = shift[i][line.row] + np.rint(line.time / spacing).astype(np.int64)
-        values[i, line.row, sample] = line.value
+        values[i, columns[i][line.row], sample] = line.value
         for key in ("gps_time", "origin", "direction"):
-            place[key][i, : len(line)] = getattr(line, key)
-        place["offset"][i, : len(line)] = starts[i] - shift[i] * spacing
+            place[key][i, columns[i]] = getattr(line, key)
+        place["offset"][i, columns[i]] = starts[i] - shift[i] * spacing
     number = np.array([line.number for line in lines])
     return {"values": values, "time": np.arange(times) * spacing, "line": number, **place}
+
+
+def align_pulses(lines: Sequence[ScanLine]) -> list[np.ndarray]:
+    """Column of every pulse of each line, from 0: neighbours in a line are neighbours, angles ascend.
+
+    A line whose angles descend is turned; then it is shifted as a whole to the angles of the longest line, because
+    mirrors repeat their motion from line to line.
+    """
+    angles = _scan_angles(lines)
+    longest = max(range(len(lines)), key=lambda i: len(lines[i]))
+    found = [_turn(angle) for angle in angles]
+    model = np.maximum.accumulate(angles[longest][found[longest]])
+    step = max((model[-1] - model[0]) / max(len(model) - 1, 1), 1e-12)
+    shifts = []
+    for angle, order in zip(angles, found, strict=True):
+        own = angle[order]
+        inside = (own >= model[0]) & (own <= model[-1])
+        at = np.where(inside, np.interp(own, model, np.arange(len(model))), (own - model[0]) / step)
+        off = (at - np.arange(len(own)))[inside if inside.any() else slice(None)]
+        shifts.append(round(float(np.median(off))) if model[-1] > model[0] else 0)
+    columns = []
+    for order, shift in zip(found, shifts, strict=True):
+        column = np.empty(len(order), np.int64)
+        column[order] = np.arange(len(order)) + shift - min(shifts)
+        columns.append(column)
+    return columns
+
+
+def _turn(angle: np.ndarray) -> np.ndarray:
+    """Order of the pulses of a line in which their angles ascend."""
+    order = np.arange(len(angle))
+    return order[::-1] if len(angle) > 1 and angle[-1] < angle[0] else order
+
+
+def _scan_angles(lines: Sequence[ScanLine]) -> list[np.ndarray]:
+    """Angle of each pulse across the flight [rad], from the rays: 0 for the mean ray."""
+    direction = np.concatenate([line.direction for line in lines])
+    unit = direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
+    apart = unit - unit.mean(axis=0)
+    across = np.linalg.eigh(apart.T @ apart)[1][:, 2]
+    across *= np.sign(across[np.argmax(np.abs(across))])
+    angle = np.arcsin(np.clip(apart @ across, -1.0, 1.0))
+    return np.split(angle, np.cumsum([len(line) for line in lines])[:-1])
 
 
 def _find_starts(lines: Sequence[ScanLine]) -> list[np.ndarray]:
@@ -142,7 +187,8 @@ def cut_cube(path: Path, wanted: dict[str, float | None]) -> list[CubeSlice]:
         wanted = {"x": values.shape[1] // 2, "y": int(number[len(number) // 2]), "t": float(time[peak])}
     x_edges, y_edges = (-0.5, values.shape[1] - 0.5), (-0.5, len(number) - 0.5)
     t_edges = (float(time[0]) - 0.5 * spacing, float(time[-1]) + 0.5 * spacing)
-    x_label, y_label, t_label = "pulse of the line [-]", "scan line, in the order of the cube [-]", "time [ns]"
+    x_label, y_label = "pulse, aligned by scan angle [-]", "scan line, in the order of the cube [-]"
+    t_label = "time [ns]"
     found = []
     if wanted["x"] is not None:
         place = _check("--x", wanted["x"], values.shape[1])

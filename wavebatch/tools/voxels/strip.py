@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from wavebatch.core.waveforms import SystemPulse, WaveformBlock
 from wavebatch.files.cloud.column_reader import find_keep
 from wavebatch.files.disk.key_sums import HELD
 from wavebatch.files.disk.publish import refuse_existing
+from wavebatch.files.pulse_energy import PulseEnergy, find_pulse_energy
 from wavebatch.files.strip.reader import StripReader, StripScan, Unit
 from wavebatch.kernels.geometry.voxels import fits_keys
 from wavebatch.kernels.physics.gap_probability import HIGHEST, LOWEST
@@ -69,6 +70,8 @@ class VoxelOptions:
     """Reflectance of canopy over that of ground; None: estimated from the strip."""
     where: Condition | None = None
     """Use only waveforms of which a return meets this, with all of their signal."""
+    energy: str | None = None
+    """Energy of each emitted pulse, by which the signal is divided; see `find_pulse_energy`."""
 
     def __post_init__(self) -> None:
         if not 0 < self.size <= _LARGEST:
@@ -175,7 +178,8 @@ def voxelize_strip(
             open_profiles(profiles, strip, calibration is not None, overwrite) as writer,
         ):
             counts: Counter[str] = Counter(waveforms=0, with_signal=0, anchored=0, clipped=0)
-            for block, chosen in _read_blocks(reader, scan, block_size, keep):
+            energy = find_pulse_energy(reader, scan, options.energy)
+            for block, chosen in _read_blocks(reader, scan, block_size, keep, energy):
                 used = block if chosen is None else block.rows(chosen)
                 counts["left_out"] += len(block) - len(used)
                 if len(used):
@@ -183,6 +187,7 @@ def voxelize_strip(
                 if progress is not None:
                     progress(len(block), scan.packets)
             meta = _describe(strip, options, pulse, calibration) | {"reflectance_ratio": asdict(ratio)}
+            meta["pulse_energy"] = None if energy is None else energy.describe()
             space = VoxelSpace(grid.columns, reader.facts, grid.low * grid.size, grid.size, meta)
             voxels = _write_both(target, space, grid, writer, overwrite)
             return VoxelSummary(
@@ -311,14 +316,19 @@ def _open_grid(reader: StripReader, middle: np.ndarray, options: VoxelOptions, s
 
 
 def _read_blocks(
-    reader: StripReader, scan: StripScan, size: int | None, keep: Callable[[np.ndarray], np.ndarray] | None
+    reader: StripReader,
+    scan: StripScan,
+    size: int | None,
+    keep: Callable[[np.ndarray], np.ndarray] | None,
+    energy: PulseEnergy | None,
 ) -> Iterator[tuple[WaveformBlock, np.ndarray | None]]:
     """Every packet of the strip once, and which of them have a return that is kept, bool (n,); None: all."""
     for unit in reader.read_units(scan):
         longest = int(unit.packets.n_samples.max(initial=1))
         chosen = None if keep is None else _choose_packets(unit, keep)
         for block, index in reader.read_blocks(unit, size or max(BLOCK_SAMPLES // longest, 1), owned_only=True):
-            yield block, None if chosen is None else chosen[index]
+            filled = block if energy is None else energy.fill(block, unit)
+            yield filled, None if chosen is None else chosen[index]
 
 
 def _choose_packets(unit: Unit, keep: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -341,6 +351,9 @@ def _add_block(
     writer: ProfileWriter | None,
 ) -> None:
     profiles = deconvolve_block(block, pulse, options.deconvolution)
+    if block.pulse_energy is not None:
+        known = np.isfinite(block.pulse_energy)
+        profiles = replace(profiles, value=profiles.value / np.where(known, block.pulse_energy, 1.0)[:, None])
     headroom = options.headroom
     if headroom is None:
         headroom = ceiling.measure_headroom(block.origin, block.direction)

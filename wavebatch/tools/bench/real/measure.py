@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from wavebatch.core.errors import InputError
-from wavebatch.tools.bench.real.agreement import Agreement, Pulse, compare_parts
 from wavebatch.tools.bench.real.false_echoes import FalseEchoes, count_false
 from wavebatch.tools.bench.real.inject import Injected, inject_echoes
 from wavebatch.tools.bench.real.noise import QuietNoise, measure_noise
@@ -89,6 +88,33 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
+class Pulse:
+    """What a survey found, in the figures that are compared."""
+
+    waveforms: int
+    fwhm: float
+    """[ns]."""
+    noise: float
+    """[DN]."""
+    model: str
+    acceptance: float
+    """Least fall of chi2 for one more echo."""
+    digitizers: int
+    """Digitizers with another pulse or noise than the main one."""
+
+    @classmethod
+    def of(cls, solver: Solver) -> Pulse:
+        """The figures of a survey."""
+        system = solver.system
+        model = f"skewed {system.kappa:.3f}" if system.kappa else "Gaussian"
+        if len(system.components) > 1:
+            model = f"{len(system.components)} Gaussians"
+        return cls(
+            solver.survey.waveforms, solver.fwhm, system.noise_std, model, system.acceptance, len(system.digitizers)
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class RealReport:
     """How well the echoes of one strip are found."""
 
@@ -108,7 +134,6 @@ class RealReport:
     """The same of echoes that are clipped."""
     calibration: list[Calibration]
     false_echoes: FalseEchoes
-    agreement: list[Agreement]
     seconds: dict[str, float]
 
 
@@ -118,10 +143,9 @@ def measure_real(
     seed: int = 0,
     injections: int = INJECTIONS,
     waveforms: int | None = None,
-    stability: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> RealReport:
-    """Injects echoes into a strip's waveforms, counts false ones, and compares surveys of its parts.
+    """Injects echoes into a strip's waveforms, and counts false ones.
 
     Parameters
     ----------
@@ -129,7 +153,6 @@ def measure_real(
     seed : of everything random; the same seed gives the same figures.
     injections : number of echoes to inject, about; half in quiet stretches, half near strong echoes.
     waveforms : how many to read, spread over the strip; None: twice as many as a survey looks at.
-    stability : also survey halves, tiles and shuffled waveforms, which takes seven more surveys.
     say : gets a line for each step.
 
     Raises
@@ -152,14 +175,12 @@ def measure_real(
     note("survey", "surveyed")
     echoes = [solver.run(block) for block in pool.blocks]
     noise = measure_noise(pool, solver, echoes)
-    draw = [np.random.default_rng((seed, number)) for number in range(4)]
+    draw = [np.random.default_rng((seed, number)) for number in range(3)]
     templates = learn_templates(pool, solver, echoes, noise.std, draw[0])
     injected = inject_echoes(pool, solver, echoes, templates, noise, injections, draw[1])
     note("inject", f"{len(injected)} echoes injected")
     false = count_false(pool, solver, echoes, noise, draw[2])
     note("false", "residuals mirrored")
-    agreement = compare_parts(pool, solver, draw[3]) if stability else []
-    note("stability", "parts surveyed")
     quiet = ~injected.near & ~injected.clipped
     strong = _count_classes(injected, noise.std, (SPLIT,), quiet)
     clipped = _count_classes(injected, noise.std, (SPLIT,), ~injected.near & injected.clipped)
@@ -178,7 +199,6 @@ def measure_real(
         clipped=clipped[0] if clipped else None,
         calibration=_calibrate(injected, noise.std),
         false_echoes=false,
-        agreement=agreement,
         seconds=seconds,
     )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -73,33 +72,6 @@ class Pool:
 
     def __len__(self) -> int:
         return sum(map(len, self.blocks))
-
-    @cached_property
-    def places(self) -> tuple[np.ndarray, ...]:
-        """Rank of each waveform along the strip, per block."""
-        point = np.concatenate([block.point for block in self.blocks])
-        time = np.concatenate([block.gps_time for block in self.blocks])
-        rank = np.empty(len(point), np.int64)
-        rank[np.lexsort((point, time))] = np.arange(len(point))
-        return self._split(rank)
-
-    @cached_property
-    def eastings(self) -> tuple[np.ndarray, ...]:
-        """Of the first sample [m], per block."""
-        return self._split(np.concatenate([block.origin[:, 0] for block in self.blocks]))
-
-    def _split(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(np.split(values, np.cumsum([len(block) for block in self.blocks])[:-1]))
-
-    def take(self, masks: Iterable[np.ndarray]) -> list[WaveformBlock]:
-        """The waveforms at `masks` (bool or indices, one per block); blocks without any are left out."""
-        parts = [block.rows(mask) for block, mask in zip(self.blocks, masks, strict=True)]
-        return [part for part in parts if len(part)]
-
-    def thin(self, number: int) -> list[WaveformBlock]:
-        """About `number` waveforms, spread over the strip."""
-        step = max(len(self) // max(number, 1), 1)
-        return self.take([place % step == 0 for place in self.places])
 
 
 def each_echo(table: EchoTable, row: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

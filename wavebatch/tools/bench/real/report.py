@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wavebatch.core.no_data import without_nan
-from wavebatch.files.figure_file import open_picture, plain_text
-from wavebatch.tools.bench.plot import NO_PLOT, can_plot
-from wavebatch.tools.bench.real.agreement import Agreement
+from wavebatch.files.figure_file import has_matplotlib, open_picture, plain_text
+from wavebatch.tools.bench.plot import NO_PLOT
 from wavebatch.tools.bench.real.measure import APART, NEAR_SIGMAS, Calibration, Class, RealReport, between
 from wavebatch.tools.bench.report import align, write_texts
 
@@ -28,9 +27,6 @@ MOST_FALSE = 1e-4
 
 LEAST_SHOWN = 10
 """Injected echoes near others of which a share is printed."""
-
-MOST_DIFFER, MOST_OFFSET, MOST_SCALE = 0.01, 0.02, 0.005
-"""Packets with another count, time offset [ns] and change of amplitude at which surveys disagree."""
 
 
 def format_report(report: RealReport) -> str:
@@ -53,8 +49,6 @@ def format_report(report: RealReport) -> str:
         [*_describe_splits(report), *_describe_false(report)],
         _calibration_table(report.calibration),
     ]
-    if report.agreement:
-        parts.append(_agreement_table(report.agreement))
     return "\n\n".join(map("\n".join, parts))
 
 
@@ -123,26 +117,6 @@ def _calibration_table(rows: Sequence[Calibration]) -> list[str]:
     return align(lines)
 
 
-def _agreement_table(rows: Sequence[Agreement]) -> list[str]:
-    heads = ["waveforms", "FWHM ns", "noise DN", "model", "other count %", "dt ns", "|dt| ns", "amplitude", "width"]
-    lines = [["surveys of parts", *heads]]
-    for row in rows:
-        one, other = row.surveys
-        lines.append([
-            row.parts,
-            f"{one.waveforms}/{other.waveforms}",
-            f"{one.fwhm:.3f}/{other.fwhm:.3f}",
-            f"{one.noise:.2f}/{other.noise:.2f}",
-            one.model if one.model == other.model else f"{one.model}/{other.model}",
-            f"{100 * row.differ:.2f}{'!' * (row.differ >= MOST_DIFFER)}",
-            f"{row.offset:+.4f}{'!' * (abs(row.offset) >= MOST_OFFSET)}",
-            f"{row.apart:.4f}{'!' * (row.apart >= MOST_OFFSET)}",
-            f"{row.amplitude_ratio:.4f}{'!' * (abs(row.amplitude_ratio - 1) >= MOST_SCALE)}",
-            f"{row.width_ratio:.4f}",
-        ])  # fmt: skip
-    return align(lines)
-
-
 def write_report(report: RealReport, folder: Path) -> str:
     """Writes real-STRIP.json, .txt and, with matplotlib, .png into a folder, replacing old ones; returns a line.
 
@@ -151,7 +125,7 @@ def write_report(report: RealReport, folder: Path) -> str:
     stem = f"real-{Path(report.strip).stem}"
     document = json.dumps(without_nan(asdict(report)), indent=1, sort_keys=True, allow_nan=False)
     written = write_texts(folder, {f"{stem}.json": document, f"{stem}.txt": format_report(report)})
-    if not can_plot():
+    if not has_matplotlib():
         return f"{written}; {NO_PLOT}"
     draw_report(report, folder / f"{stem}.png")
     return f"{written}, {stem}.png"

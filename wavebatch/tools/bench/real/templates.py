@@ -52,7 +52,7 @@ class Template:
     """The pulse of some echoes, and what the chain makes of it where nothing disturbs it.
 
     A learned pulse never is exactly that of an echo; a fit's amplitude, time and width of this very pulse without
-    noise, on a level baseline, is therefore what injected echoes are held against.
+    noise, on a level baseline, is therefore what injected echoes are compared with.
     """
 
     curve: BSpline

@@ -1,0 +1,104 @@
+"""Kernels of geometry and physics that nothing else compares with a slow, plain twin; and that each has a test."""
+
+import ast
+from pathlib import Path
+
+import naive_geometry
+import numpy as np
+import pytest
+
+from wavebatch.kernels.geometry import normals
+from wavebatch.kernels.geometry.group_returns import find_pulses
+from wavebatch.kernels.geometry.normals import thin_out
+from wavebatch.kernels.geometry.pulse_rays import fit_rays, group_pulses
+from wavebatch.kernels.geometry.two_lines import LEAST_VARIETY, in_two_lines
+from wavebatch.kernels.geometry.voxels import accumulate_profile, total_until
+from wavebatch.kernels.physics.radiometry import known_distance, slope_error
+
+TESTS = Path(__file__).resolve().parents[1]
+KERNELS = TESTS.parent / "wavebatch" / "kernels"
+
+
+def test_pulses_are_those_of_a_loop(rng):
+    time = np.repeat(rng.integers(0, 5, 60), rng.integers(1, 80, 60)).astype(float)
+    assert find_pulses(time).tolist() == naive_geometry.find_pulses(time)
+    number = rng.integers(1, 4, len(time))
+    assert group_pulses(time, number).tolist() == naive_geometry.group_pulses(time, number)
+
+
+def test_dense_points_are_thinned_as_by_a_loop(rng):
+    xyz = rng.normal(0, 1.0, (3000, 3))
+    row = rng.permutation(10**6)[:3000]
+    kept = thin_out(xyz, row, 2.0)
+    expected = naive_geometry.thin_out(xyz, row, 2.0, normals.FINENESS, normals.MOST_PER_CELL)
+    np.testing.assert_array_equal(kept, expected)
+    assert 0.1 < kept.mean() < 0.9
+
+
+def test_two_lines_are_told_by_skewness_and_kurtosis(rng):
+    sets = 80
+    group = np.repeat(np.arange(sets), 14)
+    u, v = rng.uniform(-2, 2, (2, len(group)))
+    some = group % 2 == 0
+    v[some] = np.where(rng.random(some.sum()) < 0.4, -0.7, 0.6) + rng.normal(0, 0.1, some.sum())
+    turn = rng.uniform(0, np.pi, sets)[group]
+    u, v = np.cos(turn) * u - np.sin(turn) * v, np.sin(turn) * u + np.cos(turn) * v
+    expected = np.array([naive_geometry.variety(u[group == k], v[group == k]) for k in range(sets)])
+    np.testing.assert_array_equal(in_two_lines(u, v, group, sets), expected < LEAST_VARIETY)
+    assert 0.2 < (expected < LEAST_VARIETY).mean() < 0.8
+
+
+def test_rays_of_single_returns_are_on_the_line_through_those_of_pairs(rng):
+    """Two flight lines; half of the pulses have two returns far apart, some of which are wrong."""
+    k = 400
+    angle, source = rng.uniform(-25, 25, k).round(), rng.integers(0, 2, k)
+    slope = np.stack([np.where(source == 0, 1, -1) * np.tan(np.radians(angle)), np.full(k, 0.03)], axis=1)
+    way = np.column_stack([slope, -np.ones(k)])
+    apart = np.where(np.arange(k) % 2, 5.0, 0.2)
+    wrong = np.arange(k) % 20 == 1
+    starts = 2 * np.arange(k)
+    xyz = np.zeros((2 * k, 3))
+    xyz[1::2] = way * apart[:, None]
+    xyz[1::2][wrong, 0] += 3.0
+    rays = fit_rays(xyz, starts, np.repeat(angle, 2), np.repeat(source, 2))
+    true = way / np.linalg.norm(way, axis=1)[:, None]
+    np.testing.assert_allclose(rays[~wrong], true[~wrong], atol=1e-9)
+    own = xyz[1::2][wrong]
+    np.testing.assert_allclose(rays[wrong], own / np.linalg.norm(own, axis=1)[:, None], atol=1e-12)
+
+
+def test_sums_over_time_are_those_of_a_loop(rng):
+    profile = rng.uniform(0, 3, (5, 9))
+    ray, time = rng.integers(0, 5, 300), rng.uniform(-3, 22, 300)
+    found = total_until(accumulate_profile(profile), ray, time, 2.0)
+    expected = [naive_geometry.total_until(profile[r], t, 2.0) for r, t in zip(ray, time, strict=True)]
+    assert found == pytest.approx(expected)
+
+
+def test_the_error_of_an_unknown_slope_is_that_over_its_directions():
+    for slope in (0.02, 0.2, 0.6):
+        for incidence in (0.0, 0.1, 0.5, 1.2):
+            expected = naive_geometry.slope_error(incidence, slope)
+            assert slope_error(np.array([incidence]), slope) == pytest.approx(expected, rel=1e-6)
+
+
+def test_distances_that_cannot_be_are_not_known():
+    known = known_distance(np.array([1.0, 0.0, -3.0, np.nan, np.inf, 1e5], np.float32))
+    assert known.dtype == np.float64 and np.isnan(known[1:5]).all() and known[[0, 5]].tolist() == [1.0, 1e5]
+
+
+def test_every_kernel_is_called_by_a_test():
+    """Through a stage alone, a wrong kernel would be one of many reasons of a failure."""
+    called = set()
+    for path in TESTS.rglob("test_*.py"):
+        for node in ast.parse(path.read_text("utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("wavebatch.kernels."):
+                called |= {(node.module, alias.name) for alias in node.names}
+    for folder in "signal", "geometry", "physics":
+        public = {
+            (f"wavebatch.kernels.{folder}.{path.stem}", node.name)
+            for path in (KERNELS / folder).glob("*.py")
+            for node in ast.parse(path.read_text("utf-8")).body
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
+        }
+        assert len(public) > 15 and not public - called

@@ -1,0 +1,89 @@
+"""Builds of the C by several compilers for several processors print the same bits of the same fits (tests/c/fits.c)."""
+
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from compilers import STRICT, install_zig, machine_compiler
+
+PROGRAM = Path(__file__).resolve().parents[1] / "c" / "fits.c"
+pytestmark = pytest.mark.slow
+on_x86 = pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="instructions of x86-64")
+
+
+def build_and_run(command, target, run=(), environment=None):
+    """What the program prints that the command builds."""
+    call = [*command, str(PROGRAM), "-o", str(target), "-lm"]
+    done = subprocess.run(call, capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    done = subprocess.run([*run, str(target)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def zig(tmp_path_factory):
+    return install_zig(tmp_path_factory.mktemp("zig"))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """Of the machine's compiler, for any processor of its kind."""
+    return build_and_run([*machine_compiler(), *STRICT], tmp_path_factory.mktemp("plain") / "fits")
+
+
+def has(instructions):
+    """Whether this processor has them all."""
+    cpuinfo = Path("/proc/cpuinfo")
+    return cpuinfo.exists() and set(instructions) <= set(cpuinfo.read_text().split())
+
+
+def test_all_models_and_options_are_fitted(plain):
+    lines = plain.splitlines()
+    cases = {line.rpartition(" ")[0] for line in (line.partition(":")[0] for line in lines)}
+    assert len(cases) == 16 and len(lines) == 16 * 24
+    echoes = [int(line.partition(": ")[2].split()[0]) for line in lines]
+    assert min(echoes) == 1 and max(echoes) >= 5 and sum(number > 1 for number in echoes) > 100
+    assert sum("converged 1" in line for line in lines) > 0.9 * len(lines) and "nan" not in plain
+
+
+@on_x86
+@pytest.mark.parametrize("flags", [["-mavx2", "-mfma"], ["-march=x86-64-v4"], ["-O0"], ["-O2"]], ids=" ".join)
+def test_instructions_and_optimisation_do_not_change_a_bit(plain, tmp_path, flags):
+    if flags == ["-march=x86-64-v4"] and not has(("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")):
+        pytest.skip("this processor has no AVX-512")
+    if "-mavx2" in flags and not has(("avx2", "fma")):
+        pytest.skip("this processor has no AVX2")
+    assert build_and_run([*machine_compiler(), *STRICT, *flags], tmp_path / "fits") == plain
+
+
+@on_x86
+def test_contracted_products_would_be_seen(plain, tmp_path):
+    if not has(("avx2", "fma")):
+        pytest.skip("this processor has no fused product and sum")
+    flags = ["-mfma", "-ffp-contract=fast"]
+    assert build_and_run([*machine_compiler(), *STRICT, *flags], tmp_path / "fits") != plain
+
+
+@pytest.mark.parametrize("flags", [["-mcpu=baseline"], ["-mcpu=native"]], ids=" ".join)
+def test_zig_gives_the_same_bits(plain, zig, tmp_path, flags):
+    command, environment = zig
+    assert build_and_run([*command, *flags, *STRICT], tmp_path / "fits", environment=environment) == plain
+
+
+def test_aarch64_gives_the_same_bits(plain, zig, tmp_path):
+    """Its processors have fused products, which a compiler takes unless it is told not to."""
+    emulator = shutil.which("qemu-aarch64-static") or shutil.which("qemu-aarch64")
+    if emulator is None:
+        pytest.skip("needs qemu-user-static: apt-get install qemu-user-static")
+    command, environment = zig
+    target = ["-target", "aarch64-linux-musl", "-static", "-mcpu=baseline"]
+    printed = build_and_run([*command, *target, *STRICT], tmp_path / "fits", [emulator], environment)
+    assert printed == plain
+
+
+def test_no_memory_is_misused_or_left(plain, tmp_path):
+    flags = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    assert build_and_run([*machine_compiler(), *STRICT, *flags], tmp_path / "fits") == plain

@@ -1,0 +1,271 @@
+"""Kernels of signal that nothing else compares with a slow, plain twin: noise, defects, sums, runs, deconvolution."""
+
+import naive
+import naive_signal
+import numpy as np
+import pytest
+
+from wavebatch.kernels.signal import noise as noise_kernels
+from wavebatch.kernels.signal.deconvolve import correlate_pulse, deconvolve_wiener, wiener_taps
+from wavebatch.kernels.signal.defects import fill_spikes, find_pattern, find_spikes, find_transient, fit_slopes
+from wavebatch.kernels.signal.filters import curvature_taps, filter_autocorrelation, gaussian_taps
+from wavebatch.kernels.signal.noise import (
+    PooledNoise,
+    colour_factors,
+    correlate_quiet,
+    correlation_matrix,
+    estimate_noise,
+    find_levels,
+    first_level,
+    keep_longest,
+    measure_recovery,
+    residual_noise,
+)
+from wavebatch.kernels.signal.profiles import fit_height
+from wavebatch.kernels.signal.runs import find_stretches, lobe_edges
+from wavebatch.kernels.signal.signal import NARROW, accumulate, find_quiet, sum_samples, widen_after
+from wavebatch.kernels.signal.wavelet import smooth_b3
+
+PULSE = np.exp(-0.5 * (np.arange(-5, 6) / 1.7) ** 2)
+
+
+def record(rng, n=40, s=64, level=12.0, std=1.2, amplitude=60.0):
+    """Whole counts (s, n): noise about a level, and an echo at a random place."""
+    y = level + std * rng.standard_normal((s, n))
+    y += amplitude * np.exp(-0.5 * ((np.arange(s)[:, None] - rng.uniform(15, s - 10, n)) / 2.0) ** 2)
+    return np.clip(np.rint(y), 0, 255).astype(np.float32)
+
+
+@pytest.mark.parametrize("reach", [0, 1, 2, 3, 7, 12, 40])
+def test_masks_widened_to_one_side(rng, reach):
+    mask = rng.random((30, 50)) < 0.04
+    np.testing.assert_array_equal(widen_after(mask, reach), naive_signal.widen_after(mask, reach))
+
+
+@pytest.mark.parametrize("recovery", [0, 2, 4, 9])
+def test_quiet_samples_keep_away_from_the_tails_of_strong_signal(rng, recovery):
+    above = record(rng, amplitude=rng.uniform(2, 60, 40)) - 12
+    quiet = find_quiet(above, 3.0, 2, recovery)
+    np.testing.assert_array_equal(quiet, naive_signal.find_quiet(above, 3.0, 2, recovery))
+    assert recovery < 9 or (find_quiet(above, 3.0, 2) & ~quiet).sum() > 100
+
+
+@pytest.mark.parametrize("n", [1, 2, NARROW - 1, NARROW, 300])
+def test_sums_are_those_of_a_loop_bit_for_bit(rng, n):
+    values = rng.normal(0, 1, (40, n)).astype(np.float32)
+    np.testing.assert_array_equal(sum_samples(values), naive_signal.add_up(values))
+    for end in (1, 17, 40):
+        np.testing.assert_array_equal(accumulate(np.add, values)[end - 1], naive_signal.add_up(values[:end]))
+    mask = values < 1.5
+    np.testing.assert_array_equal(accumulate(np.logical_and, mask)[-1], mask.all(axis=0))
+    assert accumulate(np.add, values[:0]).shape == (0, n)
+
+
+def test_stretches_and_edges_of_lobes(rng):
+    mask = rng.random((30, 40)) < 0.5
+    mask[0], mask[1] = False, True
+    assert list(zip(*(part.tolist() for part in find_stretches(mask)), strict=True)) == naive_signal.find_stretches(
+        mask
+    )
+    x = np.cumsum(rng.uniform(0.5, 1.5, 60))
+    for _ in range(20):
+        curve = np.exp(-0.5 * ((x - rng.uniform(20, 40)) / rng.uniform(2, 5)) ** 2) + 0.1 * rng.random(60)
+        assert lobe_edges(x, curve, 0.4) == pytest.approx(naive_signal.lobe_edges(x, curve, 0.4))
+
+
+def test_spikes_are_those_of_a_loop_and_get_the_mean_of_their_neighbours(rng):
+    above = record(rng, n=300) - 12
+    for row, height in enumerate(np.linspace(-30, 30, 200)):
+        above[rng.integers(1, 63), row] += np.float32(height)
+    spikes = find_spikes(above, 1.25, 2.0)
+    np.testing.assert_array_equal(spikes, naive_signal.find_spikes(above, 1.25, 2.0))
+    assert 50 < spikes.sum() < 250 and not find_spikes(above[:2], 1.25, 2.0).any()
+    filled = above.copy()
+    fill_spikes(filled, spikes)
+    for i, w in zip(*np.nonzero(spikes), strict=True):
+        assert filled[i, w] == 0.5 * (above[i - 1, w] + above[i + 1, w])
+    np.testing.assert_array_equal(filled[~spikes], above[~spikes])
+
+
+@pytest.mark.parametrize("s", [64, 63, 9])
+def test_a_pattern_of_the_converter_is_that_of_a_loop(rng, s):
+    signal = rng.normal(12, 1, (s, 60)).astype(np.float32) + np.resize([0.5, -0.2, 0.1, -0.4], s)[:, None]
+    signal = signal.astype(np.float32)
+    quiet = rng.random(signal.shape) < 0.95
+    found, expected = find_pattern(signal, quiet), naive_signal.find_pattern(signal, quiet)
+    assert found[0] == pytest.approx(expected[0], abs=1e-5) and found[1] == pytest.approx(expected[1], rel=1e-4)
+    nothing = find_pattern(signal[:7], quiet[:7])  # not once around for every phase
+    assert not nothing[0].any() and np.isinf(nothing[1]).all()
+
+
+@pytest.mark.parametrize(("length", "height"), [(0, 0.0), (1, 2.0), (3, 1.0), (5, -3.0), (7, 0.8), (8, 5.0)])
+def test_a_transient_is_that_of_a_loop(rng, length, height):
+    above = rng.normal(0, 1, (40, 200)).astype(np.float32)
+    above[:length] += np.float32(height)
+    assert find_transient(above, 1.0) == naive_signal.find_transient(above, 1.0) == length % 8
+    above[2, ::3] += 8  # scatter without a mean
+    above[2, 1::3] -= 8
+    assert find_transient(above, 1.0) == naive_signal.find_transient(above, 1.0)
+    above[:, ::3] += np.float32(40)
+    assert find_transient(above, 1.0) == naive_signal.find_transient(above, 1.0) == 0  # echoes lie there
+    assert find_transient(above[:23], 1.0) == 0
+
+
+def test_slopes_are_those_of_lines_through_quiet_samples(rng):
+    signal = record(rng, n=60) + (rng.uniform(-0.3, 0.3, 60) * np.arange(64)[:, None]).astype(np.float32)
+    signal = signal.astype(np.float32)
+    missing = np.zeros(signal.shape, bool)
+    missing[40:] = rng.random((24, 60)) < 0.1
+    missing[20:, 50:] = True  # only one end of these is known
+    slope, error = fit_slopes(signal, 1.25, 3, missing=missing)
+    for w in range(60):
+        expected = naive_signal.fit_slope(signal[:, w].astype(float), 1.25, 3, missing=missing[:, w])
+        assert slope[w] == pytest.approx(expected[0], abs=2e-5)
+        assert error[w] == pytest.approx(expected[1], rel=1e-4)
+    assert np.isinf(error[50:]).all() and np.isfinite(error[:50]).all()
+
+
+def test_the_first_level_is_the_most_frequent_low_count(rng):
+    for signal in (record(rng), record(rng, level=0.0, std=0.3), record(rng, level=0.0, std=5.0)):
+        assert first_level(signal) == pytest.approx(naive_signal.first_level(signal))
+    assert first_level(np.full((9, 4), 7, np.float32)) == pytest.approx((7, naive_signal.QUANTISATION_STD))
+
+
+@pytest.mark.parametrize("recovery", [0, 30])
+def test_levels_are_those_of_single_waveforms(rng, recovery):
+    signal = record(rng, level=rng.uniform(10, 90, 40))
+    levels, quiet, number = find_levels(signal, 1.25, 3, recovery=recovery)
+    for w in range(signal.shape[1]):
+        level, used = naive_signal.find_level(signal[:, w].astype(float), 1.25, 3, recovery=recovery)
+        assert levels[w] == pytest.approx(level, abs=1e-4)
+        np.testing.assert_array_equal(quiet[:, w], used)
+        assert number[w] == used.sum()
+
+
+def test_correlations_are_those_of_pairs(rng, monkeypatch):
+    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
+    white = rng.standard_normal((70, 50))
+    signal = (12 + white[3:] + 0.6 * white[2:-1] - 0.2 * white[:-3]).astype(np.float32)
+    quiet = rng.random(signal.shape) < 0.8
+    quiet[15:, :10] = False  # too few
+    found = correlate_quiet(signal, quiet, 0.5, lags=6)
+    assert found == pytest.approx(naive_signal.correlate_quiet(signal, quiet, 0.5, 6), abs=1e-5)
+    assert correlate_quiet(signal, quiet & False, 0.5).size == 0
+    residual, used = signal.T - 12, quiet.T
+    residual = residual + 30 * (rng.random(residual.shape) < 0.01)  # echoes that nobody fitted
+    std, correlation = residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), lags=5)
+    expected = naive_signal.residual_noise(residual.astype(np.float32), used, np.array([0.1, 0.05]), 5)
+    assert std == pytest.approx(expected[0], rel=1e-5) and correlation == pytest.approx(expected[1], abs=1e-5)
+    assert residual_noise(residual.astype(np.float32), used & False, np.zeros(0)) is None
+
+
+def test_the_longest_recording_is_kept(rng):
+    missing = rng.random((30, 60)) < 0.2
+    missing[:, 0], missing[:, 1] = True, False
+    np.testing.assert_array_equal(keep_longest(missing), naive_signal.keep_longest(missing))
+
+
+def record_tails(rng, tail, n=260, s=90):
+    """Waveforms (s, n) whose echoes have a tail of this share of their height."""
+    time = rng.integers(12, 30, n)
+    x = np.arange(s)[:, None]
+    signal = 12 + rng.normal(0, 1, (s, n)) + 90 * np.exp(-0.5 * ((x - time) / 2.0) ** 2)
+    return (signal + 90 * tail * (x > time) * np.exp(-np.maximum(x - time, 0) / 15.0)).astype(np.float32)
+
+
+@pytest.mark.parametrize("tail", [0.0, 0.04])
+def test_the_recovery_is_that_of_a_loop(rng, tail):
+    signal = record_tails(rng, tail)
+    pooled = PooledNoise(12.0, 1.0, 1.0, 0.3, 0.7)
+    found = measure_recovery(signal, pooled, 4, 4.0)
+    assert found == naive_signal.measure_recovery(signal, pooled, 4, 4.0)
+    assert (found > 0) == (tail > 0)
+    assert measure_recovery(signal[:, :90], pooled, 4, 4.0) == 0
+
+
+def assert_same_noise(found, expected):
+    assert found[:5] == pytest.approx(expected[:5], rel=1e-3, abs=2e-4)
+    assert found.correlation == pytest.approx(expected[5], abs=2e-4)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5])
+def test_pooled_noise_is_that_of_a_loop(rng, monkeypatch, spread):
+    """Coloured, so that samples near each other share more than their level; some waveforms have few quiet samples."""
+    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
+    white = rng.standard_normal((65, 90))
+    colour = np.where(np.arange(90) < 5, 60.0 * (np.arange(64) % 60 > 3)[:, None], 0.0)
+    signal = record(rng, n=90, std=0.0, level=12 + spread * rng.standard_normal(90))
+    signal = (signal + white[1:] + 0.6 * white[:-1] + colour).astype(np.float32)
+    found = estimate_noise(signal, 3)
+    assert found.recovery == 0
+    assert_same_noise(found, naive_signal.estimate_noise(signal, 3))
+
+
+def test_drifting_noise_is_that_of_a_loop(rng, monkeypatch):
+    monkeypatch.setattr(noise_kernels, "LEAST_PAIRS", 50)
+    signal = record(rng, n=80, level=60 + 8 * rng.standard_normal(80))
+    assert_same_noise(estimate_noise(signal, 3), naive_signal.estimate_drifting(signal, 3))
+
+
+def test_tails_of_strong_echoes_are_left_out_of_pooled_noise(rng):
+    signal = record_tails(rng, 0.04, n=150)
+    found = estimate_noise(signal, 4)
+    level, std, smoothed, spread, share, _ = naive_signal.estimate_noise(signal, 4)
+    pooled = PooledNoise(level, std, smoothed, spread, share)
+    assert found.recovery == naive_signal.measure_recovery(signal, pooled, 4, 4.0) > 0
+    assert found.level < level - 0.05
+    again = naive_signal.estimate_noise(signal, 4, recovery=found.recovery, start=(level, std, spread))
+    assert_same_noise(found, again)
+
+
+def test_coloured_noise_widens_errors_as_its_covariance_says():
+    x = np.arange(-12, 13) / 2.0
+    pulse = np.exp(-0.5 * x * x)
+    columns = (pulse, x * pulse, x * x * pulse)
+    for correlation in ((0.5, 0.2, -0.05), (0.6,), (-0.3, 0.1)):
+        assert colour_factors(correlation, *columns) == pytest.approx(
+            naive_signal.colour_factors(correlation, *columns)
+        )
+    assert colour_factors((), *columns) == (1.0, 1.0, 1.0, 1.0)
+    matrix = correlation_matrix((0.5, 0.2), 5)
+    assert matrix[0].tolist() == [1.0, 0.5, 0.2, 0.0, 0.0] and (matrix == matrix.T).all()
+
+
+@pytest.mark.parametrize("taps", [gaussian_taps(2.0), curvature_taps(1.4)])
+def test_the_autocorrelation_of_a_filter_is_that_of_its_shifted_taps(taps):
+    whole = np.r_[taps[:0:-1], taps]
+    k = len(whole)
+    expected = [sum(whole[i] * whole[i + lag] for i in range(k - lag)) for lag in range(k)]
+    assert filter_autocorrelation(taps) == pytest.approx(np.array(expected) / expected[0])
+
+
+def test_wiener_is_the_linear_estimate_of_least_error(rng):
+    for taps in (PULSE, np.roll(PULSE, 1)):
+        waveform = np.zeros(160)
+        waveform[60:100] = rng.uniform(0, 30, 40)
+        expected = naive_signal.wiener(waveform, taps, 0.05)
+        found = deconvolve_wiener(waveform[:, None], taps, 0.05)[:, 0]
+        assert found == pytest.approx(expected, abs=0.02 * np.abs(expected).max())
+        assert len(wiener_taps(taps, 0.05, 9)) == 19
+        matrix = naive.pulse_matrix(160, taps)
+        assert correlate_pulse(waveform[:, None], taps)[:, 0] == pytest.approx(matrix.T @ waveform)
+
+
+def test_heights_of_profiles_have_the_energy_of_their_waveform(rng):
+    profile, signal = rng.uniform(-1, 4, (6, 50)), rng.uniform(-2, 30, (50, 6)).astype(np.float32)
+    support = rng.random((6, 50)) < 0.5
+    profile[4], signal[:, 5] = -1.0, -1.0  # a sum of pulses, and a signal, that are not positive
+    found = fit_height(profile, signal, PULSE, support)
+    for w in range(6):
+        expected = naive_signal.fit_height(profile[w], signal[:, w].astype(float), PULSE, support[w])
+        assert found[w] == pytest.approx(expected, rel=1e-4)
+    assert not found[4:].any() and found[:4].any()
+
+
+@pytest.mark.parametrize("step", [1, 2, 8])
+def test_b3_smoothing_is_that_of_a_loop(rng, step):
+    signal = rng.normal(0, 1, (20, 3))
+    for w in range(3):
+        padded = [signal[min(max(i, 0), 19), w] for i in range(-2 * step, 20 + 2 * step)]
+        expected = [sum(h * padded[i + k * step] for k, h in enumerate((1, 4, 6, 4, 1))) / 16 for i in range(20)]
+        assert smooth_b3(signal, step)[:, w] == pytest.approx(expected)

@@ -1,0 +1,354 @@
+"""Slow, plain references for kernels/signal: noise, defects, runs and profiles of one waveform after the other."""
+
+from collections import Counter
+from itertools import groupby
+
+import naive
+import numpy as np
+
+QUANTISATION_STD = 1 / np.sqrt(12)
+
+
+def recorded_length(waveform, least_padding=8, least_recorded=16, least_level=3):
+    """Samples of one waveform without the zeros that fill its packet."""
+    end = len(waveform)
+    while end and waveform[end - 1] == 0:
+        end -= 1
+    padded = len(waveform) - end >= least_padding and end >= least_recorded and min(waveform[:end]) >= least_level
+    return end if padded else len(waveform)
+
+
+def widen_after(mask, reach):
+    """Boolean (s, n) with `reach` samples marked after every true one."""
+    wide = np.zeros_like(mask)
+    for i, w in zip(*np.nonzero(mask), strict=True):
+        wide[i : i + reach + 1, w] = True
+    return wide
+
+
+def find_quiet(signal, limit, reach, recovery=0):
+    """Samples far from signal, and far behind strong signal."""
+    smoothed = np.abs(np.stack([naive.smooth_121(column) for column in signal.T], axis=1))
+    busy = naive.widen(smoothed > limit, reach)
+    if recovery > reach:
+        busy |= widen_after(smoothed > np.float32(limit) * np.float32(3), recovery)
+    return ~busy
+
+
+def add_up(values):
+    """Sums over the samples, one after the other, in the type of the values."""
+    total = np.zeros(values.shape[1], values.dtype)
+    for row in values:
+        total = total + row
+    return total
+
+
+def find_stretches(mask):
+    """(row, first, one behind the last) of every stretch of true samples."""
+    found = []
+    for row, samples in enumerate(mask):
+        at = 0
+        for value, run in groupby(samples):
+            length = len(list(run))
+            if value:
+                found.append((row, at, at + length))
+            at += length
+    return found
+
+
+def lobe_edges(x, curve, level):
+    """Crossings of a level nearest to the highest sample."""
+    top = int(np.argmax(curve))
+    edges = []
+    for step in (-1, 1):
+        i = top
+        while curve[i] >= level:
+            i += step
+        share = (level - curve[i]) / (curve[i - step] - curve[i])
+        edges.append(x[i] + share * (x[i - step] - x[i]))
+    return tuple(edges)
+
+
+def find_spikes(above, std, width):
+    """(s, n) True where a sample is higher than its higher neighbour, or lower than its lower one, by too much."""
+    spikes = np.zeros(above.shape, bool)
+    drop = 1.5 * (1 - np.exp(-0.5 / width**2))
+    for w, y in enumerate(above.T.astype(float)):
+        for i in range(1, len(y) - 1):
+            high, low = max(y[i - 1], y[i + 1]), min(y[i - 1], y[i + 1])
+            spike = y[i] - high > 4.5 * std + drop * max(y[i], 0) and y[i] > 5.5 * std
+            hole = low - y[i] > 6.5 * std + drop * max(high, 0)
+            spikes[i, w] = spike or hole
+    return spikes
+
+
+def find_pattern(signal, quiet):
+    """Mean deviation of samples 0, 1, 2, 3, 0 ... from those within half a period, and its error."""
+    deviations = [[], [], [], []]
+    s, n = signal.shape
+    for w in range(n):
+        for i in range(2, s - 2):
+            if quiet[i - 2 : i + 3, w].all():
+                y = signal[i - 2 : i + 3, w].astype(float)
+                deviations[i % 4].append(y[2] - (0.5 * y[0] + y[1] + y[2] + y[3] + 0.5 * y[4]) / 4)
+    mean = np.array([np.mean(values) if len(values) > 1 else 0.0 for values in deviations])
+    error = np.array([np.std(values) / np.sqrt(len(values)) if len(values) > 1 else np.inf for values in deviations])
+    return mean - mean.mean(), error
+
+
+def find_transient(above, std):
+    """Samples at the start whose spread or mean over the waveforms is not that of samples 8 to 15."""
+    if len(above) < 24:
+        return 0
+    usual = [np.quantile(row, [0.05, 0.5, 0.95]) for row in above[8:16]]
+    quiet = [
+        abs(y - middle) < 4 * std + 0.5 for row, (_, middle, _) in zip(above[8:16], usual, strict=True) for y in row
+    ]
+    if np.mean(quiet) < 0.8:
+        return 0
+    spread = max(np.median([high - low for low, _, high in usual]), 2 * std)
+    centre = np.median([middle for _, middle, _ in usual])
+    for i in range(8):
+        low, high = np.quantile(above[i], [0.05, 0.95])
+        mean = np.mean([min(max(y, low), high) for y in above[i]])
+        if high - low <= 1.6 * spread and abs(mean - centre) <= max(0.5 * std, 0.3):
+            return i
+    return 0
+
+
+def fit_slope(y, std, reach, limit=4.0, missing=None):
+    """Slope of the baseline of one waveform and its error, by lines through the samples that are quiet about a line."""
+    s = len(y)
+    x = np.arange(s) - 0.5 * (s - 1)
+    missing = np.zeros(s, bool) if missing is None else missing
+    edges = [int(s * k / 6) for k in range(7)]
+    place = [np.mean(x[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    low = [sorted(y[a:b])[(b - a) // 4] for a, b in zip(edges, edges[1:], strict=False)]
+    pairs = [(low[j] - low[i]) / (place[j] - place[i]) for i in range(6) for j in range(i + 1, 6)]
+    slope = np.median(pairs)
+    level = np.median([value - slope * at for value, at in zip(low, place, strict=True)])
+    error = np.inf
+    for extra in (2.0, 1.0, 0.0):
+        rest = y - level - slope * x
+        width = limit * (np.sqrt(6) / 4 + extra) * std + 0.25
+        quiet = find_quiet(rest[:, None], width, reach)[:, 0] & ~missing
+        line = np.polyfit(x[quiet], y[quiet], 1)
+        slope, level = line
+        size = np.sum((x[quiet] - x[quiet].mean()) ** 2)
+        enough = quiet.sum() >= s // 5 and size > quiet.sum() * (0.15 * s) ** 2
+        error = std / np.sqrt(size) if enough else np.inf
+    return slope, error
+
+
+def first_level(signal):
+    """Most frequent count of the lower half of all counts, and the root mean square of what lies below it."""
+    middle = np.median([np.median(column) for column in signal.T]) + 1
+    counts = Counter(value for value in signal.ravel().tolist() if value <= middle)
+    most = max(counts.values())
+    level = min(value for value, number in counts.items() if number == most)
+    below = [value - level for value in signal.ravel().tolist() if value <= min(level, middle)]
+    if any(below):
+        return level, max(np.sqrt(np.mean(np.square(below))), QUANTISATION_STD)
+    return level, max((np.quantile(signal, 0.75) - level) / 0.674, QUANTISATION_STD)
+
+
+def find_level(y, std, reach, limit=4.0, recovery=0):
+    """Level of one waveform from itself alone, and its quiet samples."""
+    level = sorted(y)[len(y) // 4]
+    width = limit * np.sqrt(6) / 4 * std + 0.25
+    quiet = np.zeros(len(y), bool)
+    for extra in (std, 0.0, 0.0):
+        quiet = find_quiet((y - level)[:, None], width + extra, reach)[:, 0]
+        level += (y - level)[quiet].mean() if quiet.any() else 0.0
+    if recovery > reach:
+        clear = find_quiet((y - level)[:, None], width, reach, recovery)[:, 0]
+        if clear.sum() >= 4:
+            return level + (y - level)[clear].mean(), clear
+    return level, quiet
+
+
+def correlate_quiet(signal, quiet, std, lags):
+    """Correlation at lags 1, 2, ... of quiet samples about their waveform's mean, with what the mean takes away."""
+    products = [[] for _ in range(lags + 1)]
+    shares = []
+    for y, used in zip(signal.T, quiet.T, strict=True):
+        if used.sum() < 4 * lags:
+            continue
+        shares.append(1 / used.sum())
+        y = y - y[used].mean()
+        for lag in range(lags + 1):
+            products[lag] += [y[i] * y[i + lag] for i in range(len(y) - lag) if used[i] and used[i + lag]]
+    if not shares:
+        return np.empty(0)
+    raw = np.array([np.mean(values) for values in products])
+    share = np.mean(shares)
+    # All lags lose the same, share (c0 + 2 c1 + 2 c2 ...): three rounds of it are nearly its solution.
+    covariance = raw
+    for _ in range(3):
+        covariance = raw + share * max(covariance[0] + 2 * covariance[1:].sum(), 0.0)
+    return covariance[1:] / max(covariance[0], std**2)
+
+
+def keep_longest(missing):
+    """All but the first of the longest stretches of recorded samples of each waveform."""
+    lost = np.ones_like(missing)
+    for w, column in enumerate(missing.T):
+        stretches = [(first - end, first, end) for _, first, end in find_stretches(~column[None])]
+        if stretches:
+            _, first, end = min(stretches)
+            lost[first:end, w] = False
+    return lost
+
+
+def measure_recovery(signal, noise, reach, limit):
+    """Samples after strong signal until which quiet samples move baselines away from those before the signal."""
+    s, n = signal.shape
+    above = signal - noise.level
+    width = limit * np.hypot(np.sqrt(6) / 4 * noise.std, min(noise.spread, noise.std)) + 0.25
+    quiet = find_quiet(above, width, reach)
+    strong = np.abs(np.stack([naive.smooth_121(column) for column in above.T], axis=1)) > 3 * width
+    known = []
+    for w in range(n):
+        before = next((i for i in range(s) if not quiet[i, w]), s)
+        if before >= 4 and strong[:, w].any():
+            known.append((above[:, w].max(), w, before))
+    if len(known) < 100:
+        return 0
+    middle = np.median([peak for peak, _, _ in known])
+    known = [(w, before) for peak, w, before in known if peak >= middle]
+    alone = min(noise.spread, noise.std / np.sqrt(np.median([before for _, before in known])))
+    least = min(max(alone, 0.1), 0.2) * max(noise.std, 1.0)
+    step = max(reach, 1)
+    for after in range(0, s + step, step):
+        moved = []
+        for w, before in known:
+            used = above[:before, w].tolist()
+            last = None
+            for i in range(s):
+                last = i if strong[i, w] else last
+                if last is not None and quiet[i, w] and (i - last) // step >= after // step:
+                    used.append(above[i, w])
+            moved.append(np.mean(used) - np.mean(above[:before, w]))
+        if abs(np.mean(moved)) <= max(least, 4 * np.std(moved) / np.sqrt(len(moved))):
+            return after
+    return s // step * step + step
+
+
+def residual_noise(residual, used, lost, lags):
+    """Standard deviation and correlation of limited residuals about their common mean."""
+    values = residual[used].astype(float)
+    low, middle, high = np.quantile(values, [0.1587, 0.5, 0.8413])
+    wide = 7 * max(0.5 * (high - low), QUANTISATION_STD)
+    spread = np.sqrt(np.mean([min(max(v - middle, -wide), wide) ** 2 for v in values]))
+    limit = 3.5 * max(spread, QUANTISATION_STD)
+    kept = np.clip(residual.astype(float) - middle, -limit, limit)
+    kept -= kept[used].mean()
+    covariance = []
+    for lag in range(lags + 1):
+        products = [
+            kept[w, i] * kept[w, i + lag]
+            for w in range(len(kept))
+            for i in range(kept.shape[1] - lag)
+            if used[w, i] and used[w, i + lag]
+        ]
+        covariance.append(np.mean(products) + (lost[lag] if lag < len(lost) else 0.0))
+    return np.sqrt(covariance[0]), np.array(covariance[1:]) / covariance[0]
+
+
+def colour_factors(correlation, *columns):
+    """Errors of a white-weighted fit in coloured noise over those in white noise: by the covariance of its result."""
+    size = len(columns[0])
+    colour = np.eye(size)
+    for i in range(size):
+        for j in range(size):
+            lag = abs(i - j)
+            if lag:
+                colour[i, j] = correlation[lag - 1] if lag <= len(correlation) else 0.0
+    factors = []
+    for chosen in (columns[:1], columns):
+        inverse = np.linalg.pinv(np.stack(chosen, axis=1))
+        coloured, white = (np.diag(inverse @ matrix @ inverse.T) for matrix in (colour, np.eye(size)))
+        factors += np.sqrt(coloured / white).tolist()
+    return tuple(factors)
+
+
+def wiener(waveform, taps, noise_to_signal):
+    """One waveform deconvolved by the linear estimate of least mean square error for white signal and noise."""
+    pulse = naive.pulse_matrix(len(waveform), taps)
+    inverse = pulse.T @ np.linalg.inv(pulse @ pulse.T + noise_to_signal * np.eye(len(waveform)))
+    return inverse @ waveform
+
+
+def fit_height(profile, waveform, taps, support):
+    """One profile scaled so that its sum of pulses has the energy of the waveform over the support."""
+    made = (naive.pulse_matrix(len(waveform), taps) @ profile)[support].sum()
+    return profile * (max(waveform[support].sum(), 0.0) / made if made > 0 else 0.0)
+
+
+def within_waveforms(signal, quiet):
+    """Standard deviation of quiet samples about the mean of their waveform, of waveforms with eight of them or more."""
+    parts = [y[used] for y, used in zip(signal.T.astype(float), quiet.T, strict=True) if used.sum() >= 8]
+    squares = sum(np.sum((part - part.mean()) ** 2) for part in parts)
+    return max(np.sqrt(squares / sum(len(part) - 1 for part in parts)), QUANTISATION_STD)
+
+
+def smoothed_within(signal, quiet):
+    """The same of smoothed samples whose neighbours are quiet too, as the standard deviation of white noise."""
+    squares = freedom = 0
+    for y, used in zip(signal.T.astype(float), quiet.T, strict=True):
+        smoothed = naive.smooth_121(y)
+        inside = [smoothed[i] for i in range(1, len(y) - 1) if used[i - 1 : i + 2].all()]
+        if inside:
+            squares += np.sum((np.array(inside) - np.mean(inside)) ** 2)
+            freedom += len(inside) - 1
+    return np.sqrt(squares / freedom) / (np.sqrt(6) / 4)
+
+
+def split_variance(signal, level, quiet, apart):
+    """Noise of a sample, and spread of levels by the products of quiet samples of a waveform far from each other."""
+    products = pairs = squares = number = 0
+    for y, used in zip(signal.T.astype(float) - level, quiet.T, strict=True):
+        count = used.sum()
+        if count < 2:
+            continue
+        squares, number = squares + np.sum(y[used] ** 2), number + count
+        for i in np.flatnonzero(used):
+            earlier = y[: max(i - apart, 0)][used[: max(i - apart, 0)]]
+            products, pairs = products + y[i] * earlier.sum() / count, pairs + len(earlier) / count
+    between = max(products / pairs, 0.0)
+    return max(np.sqrt(max(squares / number - between, 0.0)), QUANTISATION_STD), np.sqrt(between)
+
+
+def estimate_noise(signal, reach, limit=4.0, recovery=0, start=None):
+    """Level, std, std of smoothed samples, spread, share and correlation of quiet samples about one common level.
+
+    For levels that scatter by less than the noise, at least 50 waveforms, and none missing; `start`: (level, std,
+    spread) to begin with.
+    """
+    level, std, spread = start or (*first_level(signal), 0.0)
+    for _ in range(4):
+        width = limit * np.hypot(np.sqrt(6) / 4 * std, spread) + 0.25
+        quiet = find_quiet(signal - level, width, reach, recovery)
+        last = level, std, spread
+        level = signal[quiet].astype(float).mean()
+        std, spread = split_variance(signal, level, quiet, reach)
+        if max(abs(new - old) for new, old in zip((level, std, spread), last, strict=True)) < 0.001 * std:
+            break
+    smoothed = smoothed_within(signal, quiet) * std / within_waveforms(signal, quiet)
+    return level, std, smoothed, spread, quiet.mean(), correlate_quiet(signal.astype(float), quiet, std, 12)
+
+
+def estimate_drifting(signal, reach, limit=4.0):
+    """The same for levels that scatter by more than the noise: each waveform's level is found from itself."""
+    quartile = np.array([sorted(y)[len(y) // 4] for y in signal.T.astype(float)])
+    below = (signal - quartile)[signal < quartile]
+    std = max(np.sqrt(np.mean(below**2)) / 0.773, QUANTISATION_STD)
+    for _ in range(4):
+        found = [find_level(y, std, reach, limit) for y in signal.T.astype(float)]
+        levels, quiet = np.array([one for one, _ in found]), np.stack([used for _, used in found], axis=1)
+        std = within_waveforms(signal, quiet)
+    number = quiet.sum(axis=0)
+    known = levels[number >= 8]
+    scatter = np.var(known) - std**2 * np.mean(1 / number[number >= 8])
+    correlation = correlate_quiet(signal.astype(float), quiet, std, 12)
+    return known.mean(), std, smoothed_within(signal, quiet), np.sqrt(max(scatter, 0.0)), quiet.mean(), correlation

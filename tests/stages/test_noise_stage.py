@@ -1,0 +1,38 @@
+"""Baselines of noise.pooled are those that a loop over waveforms finds from their quiet samples."""
+
+from dataclasses import replace
+
+import naive_signal
+import numpy as np
+import pytest
+
+from wavebatch.core.waveforms import SystemPulse, WaveformBlock
+from wavebatch.stages.chain import STAGES
+
+SYSTEM = SystemPulse(2.0, baseline=12.0, baseline_spread=0.5, noise_std=1.1)
+
+
+def record(rng, n=60, s=80):
+    """Whole counts with an echo and its slow tail in each waveform."""
+    x = np.arange(s)
+    time = rng.uniform(15, 40, (n, 1))
+    y = 12 + 0.5 * rng.standard_normal((n, 1)) + 1.1 * rng.standard_normal((n, s))
+    y += 80 * np.exp(-0.5 * ((x - time) / 2.0) ** 2) + 2.5 * (x > time) * np.exp(-np.maximum(x - time, 0) / 20)
+    return WaveformBlock.from_samples(np.clip(np.rint(y), 0, 255).astype(np.uint8))
+
+
+@pytest.mark.parametrize("recovery", [0.0, 25.0])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_baselines_are_those_of_a_loop(rng, recovery, gaps):
+    block = record(rng)
+    missing = np.zeros(block.samples.shape, bool)
+    missing[:, 70:] = gaps
+    block = replace(block, missing=missing) if gaps else block
+    noise = STAGES["noise.pooled"].function(block, replace(SYSTEM, recovery=recovery))
+    width = 3.5 * np.hypot(np.sqrt(6) / 4 * 1.1, 0.5)
+    for w, waveform in enumerate(block.samples.astype(float) - 12):
+        quiet = naive_signal.find_quiet(waveform[:, None].astype(np.float32), width, 6, int(recovery))[:, 0]
+        quiet &= ~missing[w]
+        trust = 0.25 / (0.25 + 1.1**2 / max(quiet.sum(), 1)) if quiet.any() else 0.0
+        assert noise.baseline[w] == pytest.approx(12 + trust * waveform[quiet].mean() if quiet.any() else 12, abs=1e-4)
+    assert noise.std == pytest.approx(1.1)

@@ -1,0 +1,299 @@
+"""What contradicts a calibration shows: brightness over the swath, other settings, contradicting options."""
+
+import json
+import struct
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import wavebatch as wb
+from tests import footprints
+from tests.facet_strips import EAST, NORTH, START, Facet, Sensor, box, path_of, write_strip, write_trajectory
+from tests.footprints import Flight, Plane
+from wavebatch.cli import main
+from wavebatch.core.errors import InputError
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.surveying import sensor
+from wavebatch.surveying.calibrating.calibration_file import format_calibration, load_calibration, parse_calibration
+
+LIGHT = 1.2e8
+BASE = {"speed": 30.0, "rate": 10_000.0, "half_angle": 12.0}
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, list(map(str, arguments)))
+
+
+def fields(x, y):
+    """Fields of 20 m with reflectances of 0.1 to 0.6."""
+    i, j = np.floor(x / 20), np.floor(y / 20)
+    return 0.1 + 0.5 * np.abs(np.sin(12.9898 * i + 78.233 * j) * 43758.5453 % 1.0)
+
+
+GROUND = [Facet(0.3, inside=box(40, 0, 60, 20)), Facet(fields)]
+
+
+def write_targets(path, more=""):
+    x0, y0 = EAST + 41, NORTH + 1
+    corners = f"{x0} {y0} {x0 + 18} {y0} {x0 + 18} {y0 + 18} {x0} {y0 + 18}"
+    name, value = more.split("=") if more else ("", "")
+    path.write_text(f"name,reflectance,vertices{more and ',' + name}\nfield,0.3,{corners}{more and ',' + value}\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def dim_edges(tmp_path_factory):
+    """Two strips that overlap by two thirds; their light falls by 25 % to the edge of the swath."""
+    folder = tmp_path_factory.mktemp("edges")
+    write_strip(folder / "a.las", GROUND, Sensor(**BASE, light=LIGHT, falloff=0.25), 18_000, seed=11)
+    other = Sensor(**BASE, light=LIGHT, falloff=0.25, start=(128, 100), heading=270.0, time=START + 600)
+    write_strip(folder / "b.las", GROUND, other, 18_000, seed=12)
+    write_targets(folder / "t.csv")
+    return folder
+
+
+def calibrate(folder, *options, strips=("a.las", "b.las")):
+    paths = [folder / name for name in strips]
+    done = call("calibrate", *paths, "--targets", folder / "t.csv", "-o", folder / "cal.toml", "--overwrite", *options)
+    assert done.exit_code == 0, done.output
+    return load_calibration(folder / "cal.toml"), done.stderr
+
+
+def offsets(folder, out, column="level_reflectance"):
+    """Reflectance of the ground in both strips over the truth, less 1, and the error that gamma states; f8 (2, n)."""
+    columns = f"{column},backscatter_coefficient,backscatter_coefficient_err"
+    run(folder, out, "a.las", "b.las", "--columns", columns)
+    parts = []
+    for name in "ab":
+        cloud = wb.read_cloud(out / f"{name}.laz")
+        x, y = cloud["x"] - EAST, cloud["y"] - NORTH
+        inside = (np.abs(x % 20 - 10) < 9) & (np.abs(y % 20 - 10) < 9)
+        target = (x >= 40) & (x < 60) & (y >= 0) & (y < 20)
+        off = cloud[column] / np.where(target, 0.3, fields(x, y)) - 1
+        stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
+        parts.append(np.stack([off, stated])[:, inside & np.isfinite(off)])
+    return np.concatenate(parts, axis=1)
+
+
+def run(folder, out, *arguments):
+    strips = [folder / one if str(one).endswith(".las") else one for one in arguments]
+    done = call("run", *strips, "-o", out, "--calibration", folder / "cal.toml", "--overwrite")
+    assert done.exit_code == 0, done.output
+    return done.stderr
+
+
+def test_brightness_that_falls_across_the_swath_is_named_and_in_the_errors(tmp_path, dim_edges):
+    found, said = calibrate(dim_edges)
+    assert "brightness changes with the scan angle by" in said and "fit it with --scan-angle" in said
+    assert found.channels[0].relative_error > 0.1 and all(row.relative_error > 0.1 for row in found.strips)
+    off, stated = offsets(dim_edges, tmp_path)
+    assert off.min() < -0.15
+    assert 0.5 < np.mean(np.abs(off) < stated) < 0.9
+
+
+def test_the_term_over_the_scan_angle_is_fitted_kept_drawn_and_applied(tmp_path, dim_edges):
+    page = tmp_path / "page.html"
+    found, said = calibrate(dim_edges, "--scan-angle", "--html", page)
+    assert "scan angle: -2" in said and "brightness changes" not in said
+    assert "Light from 0 to 12" in page.read_text()
+    assert np.degrees(found.swath[0]) == pytest.approx(12.3, abs=0.2)
+    assert np.exp(-sum(found.swath[1:])) == pytest.approx(0.75, abs=0.03)
+    assert parse_calibration(format_calibration(found), "again").swath == pytest.approx(found.swath)
+    assert found.channels[0].relative_error < 0.04
+    off, _ = offsets(dim_edges, tmp_path)
+    assert abs(np.median(off)) < 0.01 and np.quantile(np.abs(off), 0.9) < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("falloff", "slope", "seed"), [(0.1, (0.0, 0.2), 21), (0.2, (0.35, 0.1), 22), (0.0, (0.1, 0.1), 23)]
+)
+def test_hillsides_under_dim_edges_have_errors_that_hold_and_a_term_that_is_right(tmp_path, falloff, slope, seed):
+    ground = [replace(facet, slope=slope) for facet in GROUND]
+    a = Sensor(**BASE, light=LIGHT, falloff=falloff)
+    write_strip(tmp_path / "a.las", ground, a, 20_000, seed=seed)
+    b = replace(a, start=(128, 100), heading=270.0, time=START + 600)
+    write_strip(tmp_path / "b.las", ground, b, 20_000, seed=seed + 10)
+    write_targets(tmp_path / "t.csv")
+    _, said = calibrate(tmp_path)
+    assert ("brightness changes with the scan angle" in said) == (falloff > 0)
+    off, stated = offsets(tmp_path, tmp_path / "plain", "reflectance")
+    assert np.mean(np.abs(off) < stated) > 0.5
+    found, _ = calibrate(tmp_path, "--scan-angle")
+    assert np.exp(-sum(found.swath[1:])) == pytest.approx(1 - falloff, abs=0.03)
+    off, _ = offsets(tmp_path, tmp_path / "fitted", "reflectance")
+    assert abs(np.median(off)) < 0.005 and np.quantile(np.abs(off), 0.9) < 0.03
+
+
+def test_a_term_over_the_scan_angle_needs_overlap(dim_edges):
+    done = call("calibrate", dim_edges / "a.las", "--targets", dim_edges / "t.csv", "-o", dim_edges / "none.toml",
+                "--scan-angle")  # fmt: skip
+    assert done.exit_code == 1 and "the overlaps do not show the light at the edge of the swath to 5 %" in done.stderr
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A strip, its targets and its calibration."""
+    folder = tmp_path_factory.mktemp("setting")
+    write_strip(folder / "a.las", GROUND, SENSOR, 10_000, seed=1)
+    write_targets(folder / "t.csv")
+    calibrate(folder, "--divergence", 0.5, strips=["a.las"])
+    return folder
+
+
+SENSOR = Sensor(**BASE, light=LIGHT)
+
+
+def test_another_strip_of_the_same_setting_runs_without_a_word(tmp_path, calibrated):
+    other = replace(SENSOR, start=(-30.0, 20.0), time=START + 600)
+    write_strip(tmp_path / "b.las", GROUND, other, 6000, seed=2)
+    assert "warning" not in run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    found = load_calibration(calibrated / "cal.toml")
+    assert found.rate == pytest.approx(10_000.0, rel=1e-3)
+    assert found.channels[0].noise_dn == pytest.approx(0.65, abs=0.1) and found.channels[0].brightest > 1e7
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "growth"),
+    [
+        ({"rate": 20_000.0, "line_rate": 50.0, "light": 0.5 * LIGHT}, "so another energy: 2e+04", 0.69),
+        ({"light": 0.5 * LIGHT, "noise": 0.3}, "noise of digitizer 1 is [DN] 0.", 0.5),
+        ({"light": 0.5 * LIGHT}, "another gain, or other surfaces: light of digitizer 1", 0.45),
+    ],
+)
+def test_another_setting_under_the_same_header_is_named_and_in_the_error(tmp_path, calibrated, change, said, growth):
+    write_strip(tmp_path / "b.las", GROUND, replace(SENSOR, **change), 6000, seed=3)
+    line = run(calibrated, tmp_path / "out", tmp_path / "b.las")
+    assert said in line and "the error of the constant grows by" in line
+    cloud = wb.read_cloud(tmp_path / "out" / "b.laz")
+    stated = cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"]
+    assert np.nanmedian(stated) == pytest.approx(growth, abs=0.1)
+
+
+def test_reflectances_above_one_are_one_line_whatever_the_reason(tmp_path, calibrated):
+    wrong = write_targets(tmp_path / "t.csv")
+    wrong.write_text(wrong.read_text().replace("field,0.3", "field,0.9"))
+    assert call("calibrate", calibrated / "a.las", "--targets", wrong, "-o", tmp_path / "cal.toml").exit_code == 0
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml", "-q")
+    assert done.exit_code == 0 and "of the reflectances exceed 1, that of a white matt surface" in done.stderr
+    report = json.loads((tmp_path / "a.report.json").read_text())
+    assert 0.1 < report["quality"]["reflectance_above_one"] / report["counts"]["echoes"] < 1
+    assert "exceed 1" not in run(calibrated, tmp_path / "right", "a.las")
+
+
+def test_a_constant_without_an_error_is_named(tmp_path, calibrated):
+    text = (calibrated / "cal.toml").read_text()
+    error = load_calibration(calibrated / "cal.toml").relative_error
+    (tmp_path / "cal.toml").write_text(text.replace(f"relative_error = {error!r}", "relative_error = 0.0"))
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", tmp_path / "cal.toml")
+    assert "its relative_error is 0, but no constant is known exactly" in done.stderr
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3])
+def test_a_trajectory_that_is_late_is_named_and_in_the_error(tmp_path, calibrated, late):
+    moved = replace(SENSOR, time=SENSOR.time + late)
+    trajectory = write_trajectory(tmp_path / "t.csv", moved, 1.0)
+    options = ("--trajectory", trajectory, "--columns", "range,range_error", "-v")
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", calibrated / "cal.toml", *options)
+    assert done.exit_code == 0, done.output
+    assert ("the trajectory is 9.0 m behind the packets' vectors" in done.output) == bool(late)
+    cloud = wb.read_cloud(tmp_path / "a.laz")
+    true = np.linalg.norm(np.stack([cloud[name] for name in "xyz"], 1) - sensor_of(cloud["gps_time"]), axis=1)
+    off = np.abs(cloud["range"] - true)
+    assert np.mean(off < cloud["range_error"]) > 0.5 and np.nanmedian(cloud["range_error"]) < (1.0 if late else 0.1)
+
+
+def sensor_of(time):
+    return path_of(SENSOR, time - SENSOR.time) + [EAST, NORTH, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [(0.8, "--attenuation 0.8 dB/km contradicts the 0.22 dB/km"), (0.3, "light changes by +3 %"), (0.22, "")],
+)
+def test_other_air_on_the_day_of_the_calibration_is_named_and_in_the_error(tmp_path, calibrated, given, said):
+    columns = "backscatter_coefficient,backscatter_coefficient_err"
+    line = run(calibrated, tmp_path, "a.las", "--attenuation", given, "--columns", columns)
+    assert said in line and ("contradicts" in line) == bool(said)
+    cloud = wb.read_cloud(tmp_path / "a.laz")
+    stated = np.nanmedian(cloud["backscatter_coefficient_err"] / cloud["backscatter_coefficient"])
+    assert stated == pytest.approx(np.hypot(0.031, 4.6e-4 * 703 * (given - 0.22)), abs=0.004)
+
+
+def test_an_attenuation_per_metre_is_refused(tmp_path, calibrated):
+    done = call("run", calibrated / "a.las", "-o", tmp_path, "--calibration", calibrated / "cal.toml",
+                "--attenuation", 0.0003)  # fmt: skip
+    assert done.exit_code == 2 and "less than any air has near the ground; is it per metre?" in done.stderr
+    done = call("calibrate", calibrated / "a.las", "--targets", calibrated / "t.csv", "-o", tmp_path / "c.toml",
+                "--attenuation", 0.0003)  # fmt: skip
+    assert done.exit_code == 2 and "is it per metre?" in done.stderr
+
+
+def test_an_incidence_that_contradicts_the_plane_of_the_target_is_refused(tmp_path, calibrated):
+    targets = write_targets(tmp_path / "t.csv", "incidence=50")
+    done = call("calibrate", calibrated / "a.las", "--targets", targets, "-o", tmp_path / "cal.toml")
+    assert done.exit_code == 1 and "its incidence of 50 deg contradicts the plane of its echoes" in done.stderr
+    right = write_targets(tmp_path / "r.csv", "incidence=3")
+    assert call("calibrate", calibrated / "a.las", "--targets", right, "-o", tmp_path / "cal.toml").exit_code == 0
+
+
+@pytest.mark.parametrize("scatter", [0.02, 0.08])
+def test_energies_of_other_pulses_are_noticed(rng, scatter):
+    ground = np.where(np.arange(4000) // 40 % 2, 0.1, 0.5)
+    energy = 1 + scatter * rng.standard_normal(4000)
+    light = ground * energy * (1 + 0.02 * rng.standard_normal(4000))
+    assert judge_energies(light, 7.5 * energy) == ""
+    assert "one pulse too late" in judge_energies(light, np.roll(energy, 1))
+    assert "one pulse too early" in judge_energies(light, np.roll(energy, -1))
+    assert "they are of other pulses" in judge_energies(light, rng.permutation(energy))
+    assert judge_energies(light, np.ones(4000)) == judge_energies(light, np.full(4000, np.nan)) == ""
+
+
+def test_a_shuffled_log_of_energies_is_refused(tmp_path, rng):
+    truth = footprints.write_strip(tmp_path / "s.las", [Plane()], Flight(energy_spread=0.05), 2000)
+    shuffled = zip(truth.gps_time, rng.permutation(truth.energy), strict=True)
+    (tmp_path / "e.csv").write_text("time,energy\n" + "\n".join(f"{time:.9f},{one:.6f}" for time, one in shuffled))
+    options = ("--columns", "+amplitude_normalized", "--energy", tmp_path / "e.csv")
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", *options)
+    assert done.exit_code == 4 and "--energy e.csv contradicts the strip" in done.stderr
+
+
+def test_degrees_without_a_crs_are_named(tmp_path):
+    write_strip(tmp_path / "s.las", GROUND, SENSOR, 400)
+    content = bytearray((tmp_path / "s.las").read_bytes())
+    struct.pack_into("<3d", content, 131, 1e-8, 1e-8, 1e-3)
+    struct.pack_into("<3d", content, 155, 11.0, 48.0, 0.0)
+    struct.pack_into("<6d", content, 179, 11.003, 10.999, 48.004, 47.996, 1.0, -1.0)
+    (tmp_path / "s.las").write_bytes(content)
+    done = call("run", tmp_path / "s.las", "-o", tmp_path / "out", "--columns", "range")
+    assert done.exit_code == 4 and "coordinates look like degrees" in done.stderr
+
+
+def test_feet_with_metric_vectors_are_refused_whatever_the_crs_says(tmp_path, calibrated, monkeypatch):
+    monkeypatch.setattr(sensor, "measure_scale", lambda reader, scan: 3.281)
+    metres = SimpleNamespace(is_metric=True, horizontal=1.0)
+    with StripReader(calibrated / "a.las") as reader, reader.scan() as scan:
+        facts = SimpleNamespace(path="a.las", units=[metres], header=reader.facts.header)
+        with pytest.raises(InputError, match="coordinates are in feet, packet vectors in metres"):
+            sensor.refuse_units(SimpleNamespace(facts=facts), scan)
+
+
+def test_reflectances_that_were_measured_from_aside_get_the_hot_spot(tmp_path, calibrated):
+    plain = load_calibration(calibrated / "cal.toml").channels[0]
+    found = {}
+    for more in ("geometry=backscatter", "geometry=hemispherical"):
+        targets = write_targets(tmp_path / "t.csv", more)
+        options = ("--targets", targets, "-o", tmp_path / "c.toml", "--divergence", 0.5, "--overwrite")
+        assert call("calibrate", calibrated / "a.las", *options).exit_code == 0
+        found[more] = load_calibration(tmp_path / "c.toml").channels[0]
+    aside = found["geometry=hemispherical"]
+    assert found["geometry=backscatter"].constant == plain.constant
+    assert aside.constant / plain.constant == pytest.approx(1 + 0.25 * 0.3 / 0.5)
+    assert aside.relative_error == pytest.approx(np.hypot(plain.relative_error, 0.5 * 0.15 / 1.15), rel=0.01)
+    done = call("calibrate", calibrated / "a.las", "--targets", write_targets(tmp_path / "t.csv", "geometry=8/d"),
+                "-o", tmp_path / "d.toml")  # fmt: skip
+    assert done.exit_code == 2 and "geometry must be backscatter or directional or hemispherical" in done.stderr

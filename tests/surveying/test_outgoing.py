@@ -1,0 +1,165 @@
+"""The pulse that was sent against the pulse that echoes show: which is taken, and energies without being asked for."""
+
+import numpy as np
+import pytest
+
+from wavebatch.core.errors import ConfigError
+from wavebatch.core.units import FWHM_PER_SIGMA
+from wavebatch.core.waveforms import Digitizer, SystemPulse
+from wavebatch.files.las.extra_bytes import ExtraRecord
+from wavebatch.files.pulse_energy import find_pulse_energy, read_blocks
+from wavebatch.files.strip.reader import StripReader
+from wavebatch.files.strip.writer import FullwaveWriter
+from wavebatch.kernels.signal.outgoing import find_reference, measure_outgoing
+from wavebatch.surveying import Survey
+from wavebatch.surveying.outgoing import compare_outgoing, learn_shape, save_outgoing
+from wavebatch.surveying.system_file import SavedSurvey, format_survey
+from wavebatch.tools.voxels.strip import VoxelOptions, voxelize_strip
+
+
+def _samples(rng, number, sigma, tail=0.0):
+    """Outgoing pulses of 4 samples of noise each, with a tail of this share."""
+    centre = 12 + rng.uniform(-0.5, 0.5, number)
+    lag = np.arange(48) - centre[:, None]
+    clean = np.exp(-0.5 * (lag / sigma) ** 2) + tail * (lag > 0) * np.exp(-np.maximum(lag, 0) / (3 * sigma))
+    return np.clip(np.round(6 + 170 * clean + rng.normal(0, 0.7, clean.shape)), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [1.2, 2.0, 4.0])
+@pytest.mark.parametrize("tail", [0.0, 0.1])
+def test_the_stacked_pulse_is_as_wide_as_what_was_sent(rng, sigma, tail):
+    samples = _samples(rng, 800, sigma, tail)
+    shape = learn_shape(samples, 0.5, find_reference(samples))
+    lag = np.linspace(-40, 40, 80_001)
+    pulse = np.exp(-0.5 * (lag / sigma) ** 2) + tail * (lag > 0) * np.exp(-np.maximum(lag, 0) / (3 * sigma))
+    above = lag[pulse > 0.5 * pulse.max()]
+    assert shape.fwhm == pytest.approx(0.5 * (above[-1] - above[0]), rel=0.03)
+
+
+def test_recordings_without_a_pulse_have_no_energy(rng):
+    noise = np.round(6 + rng.normal(0, 0.7, (200, 48))).astype(np.uint8)
+    assert find_reference(noise) is None
+    samples = _samples(rng, 200, 2.0)
+    reference = find_reference(samples)
+    found = measure_outgoing(np.concatenate([samples, noise]), reference)
+    assert np.isfinite(found.energy[:200]).all() and np.isnan(found.energy[200:]).all()
+    assert learn_shape(noise, 1.0, reference) is None
+
+
+@pytest.fixture
+def sent(tmp_path, rng):
+    """Writes the system file of outgoing pulses beside strip.las."""
+    samples = _samples(rng, 400, 2.0)
+    shape = learn_shape(samples, 1.0, find_reference(samples))
+
+    def write(same_receiver=True):
+        saved = save_outgoing(shape, find_reference(samples), 1.0, 8, "a.pls", {}, same_receiver=same_receiver)
+        (tmp_path / "strip.system.toml").write_text(format_survey(saved))
+        return tmp_path / "strip.las", shape.fwhm
+
+    return write
+
+
+def _echoes(fwhm, learned=True):
+    figures = {"misfit_1_gaussians": 0.01} if learned else {}
+    return Survey(SystemPulse(fwhm / FWHM_PER_SIGMA, components=((1.0, 0.0, 1.0), (0.1, 3.0, 1.0))), 500, figures, ())
+
+
+@pytest.mark.parametrize(
+    ("ratio", "learned", "same", "taken", "reason"),
+    [(1.01, True, True, False, "both agree"), (1.4, True, True, True, "targets widened"),
+     (1.1, True, False, True, "targets widened"), (1.4, True, False, False, "receiver is slower"),
+     (0.9, True, True, False, "echoes are narrower"), (1.3, False, False, True, "too few echoes")],
+)  # fmt: skip
+def test_the_pulse_that_is_taken_and_why(sent, ratio, learned, same, taken, reason):
+    strip, fwhm = sent(same)
+    before = _echoes(ratio * fwhm, learned)
+    found = compare_outgoing(before, strip)
+    decision = found.decisions[-1]
+    assert decision.needed == taken and reason in decision.reason
+    width = fwhm if taken else ratio * fwhm
+    assert found.system.sigma_ref * FWHM_PER_SIGMA == pytest.approx(width)
+    assert (found.system.components == before.system.components) != taken
+    assert found.figures["sent_fwhm_ns"] == pytest.approx(fwhm)
+    # A survey that is saved under the same name is not taken for outgoing pulses.
+    strip.with_suffix(".system.toml").write_text(format_survey(SavedSurvey(found)))
+    assert compare_outgoing(before, strip) is before
+
+
+def test_without_a_file_of_outgoing_pulses_nothing_changes(tmp_path, sent):
+    before = _echoes(4.0)
+    assert compare_outgoing(before, tmp_path / "other.las") is before
+    strip, _ = sent()
+    strip.with_suffix(".system.toml").write_text("x = ")
+    with pytest.raises(ConfigError, match=r"strip\.system\.toml"):
+        compare_outgoing(before, strip)
+
+
+def _strip(path, energies):
+    records = [ExtraRecord.build("pulse_energy", "f4", ""), ExtraRecord.build("pulse_energy_err", "f4", "")]
+    n, time = len(energies), np.arange(60)
+    writer = FullwaveWriter(path, point_format=9, internal=True, digitizers=[Digitizer(1, 8, 60, 1.0)],
+                            extra_bytes=records)  # fmt: skip
+    height = 100 * np.nan_to_num(energies, nan=1.0)
+    samples = np.round(5 + height[:, None] * np.exp(-0.5 * ((time - 20) / 2.0) ** 2)).astype(np.uint8)
+    with writer:
+        points = np.zeros(n, writer.dtype)
+        points["wavepacket_offset"] = writer.write_packets(samples, 1)
+        points["wavepacket_index"], points["wavepacket_size"] = 1, 60
+        points["gps_time"], points["X"] = np.arange(n) * 1e-5, np.arange(n) * 300 + 150
+        points["bit_fields"], points["z_t"] = 0x11, 0.000149896
+        points["return_point_wave_location"] = 20_000
+        points["pulse_energy"], points["pulse_energy_err"] = 3 * energies, 0.03
+        writer.write_points(points)
+        writer.commit()
+    return path
+
+
+@pytest.fixture
+def strip(tmp_path, rng):
+    """Pulses of various energies, a tenth of them unknown."""
+    energies = np.round(1 + 0.2 * rng.standard_normal(400), 4).clip(0.4, 1.8)
+    energies[::10] = np.nan
+    return _strip(tmp_path / "s.las", energies), energies
+
+
+def _filled(path, request):
+    with StripReader(path) as reader, reader.scan() as scan:
+        energy = find_pulse_energy(reader, scan, request)
+        blocks = list(read_blocks(reader, scan, 128, energy))
+    if energy is None:
+        assert all(block.pulse_energy is None for block in blocks)
+        return None
+    return (np.concatenate([getattr(block, name) for block in blocks]) for name in ("pulse_energy", "pulse_energy_err"))
+
+
+def test_the_column_of_an_import_is_used_without_being_asked_for(strip):
+    path, energies = strip
+    energy, error = _filled(path, None)
+    known, mean = np.isfinite(energies), np.nanmean(energies)
+    assert np.allclose(energy[known], energies[known] / mean, atol=1e-6) and np.allclose(error[known], 0.01 / mean)
+    # An unknown one counts as it would without the column: mean energy, known to what it varies by.
+    assert np.all(energy[~known] == 1) and np.allclose(error[~known], np.nanstd(energies) / mean)
+    assert _filled(path, "none") is None
+    energy, _ = _filled(path, "pulse_energy")
+    assert np.isnan(energy[~known]).all()
+
+
+def test_a_column_that_knows_few_pulses_is_not_used_unless_asked_for(tmp_path):
+    path = _strip(tmp_path / "s.las", np.r_[np.ones(10), np.full(90, np.nan)])
+    assert _filled(path, None) is None
+    with pytest.raises(OSError, match="--energy pulse_energy knows 10 of 100"):
+        _filled(path, "pulse_energy")
+
+
+def test_voxels_are_divided_by_the_energies(strip, tmp_path):
+    path, energies = strip
+    sums = {}
+    for energy in (None, "none"):
+        voxelize_strip(path, tmp_path / f"{energy}.npz", VoxelOptions(size=0.3, energy=energy))
+        with np.load(tmp_path / f"{energy}.npz") as found:
+            column = found["index"][:, 0]
+            sums[energy] = np.bincount(column - column.min(), found["energy"])
+    known = np.isfinite(energies)
+    spread = {energy: values[: len(known)][known].std() / values[known].mean() for energy, values in sums.items()}
+    assert spread[None] < 0.03 < 0.15 < spread["none"]

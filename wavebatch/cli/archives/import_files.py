@@ -1,0 +1,94 @@
+"""`wavebatch import`: PulseWaves files as strips.
+
+Only reads options and prints; the work is in `wavebatch.tools.archives.import_file`.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from wavebatch.cli.messages import count, counting, print_json, printable, talk
+from wavebatch.cli.options import (
+    common_options,
+    for_each,
+    from_options,
+    name_outputs,
+    output_option,
+    recursive_option,
+)
+from wavebatch.cli.program.completion import complete_files
+from wavebatch.files.inputs import find_files
+from wavebatch.tools.archives.import_file import SUFFIXES, ImportOptions, ImportSummary, describe, import_file
+
+EXIT_SOME, EXIT_NONE = 3, 4
+"""Exit codes of `wavebatch run`: some files failed; no file was written."""
+
+
+@click.command("import")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", shell_complete=complete_files)
+@recursive_option
+@output_option("Strip to write, .las or .laz, or a folder.  [default: X.las beside each X.pls]", "FILE|DIR",
+               required=False, folder=None)
+@click.option("--returns", type=click.Choice(["strongest", "detect"]), default="strongest", show_default=True,
+              help="strongest: one point per recorded segment, at its strongest sample; detect: one at each maximum "
+              "that stands out of the noise.")
+@click.option("--internal/--external", default=False,
+              help="Store packets in the strip or in a .wdp file beside it.  [default: external]")
+@click.option("--resume", is_flag=True, help="Skip files whose strip is there and up to date.")
+@common_options("overwrite", "json", "quiet")
+def import_(files: tuple[str, ...], output: Path | None, recursive: bool, **options: Any) -> None:
+    """Import PulseWaves FILEs (.pls with the .wvs beside it) as LAS 1.4 strips of point format 9.
+
+    FILE is a .pls, a glob, a folder, or @list.txt with one of these per line. A strip has the energy and the height of
+    every outgoing pulse as extra bytes, and X.system.toml beside it has the shape of these pulses. A file that is
+    damaged or cut gives one line and no output.
+
+    Exit code: 0 all written, 2 wrong usage, 3 some files failed, 4 no file was written.
+    """  # fmt: skip
+    paths = find_files(files, recursive=recursive, kinds=(SUFFIXES,))
+    targets = _name_strips(paths, output)
+    chosen = from_options(ImportOptions, options)
+    # A single file that fails is one line too, with the exit code of a batch.
+    results, failed = for_each(
+        paths, lambda path: _import(path, targets[path], chosen, options), debug=options["debug"], alone=True
+    )
+    if options["as_json"]:
+        print_json({"files": [describe(one) for one in results], "failed": failed})
+    sys.exit(0 if not failed else EXIT_SOME if results else EXIT_NONE)
+
+
+def _name_strips(paths: list[Path], output: Path | None) -> dict[Path, Path]:
+    if output is None:
+        return {path: path.with_suffix(".las") for path in paths}
+    if output.suffix.lower() not in (".las", ".laz"):
+        output.mkdir(parents=True, exist_ok=True)
+    return name_outputs(paths, output, (".las", ".laz"), ".las")
+
+
+def _import(path: Path, target: Path, chosen: ImportOptions, options: dict[str, Any]) -> ImportSummary:
+    bar = counting("pulses", options["quiet"])
+    with bar:
+        summary = import_file(path, target, chosen, bar.update)
+    if not options["quiet"]:
+        _say(summary)
+    return summary
+
+
+def _say(summary: ImportSummary) -> None:
+    if summary.skipped:
+        talk(f"{summary.output}: is up to date, skipped")
+        return
+    parts = (summary.points, "point"), (summary.packets, "packet"), (summary.pulses, "pulse")
+    points, packets, pulses = (count(*part) for part in parts)
+    talk(f"{summary.output}: {points} and {packets} of {pulses}")
+    sent = summary.outgoing
+    if sent is not None:
+        spread, error = 100 * sent["energy_scatter"], 100 * sent["energy_error"]
+        width = f"{sent['fwhm_ns']:.3f} ns wide at half maximum"
+        talk(f"{summary.output}: outgoing pulses {width}, energies vary by {spread:.2f} %, known to {error:.2f} %")
+    for note in summary.notes:
+        talk(printable(f"{summary.output}: {note}"))

@@ -1,0 +1,1 @@
+"""Reader of PulseWaves files (.pls with .wvs): header, descriptors, pulses and their waves."""

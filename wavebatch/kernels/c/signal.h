@@ -1,0 +1,247 @@
+/* Before the fit: levels, maxima and clusters of whole waveforms, docs/algorithms.md 1.1, 4.2 and H10. */
+
+typedef struct { /* candidates of waveforms; `room` of them fit */
+    int64_t room;
+    int64_t *waveform;
+    double *amplitude, *time, *width;
+} Candidates;
+
+typedef struct {
+    double threshold;                          /* least height in noise of one sample */
+    double width_ref, broad;                   /* of the pulse; of the Gaussian `taps`, 0 for [1 2 1]/4 twice */
+    const float *taps;                         /* half of a filter: the centre first */
+    int64_t reach;
+} Detector;
+
+typedef struct { float *signal, *smoothed, *even; uint8_t *marks; } Rows;
+
+static void free_rows(Rows *r) { free(r->signal); free(r->smoothed); free(r->even); free(r->marks); }
+
+static int reserve_rows(Rows *r, int64_t s) {
+    return enlarge(&r->signal, s * sizeof(float)) && enlarge(&r->smoothed, s * sizeof(float)) && enlarge(&r->even, s * sizeof(float))
+        && enlarge(&r->marks, s);
+}
+
+/* [1 2 1]/4 along the samples; the end samples are repeated outwards. */
+static void smooth_121(int64_t s, const float *restrict x, float *restrict out) {
+    for (int64_t i = 1; i + 1 < s; i++) out[i] = ((x[i - 1] + x[i + 1]) + x[i] + x[i]) * 0.25f;
+    int64_t last = s - 1, next = s > 1, before = s > 1 ? s - 2 : 0;
+    out[0] = ((x[0] + x[next]) + x[0] + x[0]) * 0.25f;
+    out[last] = ((x[last] + x[before]) + x[last] + x[last]) * 0.25f;
+}
+
+static void filter_symmetric(int64_t s, const float *x, const float *taps, int64_t reach, float *out) {
+    for (int64_t i = 0; i < s; i++) {
+        float sum = taps[0] * x[i];
+        for (int64_t d = 1; d <= reach; d++) sum += taps[d] * ((i >= d ? x[i - d] : 0) + (i + d < s ? x[i + d] : 0));
+        out[i] = sum;
+    }
+}
+
+/* A waveform above its level, with 0 where no sample was recorded; returns whether its counts differ. */
+static int read_signal(const Block *b, int64_t waveform, float *signal) {
+    const int64_t s = b->length, first = waveform * s;
+    int varies = 0;
+    read_counts(b, first, s, signal);
+    for (int64_t i = 1; i < s; i++) varies |= signal[i] != signal[0];
+    take_level(b, waveform, first, s, signal);
+    for (int64_t i = 0; i < s && b->missing; i++)
+        if (b->missing[first + i]) signal[i] = 0;
+    return varies;
+}
+
+/* Samples that are far from any signal: neither within `reach` of a smoothed sample beyond +-limit, nor within `recovery`
+   after one beyond three times that. Their mean above the baseline and their number, H10. */
+EXPORT int64_t quiet_levels(const Block *b, int64_t n, double limit, int64_t reach, int64_t recovery, float *mean, int32_t *number) {
+    const int64_t s = b->length;
+    const float busy = limit, strong = 3 * busy;
+    Rows r = {0};
+    int good = reserve_rows(&r, s);
+    for (int64_t w = 0; w < n && good; w++) {
+        read_counts(b, w * s, s, r.signal);
+        take_level(b, w, w * s, s, r.signal);
+        smooth_121(s, r.signal, r.smoothed);
+        int64_t blocked = -1, found = 0;
+        double total = 0;
+        for (int64_t i = 0; i < s; i++) {
+            float height = fabsf(r.smoothed[i]);
+            int64_t until = height > busy ? i + reach : -1;
+            if (height > strong && i + recovery > until) until = i + recovery;
+            blocked = until > blocked ? until : blocked;
+            r.marks[i] = i <= blocked || (b->missing && b->missing[w * s + i]);
+        }
+        blocked = s + reach;
+        for (int64_t i = s - 1; i >= 0; i--) {
+            if (fabsf(r.smoothed[i]) > busy) blocked = i;
+            if (r.marks[i] || i >= blocked - reach) continue;
+            total += r.signal[i];
+            found++;
+        }
+        mean[w] = found ? total / found : 0;
+        number[w] = found;
+    }
+    free_rows(&r);
+    return good ? 0 : -1;
+}
+
+/* The peak by a parabola through the logarithms of five smoothed samples, weighted by the signal; the width of the filter
+   [1 2 1]/4 is taken off. `width` where the parabola fails. docs/algorithms.md 4.1. */
+static void start_of(int64_t s, const float *y, int64_t place, double *amplitude, double *time, double *width) {
+    const double peak = y[place], floor = 0.05 * peak;
+    double sum[5] = {0}, product[3] = {0};
+    for (int d = -2; d <= 2; d++) {
+        int64_t at = place + d;
+        if (at < 0 || at >= s || !(y[at] > floor)) continue;
+        double weight = (double)y[at] * y[at], value = weight * log_double(y[at]), power = 1;
+        for (int q = 0; q < 5; q++, power *= d) {
+            sum[q] += weight * power;
+            if (q < 3) product[q] += value * power;
+        }
+    }
+    double m0 = sum[2] * sum[4] - sum[3] * sum[3], m1 = sum[1] * sum[4] - sum[2] * sum[3], m2 = sum[1] * sum[3] - sum[2] * sum[2];
+    double n1 = sum[0] * sum[4] - sum[2] * sum[2], n2 = sum[0] * sum[3] - sum[1] * sum[2];
+    double determinant = sum[0] * m0 - sum[1] * m1 + sum[2] * m2, inverse = fabs(determinant) > 1e-12 ? 1 / determinant : 0;
+    double c0 = (product[0] * m0 - product[1] * m1 + product[2] * m2) * inverse;
+    double c1 = (-product[0] * m1 + product[1] * n1 - product[2] * n2) * inverse;
+    double c2 = (product[0] * m2 - product[1] * n2 + product[2] * (sum[0] * sum[2] - sum[1] * sum[1])) * inverse;
+    double shift = c2 < -1e-4 ? -c1 / (2 * c2) : 2;
+    *time = place; *amplitude = 1.1 * peak;
+    if (!(fabs(shift) < 1.5)) return;
+    double narrow = sqrt(fmax(-1 / (2 * c2) - 0.5, 0.1));
+    *time = place + shift;
+    *amplitude = exp_double(fmin(fmax(c0 - c1 * c1 / (4 * c2), -20), 20)) * sqrt(1 + 0.5 / (narrow * narrow));
+    *width = narrow;
+}
+
+/* Peaks with a neighbour: time and height by a parabola through the logarithms of three samples. */
+static void refine_peak(int64_t s, const float *y, int64_t place, double *amplitude, double *time) {
+    *time = place; *amplitude = y[place];
+    if (place == 0 || place == s - 1 || !(y[place - 1] > 0 && y[place + 1] > 0)) return;
+    double a = log_double(y[place - 1]), b = log_double(y[place]), c = log_double(y[place + 1]), curve = a - 2 * b + c;
+    if (!(curve < -1e-12)) return;
+    double shift = fmin(fmax(0.5 * (a - c) / curve, -0.5), 0.5);
+    *time = place + shift;
+    *amplitude = exp_double(b - 0.25 * (a - c) * shift);
+}
+
+/* Whether a local maximum begins at sample i: a plateau counts once, at its first sample, but not at the first of all. */
+INLINE int is_peak(int64_t s, const float *y, int64_t i) {
+    if (i == 0) return s > 1 && y[1] < y[0];
+    int64_t ahead = i + 1;
+    while (ahead < s && y[ahead] == y[i]) ahead++;
+    return y[i] > y[i - 1] && (ahead == s || y[ahead] < y[i]);
+}
+
+/* Local maxima of smoothed waveforms `from` to n - 1 with starts for the fit, until their room ends: 1.1, max-detection.
+   Returns the first waveform that is not done, and in `found` the number of maxima; -1 where there is no memory. */
+EXPORT int64_t find_maxima(const Block *b, int64_t n, const Detector *d, int64_t from, Candidates *out, int64_t *found) {
+    const int64_t s = b->length;
+    const double ref = d->width_ref;
+    Rows r = {0};
+    int64_t w = reserve_rows(&r, s) ? from : -1, total = 0;
+    for (; w >= 0 && w < n; w++) {
+        const float least = (float)d->threshold * b->std[w];
+        int64_t here = total;
+        float highest = 0;
+        if (!read_signal(b, w, r.signal)) continue;
+        if (d->broad > 0) filter_symmetric(s, r.signal, d->taps, d->reach, r.smoothed);
+        else smooth_121(s, r.signal, r.smoothed);
+        for (int64_t i = 0; i < s; i++) highest = r.smoothed[i] > highest ? r.smoothed[i] : highest;
+        if (!(highest > least)) continue; /* one more pass only lowers it */
+        if (d->broad > 0) memcpy(r.even, r.smoothed, s * sizeof(float));
+        else smooth_121(s, r.smoothed, r.even);
+        for (int64_t i = 0; i < s && here < out->room; i++)
+            if (r.even[i] > least && is_peak(s, r.even, i)) { out->waveform[here] = w; out->time[here++] = i; }
+        if (here == out->room) break;
+        double after = INFINITY;
+        for (int64_t j = here - 1; j >= total; j--) {
+            int64_t place = (int64_t)out->time[j];
+            double before = j > total ? place - out->time[j - 1] : INFINITY, gap = fmin(before, after), width = ref;
+            after = before;
+            start_of(s, r.smoothed, place, &out->amplitude[j], &out->time[j], &width);
+            if (gap < 4 * ref) refine_peak(s, r.smoothed, place, &out->amplitude[j], &out->time[j]);
+            width = fmin(width, 0.5 * gap);
+            if (d->broad > 0) {
+                width = sqrt(fmax(width * width - d->broad * d->broad, 0.25 * ref * ref));
+                out->amplitude[j] *= sqrt(1 + d->broad * d->broad / (width * width));
+            }
+            out->width[j] = fmin(fmax(width, 0.7 * ref), 4 * ref);
+        }
+        total = here;
+    }
+    free_rows(&r);
+    *found = total;
+    return w;
+}
+
+static const double RUN_LEVEL = 2;             /* of a run, in noise of the smoothed signal: echoes on one are one cluster */
+
+typedef struct { int64_t margin, reach, most; const int64_t *tail; } Grouping;
+typedef struct { int64_t *waveform, *low, *high, *first, *number; } Groups;
+
+/* The run of signal above the noise that each of m candidates of one waveform stands on, and its sample. */
+static void find_extents(int64_t s, const float *smoothed, float level, int64_t m, const double *time, const int64_t *tail, int64_t *at,
+                         int64_t *low, int64_t *high) {
+    for (int64_t i = 0; i < m; i++) {
+        int64_t place = (int64_t)rint(fmin(fmax(time[i], 0), s - 1)), begin = place, end = place + 1;
+        if (smoothed[place] > level) {
+            if (i && place < high[i - 1] && place >= low[i - 1]) { begin = low[i - 1]; end = high[i - 1]; } /* the same run */
+            while (begin > 0 && smoothed[begin - 1] > level) begin--;
+            while (end < s && smoothed[end] > level) end++;
+        }
+        at[i] = place; low[i] = begin;
+        high[i] = end;
+    }
+    for (int64_t i = 0; i < m && tail; i++)
+        if (at[i] + tail[i] > high[i]) high[i] = at[i] + tail[i];
+}
+
+/* Candidates i .. end - 1 of one waveform as clusters, whose windows do not overlap; returns the number of clusters. */
+static int64_t group_waveform(const Grouping *g, int64_t s, int64_t waveform, int64_t i, int64_t end, const int64_t *at, const int64_t *low,
+                              const int64_t *high, Groups *out, int64_t number) {
+    int64_t furthest = 0, run = 0, before = -1;
+    for (int64_t j = i; j < end; j++) {
+        int joined = j > i && low[j] < furthest;
+        run = joined ? run + 1 : 0;
+        if (!joined || run % g->most == 0) {
+            int64_t first = low[j] - g->margin < at[j] - g->reach ? low[j] - g->margin : at[j] - g->reach;
+            if (before >= 0) { /* windows are cut half-way between the signals, or between candidates where signals meet */
+                int64_t here = at[j - 1] + 1, most = at[j] > here ? at[j] : here;
+                int64_t middle = (low[j] >= furthest ? low[j] + furthest : at[j] + here) / 2;
+                middle = middle < here ? here : middle > most ? most : middle;
+                if (out->high[before] > middle) out->high[before] = middle;
+                if (first < middle) first = middle;
+            }
+            first = first < 0 ? 0 : first;
+            out->waveform[number] = waveform; out->first[number] = j; out->number[number] = 0;
+            out->low[number] = first < at[j] ? first : at[j];
+            before = number++;
+        }
+        if (high[j] > furthest) furthest = high[j];
+        int64_t last = furthest + g->margin > at[j] + 1 + g->reach ? furthest + g->margin : at[j] + 1 + g->reach;
+        out->high[before] = last > s ? s : last;
+        out->number[before]++;
+    }
+    return number;
+}
+
+/* Joins m candidates, sorted by waveform and time, that stand on one run of signal above the noise: 4.2. A window that
+   reaches into its neighbour finds false echoes there. Returns the number of clusters; -1 where there is no memory. */
+EXPORT int64_t group_candidates(const Block *b, int64_t m, const int64_t *waveform, const double *time, const Grouping *g, Groups *out) {
+    const int64_t s = b->length;
+    Rows r = {0};
+    int64_t number = 0, *at = NULL, *low = NULL, *high = NULL;
+    size_t size = (m + 1) * sizeof(int64_t);
+    int good = reserve_rows(&r, s) && enlarge(&at, size) && enlarge(&low, size) && enlarge(&high, size);
+    for (int64_t i = 0, end; i < m && good; i = end) {
+        for (end = i + 1; end < m && waveform[end] == waveform[i];) end++;
+        const float level = (float)(RUN_LEVEL * SMOOTH_GAIN) * b->std[waveform[i]];
+        read_signal(b, waveform[i], r.signal);
+        smooth_121(s, r.signal, r.smoothed);
+        find_extents(s, r.smoothed, level, end - i, time + i, g->tail ? g->tail + i : NULL, at + i, low + i, high + i);
+        number = group_waveform(g, s, waveform[i], i, end, at, low, high, out, number);
+    }
+    free_rows(&r);
+    free(at); free(low); free(high);
+    return good ? number : -1;
+}

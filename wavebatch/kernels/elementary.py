@@ -1,0 +1,62 @@
+"""Exponentials, logarithms and small systems of equations that give the same bits on every processor.
+
+NumPy's own use what the processor has (AVX2, AVX-512, the BLAS that fits it), and their last bits differ. Whatever
+decides results uses these, and sums of products by `np.einsum`, which is the same everywhere, in place of `@`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+
+from wavebatch.kernels.library import call
+
+
+def exp(x: np.ndarray | float) -> np.ndarray:
+    """e^x of the shape and the type of x, error 2e-16 of the value (of float32: rounded from that)."""
+    return _apply("exponentials", x)
+
+
+def log(x: np.ndarray | float) -> np.ndarray:
+    """Natural logarithm of the shape and the type of x; -inf at 0, NaN below."""
+    return _apply("logarithms", x)
+
+
+def log1p(x: np.ndarray | float) -> np.ndarray:
+    """ln(1 + x), exact for small x too: rounding of 1 + x is made good by the factor x / ((1 + x) - 1)."""
+    one = 1.0 + np.asarray(x, np.float64)
+    rounded = one - 1.0
+    exact = rounded == 0
+    found = np.where(exact, x, log(one) * np.where(exact, 1.0, x) / np.where(exact, 1.0, rounded))
+    return found.astype(_kind(x), copy=False)
+
+
+def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution of a symmetric positive definite system.
+
+    Parameters
+    ----------
+    matrix : float (p, p)
+    right : float (p,) or (p, q)
+
+    Returns
+    -------
+    float64
+        Of the shape of `right`; an unknown that the equations do not determine is 0.
+    """
+    lower = np.array(matrix, np.float64, order="C")
+    columns = np.array(np.asarray(right, np.float64).T, order="C")
+    call("solve_equations", ctypes.c_int64(len(lower)), ctypes.c_int64(columns.size // len(lower)), lower, columns)
+    return columns.T
+
+
+def _kind(x: np.ndarray | float) -> type:
+    return np.float32 if getattr(x, "dtype", None) == np.float32 else np.float64
+
+
+def _apply(name: str, x: np.ndarray | float) -> np.ndarray:
+    values = np.ascontiguousarray(x, np.float64)
+    out = np.empty_like(values)
+    call(name, ctypes.c_int64(values.size), values, out)
+    return out.reshape(np.shape(x)).astype(_kind(x), copy=False)[()]

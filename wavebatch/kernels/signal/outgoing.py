@@ -1,0 +1,167 @@
+"""Energy, height and place of outgoing pulses, each with its error; called when pulses are imported.
+
+Outgoing pulses are recorded with few samples: the level is known better from all shots than from one, so each shot's
+level is drawn to that of all as far as levels do not differ by more than their noise.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.kernels.elementary import exp, log
+
+QUIET = 3.5
+"""Widths before the peak up to which samples show the level; what comes behind it may hold after-pulses."""
+
+BEFORE, AFTER = 4.0, 6.0
+"""Widths before and after the peak that the energy is summed over: tails are longer than fronts."""
+
+MOST_LAGS = 4
+"""Lags of the noise's correlation that count: receivers are quicker."""
+
+LEAST_HEIGHT = 8.0
+"""Noise above which a recording shows a pulse."""
+
+PEAK_ERROR = 1.1
+"""Error of the height of a parabola through three samples, in noise of one: from simulated Gaussians of 1.5 to 3
+samples, 1.0 to 1.15."""
+
+
+class Reference(NamedTuple):
+    """What all outgoing pulses of a channel have in common."""
+
+    width: float
+    """Gaussian standard deviation [samples]."""
+    noise: float
+    """Standard deviation of a sample [count]."""
+    gain: float
+    """Variance of a mean of samples over that of white noise, for correlated noise."""
+    level: float
+    """Mean level without light [count]."""
+    spread: float
+    """Standard deviation of true levels between shots [count]."""
+
+
+class OutgoingPulses(NamedTuple):
+    """Measures of n outgoing pulses; NaN where a recording shows none."""
+
+    energy: np.ndarray
+    """Sum above the level, f8 (n,) [count samples]."""
+    amplitude: np.ndarray
+    """Height of the peak above the level, f8 (n,) [count]."""
+    time: np.ndarray
+    """Place of the peak, f8 (n,) [samples]."""
+    level: np.ndarray
+    """f8 (n,) [count]."""
+    energy_error: np.ndarray
+    """Standard deviation, f8 (n,)."""
+    amplitude_error: np.ndarray
+    """Standard deviation, f8 (n,)."""
+
+
+def find_reference(samples: np.ndarray) -> Reference | None:
+    """Return what outgoing pulses have in common.
+
+    Parameters
+    ----------
+    samples : unsigned integers (n, s), count
+        Recordings of one channel and length, spread over the strip.
+
+    Returns
+    -------
+    Reference or None
+        None where most of them show no pulse.
+    """
+    values = samples.astype(np.float32)
+    least = np.min(values, axis=1)
+    peak = np.argmax(values, axis=1)
+    height = values[np.arange(len(values)), peak] - least
+    # Half width at half height, from where samples cross it; it only has to tell quiet samples from others.
+    above = (values - least[:, None]) > 0.5 * height[:, None]
+    width = max(float(np.median(above.sum(axis=1))) / 2.3548, 0.5)
+    quiet = np.arange(values.shape[1]) < (peak - QUIET * width)[:, None]
+    number = quiet.sum(axis=1)
+    used = number >= 3
+    if not used.any():
+        level = float(np.median(least))
+        return Reference(width, 1.0, 1.0, level, 0.0) if np.median(height) > LEAST_HEIGHT else None
+    means = np.where(quiet, values, 0).sum(axis=1)[used] / number[used]
+    rest = np.where(quiet[used], values[used] - means[:, None], 0)
+    freedom = float((number[used] - 1).sum())
+    noise = max(float(np.sqrt((rest**2).sum() / freedom)), QUANTISATION_STD)
+    level = float(np.median(means))
+    # Against the level of all: against its own, the correlation of a few samples is always negative.
+    away = np.where(quiet[used], values[used] - level, 0)
+    gain = 1 + 2 * sum(_correlation(away, quiet[used], lag) for lag in range(1, MOST_LAGS + 1))
+    gain = float(np.clip(gain, 1.0, 1 + 2 * MOST_LAGS))
+    within = noise**2 * gain / float(np.median(number[used]))
+    total = float(MAD_TO_STD * np.median(np.abs(means - level))) ** 2
+    spread = float(np.sqrt(max(total - within, 0.0)))
+    return Reference(width, noise, gain, level, spread) if np.median(height) > LEAST_HEIGHT * noise else None
+
+
+def _correlation(away: np.ndarray, quiet: np.ndarray, lag: int) -> float:
+    """Correlation of quiet samples this far apart; 0 where they are too few."""
+    both = quiet[:, lag:] & quiet[:, :-lag]
+    if np.count_nonzero(both) < 100:
+        return 0.0
+    product = np.where(both, away[:, lag:] * away[:, :-lag], 0).sum() / both.sum()
+    return max(float(product * quiet.sum() / max((away**2).sum(), 1e-12)), 0.0)
+
+
+def measure_outgoing(samples: np.ndarray, reference: Reference) -> OutgoingPulses:
+    """Measure outgoing pulses.
+
+    Parameters
+    ----------
+    samples : unsigned integers (n, s), count
+        Recordings of one length.
+    reference : Reference
+
+    Returns
+    -------
+    OutgoingPulses
+
+    Notes
+    -----
+    The height is that of a parabola through the logarithms of the three largest samples, which is exact for a
+    Gaussian. The energy is the sum from BEFORE widths before the peak to AFTER widths behind it; samples at the ends
+    count in part, so that the sum does not depend on where the peak lies between two samples.
+    """
+    values = samples.astype(np.float32)
+    n, s = values.shape
+    rows, place = np.arange(n), np.arange(s, dtype=np.float32)
+    peak = np.clip(np.argmax(values, axis=1), 1, max(s - 2, 1)) if s > 2 else np.zeros(n, int)
+    level, variance = _find_levels(values, peak, reference)
+    values -= level.astype(np.float32)[:, None]
+    three = np.stack([values[rows, np.clip(peak + step, 0, s - 1)] for step in (-1, 0, 1)]).astype(np.float64)
+    low, top, high = log(np.maximum(three, 0.5 * reference.noise))
+    bend = low + high - 2 * top
+    shift = np.where(bend < 0, 0.5 * (low - high) / np.minimum(bend, -1e-9), 0.0)
+    shift = np.clip(shift, -1.0, 1.0)
+    amplitude = exp(top - 0.25 * (low - high) * shift)
+    time = peak + shift
+    lag = place - time.astype(np.float32)[:, None]
+    weight = np.clip(lag + np.float32(BEFORE * reference.width + 0.5), 0, 1)
+    weight *= np.clip(np.float32(AFTER * reference.width + 0.5) - lag, 0, 1)
+    energy = (values * weight).sum(axis=1, dtype=np.float64)
+    total = weight.sum(axis=1, dtype=np.float64)
+    squares = (weight * weight).sum(axis=1, dtype=np.float64)
+    energy_error = np.sqrt(reference.noise**2 * reference.gain * squares + variance * total**2)
+    amplitude_error = np.sqrt((PEAK_ERROR * reference.noise) ** 2 + variance)
+    seen = (amplitude > LEAST_HEIGHT * reference.noise) & (energy > 0)
+    measures = (energy, amplitude, time, level, energy_error, amplitude_error)
+    return OutgoingPulses(*(np.where(seen, measure, np.nan) for measure in measures))
+
+
+def _find_levels(values: np.ndarray, peak: np.ndarray, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+    """Level of each shot and its variance: its quiet samples, drawn to the level of all shots."""
+    quiet = np.arange(values.shape[1]) < (peak - QUIET * reference.width)[:, None]
+    number = quiet.sum(axis=1)
+    mean = np.where(quiet, values, 0).sum(axis=1, dtype=np.float64) / np.maximum(number, 1)
+    within = reference.noise**2 * reference.gain / np.maximum(number, 1)
+    share = np.where(number > 0, reference.spread**2 / (reference.spread**2 + within), 0.0)
+    return reference.level + share * (mean - reference.level), np.where(number > 0, share * within, reference.spread**2)

@@ -1,0 +1,104 @@
+"""What identifies a sensor's setting beyond its header: the rate of its pulses, the light of its strongest echoes.
+
+`targets` measures it for CAL.toml and `strip_match` for each strip: another pulse rate or gain under the same header
+makes another sensor of it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.waveforms import WaveformBlock
+from wavebatch.files.disk.raw_bytes import widen
+from wavebatch.files.pulse_energy import PulseEnergy
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.kernels.physics.pulse_energies import judge_energies
+from wavebatch.kernels.physics.radiometry import transmit
+from wavebatch.surveying.sensor import SensorSource
+
+SAMPLE = 2048
+"""Waveforms whose light is summed."""
+
+BRIGHT = 0.95
+"""Quantile of the light of waveforms: above it lie few metal roofs and signs."""
+
+ENERGIES = 4096
+"""Neighbouring pulses whose light is compared with their energies."""
+
+SLICES, SLICE_POINTS = 8, 2048
+"""Places of the strip at which GPS times are read, and points at each."""
+
+LEAST_IN_ORDER = 0.8
+"""Share of neighbouring points whose times must not fall: points in another order show no pulse rate."""
+
+
+class Setting(NamedTuple):
+    """A strip's setting by its data."""
+
+    rate: float | None
+    """Pulses per second; None where the times do not show it."""
+    brightest: dict[int, float]
+    """R^2 / eta times the sum of the samples of the strongest waveforms of each digitizer [DN m2]: slopes do not change
+    it."""
+
+
+def measure_setting(reader: StripReader, scan: StripScan, sensor: SensorSource, attenuation: float) -> Setting:
+    """Measure the setting of a strip; attenuation: of the air, one way [dB/km]."""
+    light: dict[int, list[np.ndarray]] = {}
+    for block in reader.sample_blocks(scan, SAMPLE):
+        block = sensor.fill(block)
+        if block.sensor is None:
+            continue
+        above = _take_off_level(block)
+        time = block.spacing * np.nanargmax(above, axis=1)
+        away = block.origin + block.direction * time[:, None] - block.sensor
+        distance = np.sqrt((away * away).sum(axis=1))
+        whole = np.nansum(above, axis=1) * distance**2 / transmit(distance, attenuation)
+        light.setdefault(block.digitizer.index, []).append(whole)
+    joined = {index: np.concatenate(parts) for index, parts in light.items()}
+    known = {index: rows[np.isfinite(rows)] for index, rows in joined.items()}
+    brightest = {index: float(np.quantile(rows, BRIGHT)) for index, rows in known.items() if len(rows)}
+    return Setting(_measure_rate(reader), brightest)
+
+
+def check_energies(reader: StripReader, scan: StripScan, energy: PulseEnergy) -> None:
+    """Raise InputError where the light of neighbouring pulses in the middle of a strip contradicts their energies."""
+    if not reader.unit_count():
+        return
+    unit = reader.read_unit(reader.unit_count() // 2, scan)
+    rows = np.flatnonzero(unit.packets.owned)[:ENERGIES]
+    blocks = [energy.fill(block, unit) for block, _ in reader.read_rows(unit, rows, ENERGIES)]
+    if not blocks:
+        return
+    light = np.concatenate([np.nansum(_take_off_level(block), axis=1) for block in blocks])
+    order = np.argsort(np.concatenate([block.gps_time for block in blocks]), kind="stable")
+    doubt = judge_energies(light[order], np.concatenate([block.pulse_energy for block in blocks])[order])
+    if doubt:
+        raise InputError(
+            f"{reader.facts.path}: --energy {energy.source} contradicts the strip: {doubt}; check its times, or "
+            "leave it out"
+        )
+
+
+def _take_off_level(block: WaveformBlock) -> np.ndarray:
+    """Samples f4 (n, s) over the median of their waveform; NaN where they are missing."""
+    samples = block.samples.astype(np.float32)
+    if block.missing is not None:
+        samples[block.missing] = np.nan
+    return samples - np.nanmedian(samples, axis=1)[:, None]
+
+
+def _measure_rate(reader: StripReader) -> float | None:
+    """Pulses per second by the shortest usual distance of GPS times: pulses without a point leave longer ones."""
+    count, rates = reader.facts.header.point_count, []
+    for start in np.unique(np.linspace(0, max(count - SLICE_POINTS, 0), SLICES).astype(np.int64)).tolist():
+        step = np.diff(widen(reader.read_points(start, min(start + SLICE_POINTS, count))["gps_time"]))
+        later = step[np.isfinite(step) & (step > 0)]
+        if not len(later) or np.mean(step >= 0) < LEAST_IN_ORDER:
+            continue
+        shortest = np.quantile(later, 0.1)
+        rates.append(1.0 / float(np.mean(later[later < 1.3 * shortest + 1e-9])))
+    return float(np.median(rates)) if rates else None

@@ -1,0 +1,138 @@
+"""What differs between a calibration and a strip of its sensor, and what that adds to the error of the constant.
+
+`strip_match` asks about day, distance, air, software, rate of the pulses, noise, light and divergence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from datetime import date
+
+import numpy as np
+
+from wavebatch.core.waveforms import SystemPulse
+from wavebatch.files.las.header import decode_text
+from wavebatch.files.strip.reader import StripReader, StripScan
+from wavebatch.stages.attribute.light import AIR_DOUBT
+from wavebatch.surveying.calibrating.setting import measure_setting
+from wavebatch.surveying.calibrating.strip_echoes import read_day, read_sensor_name
+from wavebatch.surveying.calibration import Calibration
+from wavebatch.surveying.sensor import SensorSource
+
+SAME_DIVERGENCE = 0.03
+"""Relative difference up to which divergences are equal."""
+
+OTHER_DAY, OTHER_MONTH = 0.02, 0.05
+"""Errors for strips of another day than the calibration, and for more than 30 days: lasers and receivers drift. These
+are assumptions; `wavebatch calibrate` of several strips measures the drift of a flight."""
+
+LEAST_AIR = 0.005
+"""Relative change of the light from which other air on the same day is named."""
+
+FAR = 1.3
+"""Ratio of distances from which the strip's and the targets' are named."""
+
+SAME_RATE = 1.02
+"""Ratio up to which pulse rates are equal."""
+
+OTHER_NOISE, OTHER_LIGHT = 1.3, 1.7
+"""Ratios of noise and of the light of the strongest echoes from which another gain is suspected: sunlight changes the
+one, other surfaces the other."""
+
+
+def doubt_calibration(calibration: Calibration) -> Iterator[str]:
+    """Yield what makes a calibration doubtful for any strip."""
+    if not any(row.is_described for row in calibration.channels):
+        yield (
+            "calibration: the file does not say which sensor it was measured with (an earlier version wrote it), so "
+            "that nothing shows whether it fits this strip; measure it again with `wavebatch calibrate`"
+        )
+    if not min(row.relative_error for row in (calibration, *calibration.channels)):
+        yield (
+            "calibration: its relative_error is 0, but no constant is known exactly: put the error of the targets into "
+            "the file"
+        )
+
+
+def find_growth(calibration: Calibration, reader: StripReader, sensor: SensorSource) -> tuple[float, list[str]]:
+    """Error that day, distance and sensor add to the constant, relative, and the warnings."""
+    parts, lines = [], []
+    day = read_day(reader)
+    if day and calibration.flight and day != calibration.flight:
+        apart = abs((date.fromisoformat(day) - date.fromisoformat(calibration.flight)).days)
+        parts.append(OTHER_MONTH if apart > 30 else OTHER_DAY)
+        lines.append(
+            f"calibration: measured on {calibration.flight}, this strip was flown on {day}: the error of the constant "
+            f"grows by {100 * parts[-1]:.0f} %"
+        )
+    if calibration.distance and sensor.distance:
+        slope = 2.0e-4 * math.log(10.0) * AIR_DOUBT * calibration.attenuation
+        parts.append(slope * abs(sensor.distance - calibration.distance))
+        ratio = sensor.distance / calibration.distance
+        if max(ratio, 1 / ratio) > FAR:
+            lines.append(
+                f"calibration: measured at {calibration.distance:.0f} m, this strip is {sensor.distance:.0f} m away: "
+                f"the air between adds {100 * parts[-1]:.1f} % to the error of the constant"
+            )
+    name = read_sensor_name(reader.facts)
+    if calibration.sensor and name and name != calibration.sensor:
+        lines.append(
+            f"calibration: measured with sensor {calibration.sensor!r}, the header of this strip names {name!r}; "
+            "bits, spacing, gain and pulse agree"
+        )
+    software = decode_text(reader.facts.header.generating_software).strip()
+    if calibration.software and software and software != calibration.software:
+        lines.append(f"calibration: measured on a file of {calibration.software!r}, this one is of {software!r}")
+    return float(np.sqrt(np.sum(np.square(parts)))), lines
+
+
+def compare_setting(
+    calibration: Calibration, reader: StripReader, scan: StripScan, system: SystemPulse, sensor: SensorSource
+) -> tuple[float, list[str]]:
+    """Error that another pulse rate or gain adds to the constant, relative, and the warnings."""
+    found, growth, lines = measure_setting(reader, scan, sensor, calibration.attenuation), 0.0, []
+
+    def compare(value: float | None, known: float | None, most: float, share: float, line: str) -> None:
+        nonlocal growth
+        off = abs(math.log(value / known)) if value and known else 0.0
+        if off > math.log(most):
+            growth = max(growth, share * off)
+            lines.append(f"calibration: {line} {value:.4g}, where the calibration has {known:.4g}")
+
+    compare(found.rate, calibration.rate, SAME_RATE, 1.0, "another rate of pulses [1/s], so another energy:")
+    for row in calibration.channels:
+        noise, which = system.digitizers.get(row.digitizer, system).noise_std, f"of digitizer {row.digitizer}"
+        compare(noise, row.noise_dn, OTHER_NOISE, 1.0, f"another gain, or other sunlight: noise {which} is [DN]")
+        # Other surfaces explain it as well as another gain: half of the square of what a gain would be.
+        light = found.brightest.get(row.digitizer)
+        compare(light, row.brightest, OTHER_LIGHT, 0.5**0.5, f"another gain, or other surfaces: light {which} is")
+    return growth, [f"{line}: the error of the constant grows by {100 * growth:.0f} %" for line in lines]
+
+
+def compare_air(
+    calibration: Calibration, reader: StripReader, sensor: SensorSource, attenuation: float | None, warnings: list[str]
+) -> float:
+    """Relative error of a strip of the calibration's day that is given other air than the calibration had."""
+    day = read_day(reader)
+    if attenuation is None or not sensor.distance or (day and calibration.flight and day != calibration.flight):
+        return 0.0
+    off = 2.0e-4 * math.log(10.0) * sensor.distance * (attenuation - calibration.attenuation)
+    if abs(off) < LEAST_AIR:
+        return 0.0
+    warnings.append(
+        f"calibration: --attenuation {attenuation:g} dB/km contradicts the {calibration.attenuation:g} dB/km with "
+        f"which the constant was measured on the same day: light changes by {100 * math.expm1(off):+.0f} %, which is "
+        "in the error; give `wavebatch calibrate` the same --attenuation"
+    )
+    return abs(off)
+
+
+def compare_divergence(calibration: Calibration, system: SystemPulse) -> Iterator[str]:
+    """Yield the sentence about a divergence that is not that of the calibration."""
+    own, other = system.divergence, calibration.divergence
+    if own is not None and other is not None and abs(own / other - 1.0) > SAME_DIVERGENCE:
+        yield (
+            f"calibration: measured with a divergence of {other:g} mrad, the survey has {own:g} mrad, which is used: "
+            f"one of the two makes cross sections {100 * abs((own / other) ** 2 - 1):.0f} % wrong"
+        )

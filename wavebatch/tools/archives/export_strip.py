@@ -1,0 +1,213 @@
+"""A strip for other programs: LAS with its packets repaired, or its waveforms as arrays, for `wavebatch export`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wavebatch import __version__
+from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.disk.fingerprint import take_fingerprint
+from wavebatch.files.disk.npz import NpzWriter
+from wavebatch.files.las.extra_bytes import EXTRA_BYTES_RECORD_ID
+from wavebatch.files.las.header import STANDARD_TIME, Vlr, decode_text, has_record, is_projection
+from wavebatch.files.strip.header_check import audit_header
+from wavebatch.files.strip.packet_vectors import VECTORS, read_toward
+from wavebatch.files.strip.reader import StripReader, StripScan, Unit
+from wavebatch.files.strip.writer import FullwaveWriter
+
+SUFFIXES = (".las", ".laz", ".npz")
+USER_ID = b"wavebatch_export"
+"""User id of the record that says what was repaired."""
+MOST_DESCRIPTORS = 255
+_BLOCK = 4096
+_WAVES = ("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location", *VECTORS)
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSummary:
+    """What was exported."""
+
+    strip: str
+    output: str
+    points: int
+    waveforms: int
+    repaired: tuple[str, ...]
+    """What was wrong with the strip, and is not any more."""
+
+
+def export_strip(
+    path: Path, target: Path, *, direction: str = "auto", headerless: bool = False, overwrite: bool = False,
+    progress: Callable[[int], Any] = lambda waveforms: None,
+) -> ExportSummary:  # fmt: skip
+    """Export a strip.
+
+    Parameters
+    ----------
+    path : Path
+        LAS or LAZ file with waveforms.
+    target : Path
+        .las or .laz: the strip with its packets repaired, in a .wdp beside it; .npz: its waveforms as arrays.
+    direction : str
+        Where packet vectors point: auto, toward or away.
+    headerless : bool
+        Accept a .wdp without its 60-byte header.
+    overwrite : bool
+        Replace an existing file.
+    progress : callable
+        Called with numbers of waveforms.
+
+    Returns
+    -------
+    ExportSummary
+
+    Raises
+    ------
+    InputError
+        Where the strip cannot be read or the output cannot be written.
+    """
+    write = _write_arrays if target.suffix.lower() == ".npz" else _write_strip
+    with StripReader(path, direction=direction, headerless=headerless) as reader, reader.scan() as scan:
+        repaired = tuple(_list_repairs(reader, scan))
+        waveforms = write(reader, scan, target, repaired, overwrite, progress)
+    return ExportSummary(str(path), str(target), scan.points, waveforms, repaired)
+
+
+def _list_repairs(reader: StripReader, scan: StripScan) -> Iterator[str]:
+    facts = reader.facts
+    if facts.compressed & set(scan.by_descriptor):
+        yield "packets were compressed"
+    if scan.vectors.form == "range":
+        yield "packet vectors were whole paths; they are metres per picosecond"
+    elif scan.vectors.direction == "away":
+        yield "packet vectors pointed away from the sensor; they point toward it"
+    if scan.broken:
+        yield f"{scan.broken} points had packets that cannot be used; they have none"
+    if scan.short:
+        yield f"{scan.short} points had packets shorter than their descriptor; they have descriptors of their length"
+    yield from (*scan.notes, *facts.warnings)
+    yield from audit_header(reader, scan)
+
+
+def _write_arrays(
+    reader: StripReader, scan: StripScan, target: Path, repaired: tuple[str, ...], overwrite: bool,
+    progress: Callable[[int], Any],
+) -> int:  # fmt: skip
+    """All waveforms of a strip as one .npz; their samples stand behind each other."""
+    columns = {
+        "point": "<i8", "gps_time": "<f8", "origin": np.dtype(("<f8", (3,))), "direction": np.dtype(("<f8", (3,))),
+        "digitizer": "u1", "spacing": "<f8", "first": "<i8", "count": "<i4", "samples": "<u4", "missing": "?",
+        "return_waveform": "<i8", "return_point": "<i8", "return_time": "<f8",
+        "return_xyz": np.dtype(("<f8", (3,))),
+    }  # fmt: skip
+    if all(reader.facts.digitizers[index].width <= 2 for index in scan.by_descriptor):
+        columns["samples"] = "<u2"
+    done, at = 0, 0
+    writer = NpzWriter(target, columns, overwrite=overwrite)
+    try:
+        for block in reader.all_blocks(scan, _BLOCK):
+            n, s = block.samples.shape
+            missing = np.zeros((n, s), bool) if block.missing is None else block.missing
+            writer.add({
+                "point": block.point, "gps_time": block.gps_time, "origin": block.origin, "direction": block.direction,
+                "digitizer": np.full(n, block.digitizer.index), "spacing": np.full(n, block.spacing),
+                "first": at + s * np.arange(n), "count": np.full(n, s), "samples": block.samples.reshape(-1),
+                "missing": missing.reshape(-1), "return_waveform": done + block.returns.waveform,
+                "return_point": block.returns.point, "return_time": block.returns.time,
+                "return_xyz": block.returns.xyz,
+            })  # fmt: skip
+            done, at = done + n, at + n * s
+            progress(n)
+        account = _describe(reader, repaired)
+        writer.publish({"crs": reader.facts.crs or "", "meta": json.dumps(account, sort_keys=True)})
+    finally:
+        writer.discard()
+    return done
+
+
+def _describe(reader: StripReader, repaired: tuple[str, ...]) -> dict[str, Any]:
+    facts = reader.facts
+    source = {"file": facts.path.name, **take_fingerprint(facts.path, facts.packets.file)}
+    return {"export": source, "repaired": list(repaired), "version": __version__}
+
+
+def _write_strip(
+    reader: StripReader, scan: StripScan, target: Path, repaired: tuple[str, ...], overwrite: bool,
+    progress: Callable[[int], Any],
+) -> int:  # fmt: skip
+    """The strip with plain packets, one descriptor per kind and length, and vectors toward the sensor."""
+    digitizers, done = _list_digitizers(reader, scan), 0
+    with _open_writer(reader, target, list(digitizers.values()), _describe(reader, repaired), overwrite) as writer:
+        for unit in reader.read_units(scan):
+            offset, size, index = (np.zeros(len(unit.packets), kind) for kind in (np.uint64, np.uint32, np.uint8))
+            # Packets that points of several units share are written in each of them.
+            rows = np.unique(unit.packet_of_point[unit.packet_of_point >= 0])
+            for samples, stored, chosen in reader.read_counts(unit, rows, _BLOCK):
+                digitizer = digitizers[_name(stored, samples.shape[1])]
+                offset[chosen] = writer.write_packets(samples, digitizer.index)
+                size[chosen], index[chosen] = samples.shape[1] * digitizer.width, digitizer.index
+                done += len(chosen)
+                progress(len(chosen))
+            writer.write_points(_build_points(unit, writer.dtype, index, offset, size))
+        writer.commit()
+    return done
+
+
+def _name(stored: Digitizer, length: int) -> tuple[int, int, bool]:
+    return stored.index, length, stored.inverted
+
+
+def _list_digitizers(reader: StripReader, scan: StripScan) -> dict[tuple[int, int, bool], Digitizer]:
+    """A descriptor for each kind and length of packets; those of too many lengths keep their own length."""
+    found: dict[tuple[int, int, bool], Digitizer] = {}
+    for unit in reader.read_units(scan):
+        table = unit.packets
+        kinds = np.stack([table.digitizer, table.n_samples, table.packed], axis=1) if len(table) else np.empty((0, 3))
+        for index, length, packed in np.unique(kinds, axis=0).astype(int).tolist():
+            stored = reader.facts.digitizers[index]
+            form = unit.forms.get(index)
+            here = replace(stored, bits=8 * stored.width) if form is None else form.digitizer(stored, bool(packed))
+            found[_name(here, length)] = replace(here, bits=8 * here.width, n_samples=length)
+    names = sorted(found)
+    if len(names) <= MOST_DESCRIPTORS:
+        return {name: replace(found[name], index=number) for number, name in enumerate(names, 1)}
+    return {name: replace(found[name], n_samples=reader.facts.digitizers[name[0]].n_samples) for name in names}
+
+
+def _open_writer(
+    reader: StripReader, target: Path, digitizers: list[Digitizer], account: dict[str, Any], overwrite: bool
+) -> FullwaveWriter:
+    facts, header = reader.facts, reader.facts.header
+    dropped = [("LASF_Spec", number) for number in (*range(100, 355), EXTRA_BYTES_RECORD_ID)]
+    records = [vlr for vlr in header.vlrs if not any(has_record([vlr], *one) for one in dropped)]
+    records.append(Vlr(USER_ID, 1, json.dumps(account, sort_keys=True).encode(), b"what was exported and repaired"))
+    return FullwaveWriter(
+        target, version="{}.{}".format(*header.version), point_format=header.point_format, internal=False,
+        digitizers=list({one.index: one for one in digitizers}.values()), scales=header.scales, offsets=header.offsets,
+        wkt=None if any(map(is_projection, header.vlrs)) else facts.crs, extra_bytes=facts.records,
+        records=records, week=not header.global_encoding & STANDARD_TIME,
+        system=decode_text(header.system_identifier), source=header.file_source_id, overwrite=overwrite,
+    )  # fmt: skip
+
+
+def _build_points(
+    unit: Unit, dtype: np.dtype, index: np.ndarray, offset: np.ndarray, size: np.ndarray
+) -> np.ndarray:
+    """Points of a unit with the places of their new packets; those without a usable packet get none."""
+    points = np.ascontiguousarray(unit.points).view(dtype).copy()
+    has = np.flatnonzero(unit.packet_of_point >= 0)
+    row = unit.packet_of_point[has]
+    toward = read_toward(points[has], unit.vectors.direction, unit.vectors.form)
+    location = points["return_point_wave_location"][has]
+    for name in _WAVES:
+        points[name] = 0
+    points["wavepacket_index"][has], points["wavepacket_offset"][has] = index[row], offset[row]
+    points["wavepacket_size"][has], points["return_point_wave_location"][has] = size[row], location
+    for axis, name in enumerate(VECTORS):
+        points[name][has] = toward[:, axis]
+    return points

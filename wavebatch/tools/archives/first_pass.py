@@ -1,0 +1,202 @@
+"""The first pass over a PulseWaves file: lengths of segments, channels, and the outgoing pulses of a sample.
+
+`import_file` makes it before anything is written: a file that cannot be read to its end leaves no output behind.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from wavebatch.core.errors import InputError
+from wavebatch.core.units import MAD_TO_STD, QUANTISATION_STD
+from wavebatch.core.waveforms import Digitizer
+from wavebatch.files.pulsewaves.header import OUTGOING, RETURNING
+from wavebatch.files.pulsewaves.reader import Piece, PulseReader
+from wavebatch.kernels.signal.outgoing import Reference, find_reference, measure_outgoing
+from wavebatch.surveying.outgoing import STACKED, OutgoingShape, learn_shape
+from wavebatch.tools.archives.channels import Overlaps, code_segments, decode, find_partners, group_rows
+
+MOST_DESCRIPTORS = 250
+"""Wave packet descriptors that a strip gets: LAS has 255. With more lengths, lengths are rounded up."""
+SAMPLED = 2 * STACKED
+"""Pulses of the sample, about."""
+STANDARD_TIME = 1e9
+"""What GPS times in LAS lack: they are seconds since 1980 less this."""
+SECONDS_OF_WEEK = 604_800 * 2
+"""Largest time that can be one of a GPS week; flights over its end count on."""
+ONE_TIME = 64
+"""Pulses of one time from which that is no time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outgoing:
+    """What is known of the outgoing pulses of a file."""
+
+    kind: int
+    """Channel, bits and spacing as `code_segments` with length 0."""
+    reference: Reference
+    shape: OutgoingShape | None
+    energy: float
+    """Mean [count samples]."""
+    amplitude: float
+    """Mean [count]."""
+    scatter: float
+    """Standard deviation of energies from shot to shot beyond their errors, relative."""
+    error: float
+    """Mean error of an energy, relative."""
+    width_scatter: float
+    """The same of energy over amplitude: how much the width of pulses varies, relative."""
+    origin: float
+    """Mean time of their peaks on the clock of the pulses [samples]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """How the segments of a file become packets and points."""
+
+    primary: int
+    """The most sensitive channel: most segments are of it."""
+    top: float
+    """Largest count of it where another channel recorded the same [count]."""
+    ratios: dict[int, float]
+    """By other channel: gain of the primary one over its gain."""
+    unknown: tuple[int, ...]
+    """Other channels whose gain is not known: nothing tells that they see the same, so all of them is kept."""
+    noise: float
+    """Of a sample of the primary channel [count]."""
+    digitizers: dict[int, Digitizer]
+    """By code of segments."""
+    outgoing: Outgoing | None
+    one_time: bool
+    """All pulses have one and the same time."""
+    week: bool
+    """Times are seconds of the GPS week, not standard GPS time."""
+    time_offset: float
+    """Added to the scaled times [s]."""
+    dark: bool
+    """No pulse has an intensity."""
+
+    def lengths(self, code: int) -> int:
+        """Samples of a packet of this code, with padding."""
+        return self.digitizers[code].n_samples
+
+
+@dataclass(slots=True)
+class _Found:
+    codes: Counter[int] = field(default_factory=Counter)
+    outgoing: dict[int, list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
+    """By kind: samples, and start of the first one [samples]."""
+    steps: list[np.ndarray] = field(default_factory=list)
+    overlaps: dict[int, Overlaps] = field(default_factory=dict)
+    times: tuple[int, int] = (2**63 - 1, -(2**63))
+    intensity: int = 0
+    channels: Counter[int] = field(default_factory=Counter)
+
+
+def make_plan(reader: PulseReader) -> Plan:
+    """Read all pulses once; raises InputError for a file without any returning segment, or that ends too early."""
+    found, every = _Found(), max(1, reader.header.count // SAMPLED)
+    for piece in reader.pieces():
+        _add(found, piece, every)
+    if not found.codes:
+        raise InputError(f"{reader.header.path}: none of its {reader.header.count} pulses has a returning waveform")
+    primary = found.channels.most_common(1)[0][0]
+    overlap = found.overlaps.get(primary, Overlaps())
+    ratios, unknown = _find_ratios(found, primary)
+    steps = np.concatenate([np.zeros(1), *found.steps])
+    noise = max(float(np.median(steps)) * MAD_TO_STD / np.sqrt(2), QUANTISATION_STD)
+    header = reader.header
+    latest = max(abs(time * header.time_scale + header.time_offset) for time in found.times)
+    week = latest <= SECONDS_OF_WEEK
+    return Plan(
+        primary, overlap.top, ratios, unknown, noise, _list_digitizers(found.codes, ratios),
+        _learn_outgoing(found.outgoing), header.count >= ONE_TIME and found.times[0] == found.times[1], week,
+        header.time_offset - (0.0 if week else STANDARD_TIME), found.intensity == 0,
+    )  # fmt: skip
+
+
+def _add(found: _Found, piece: Piece, every: int) -> None:
+    segments, pulses = piece.segments, piece.pulses
+    returning = np.flatnonzero((segments.kind == RETURNING) & (segments.length > 0))
+    for code, count in zip(*np.unique(code_segments(segments, returning), return_counts=True), strict=True):
+        found.codes[int(code)] += int(count)
+        found.channels[decode(int(code))[0]] += int(count)
+    found.times = min(found.times[0], int(pulses["time"].min())), max(found.times[1], int(pulses["time"].max()))
+    found.intensity = max(found.intensity, int(pulses["intensity"].max()))
+    if len(found.channels) > 1:
+        primary = found.channels.most_common(1)[0][0]
+        pairs = found.overlaps.setdefault(primary, Overlaps())
+        pairs.add(piece, *find_partners(segments, primary, returning))
+    chosen = (piece.first + segments.pulse) % every == 0
+    sent = np.flatnonzero(chosen & (segments.kind == OUTGOING) & (segments.length > 2))
+    sent = sent[np.append(True, np.diff(segments.pulse[sent]) != 0)[: len(sent)]]
+    for (rows,) in group_rows(segments, sent):
+        start = (segments.start * segments.unit / segments.spacing)[rows]
+        found.outgoing.setdefault(int(code_segments(segments, rows[:1])[0]), []).append((piece.samples(rows), start))
+    for (rows,) in group_rows(segments, returning[chosen[returning] & (segments.length[returning] > 1)]):
+        found.steps.append(np.abs(np.diff(piece.samples(rows).astype(np.int64), axis=1)).mean(axis=1))
+
+
+def _find_ratios(found: _Found, primary: int) -> tuple[dict[int, float], tuple[int, ...]]:
+    """Ratios of gains; only that of sensors with two channels can be told from the overlaps."""
+    others = [channel for channel in found.channels if channel != primary]
+    ratio = found.overlaps[primary].find_ratio() if len(others) == 1 and primary in found.overlaps else None
+    if ratio is None or ratio <= 1:
+        return {}, tuple(others)
+    return {others[0]: ratio}, ()
+
+
+def _list_digitizers(codes: Counter[int], ratios: dict[int, float]) -> dict[int, Digitizer]:
+    """A descriptor per kind of segment; where they are too many, one for several lengths."""
+    step = 1
+    while True:
+        rounded = {code: _round_up(code, step) for code in codes}
+        if len(set(rounded.values())) <= MOST_DESCRIPTORS:
+            break
+        step *= 2
+    index = {code: number for number, code in enumerate(sorted(set(rounded.values())), 1)}
+    digitizers = {}
+    for code, wide in rounded.items():
+        channel, bits, spacing, length = decode(wide)
+        # Counts of a less sensitive channel are written on the scale of the sensitive one.
+        bits = 16 if channel in ratios and bits == 8 else 32 if channel in ratios else bits
+        digitizers[code] = Digitizer(index[wide], bits, length, spacing)
+    return digitizers
+
+
+def _round_up(code: int, step: int) -> int:
+    length = code & ((1 << 18) - 1)
+    return code - length + -(-length // step) * step
+
+
+def _learn_outgoing(samples: dict[int, list[tuple[np.ndarray, np.ndarray]]]) -> Outgoing | None:
+    """Shape and means of the commonest kind of outgoing pulses."""
+    if not samples:
+        return None
+    counts = {code: sum(len(start) for _, start in parts) for code, parts in samples.items()}
+    code = max(counts, key=lambda one: (counts[one], -one))
+    values, start = (np.concatenate(column) for column in zip(*samples[code], strict=True))
+    reference = find_reference(values)
+    if reference is None:
+        return None
+    pulses = measure_outgoing(values, reference)
+    good = np.isfinite(pulses.energy)
+    if np.count_nonzero(good) < 2:
+        return None
+    energy, amplitude = pulses.energy[good], pulses.amplitude[good]
+    error = float((pulses.energy_error[good] / energy).mean())
+    _, _, spacing, _ = decode(code)
+    return Outgoing(
+        code & ~((1 << 18) - 1), reference, learn_shape(values, spacing, reference), float(energy.mean()),
+        float(amplitude.mean()), _beyond(energy, error), error,
+        _beyond(energy / amplitude, float(np.hypot(error, (pulses.amplitude_error[good] / amplitude).mean()))),
+        float((start + pulses.time)[good].mean()),
+    )  # fmt: skip
+
+
+def _beyond(values: np.ndarray, error: float) -> float:
+    """Relative scatter of values beyond their relative error."""
+    return float(np.sqrt(max((values.std() / values.mean()) ** 2 - error**2, 0.0)))

@@ -1,0 +1,80 @@
+"""Coordinates of an imported strip: the CRS of its file, and longitude and latitude projected to UTM.
+
+Packets need metres in all three directions, so pulses in degrees are projected. Others stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from wavebatch.files.las.geo_keys import GeoKeys
+from wavebatch.files.las.geotiff_wkt import build_utm
+from wavebatch.files.las.header import GEOTIFF_ID, Vlr
+from wavebatch.files.pulsewaves.reader import Piece, PulseReader
+from wavebatch.tools.archives.utm import find_zone, project_utm
+
+SCALE = 0.001
+"""Largest unit of stored coordinates [m]: coarser ones would shift samples by as much."""
+ROUND = 1000.0
+"""Offsets of coordinates are multiples of this [m]."""
+
+_ZONES = {4326: 32600, 4979: 32600, 4258: 25800, 4269: 26900}
+"""EPSG code of zone 0 north by the code of the geographic CRS."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """How coordinates of a file become those of a strip."""
+
+    zone: int
+    """UTM zone; 0: coordinates stay as they are."""
+    south: bool
+    scales: tuple[float, float, float]
+    offsets: tuple[float, float, float]
+    wkt: str | None
+    records: tuple[Vlr, ...]
+    """GeoTIFF keys that still hold."""
+    notes: tuple[str, ...]
+
+    def place(self, piece: Piece) -> Piece:
+        """Return the piece with its pulses in the coordinates of the strip."""
+        if not self.zone:
+            return piece
+        target = piece.anchor + 1000 * piece.direction
+        anchor, target = (self._project(one) for one in (piece.anchor, target))
+        return replace(piece, anchor=anchor, direction=(target - anchor) / 1000)
+
+    def _project(self, xyz: np.ndarray) -> np.ndarray:
+        east, north = project_utm(xyz[:, 0], xyz[:, 1], self.zone, south=self.south)
+        return np.stack([east, north, xyz[:, 2]], axis=1)
+
+
+def find_frame(reader: PulseReader) -> Frame:
+    """Decide on the coordinates of a file from its GeoTIFF keys and its first pulse."""
+    header = reader.header
+    directory = next((vlr.payload for vlr in header.projection if vlr.record_id == GEOTIFF_ID), b"")
+    keys = GeoKeys.parse(directory)
+    first = next(iter(reader.pieces())).anchor[:1] if header.count else np.zeros((1, 3))
+    zero = _ZONES.get(keys.code or 4326)
+    if keys.kind == "geographic" and zero is not None:
+        zone, south = find_zone(float(first[0, 0])), bool(first[0, 1] < 0) and zero == 32600
+        code = zero + zone + (100 if south else 0)
+        note = f"coordinates are degrees; they are projected to UTM zone {zone}{'S' if south else 'N'} (EPSG:{code})"
+        frame = Frame(zone, south, (SCALE,) * 3, (0.0,) * 3, build_utm(code), (), (note,))
+        first = frame._project(first)
+    else:
+        code = keys.sure_code
+        scales = tuple(min(abs(float(scale)), SCALE) for scale in header.scales)
+        wkt, notes = (build_utm(code) if code else None), _note(keys)
+        frame = Frame(0, False, scales, (0.0,) * 3, wkt, header.projection, notes)
+    return replace(frame, offsets=tuple(float(value) for value in np.floor(first[0] / ROUND) * ROUND))
+
+
+def _note(keys: GeoKeys) -> tuple[str, ...]:
+    if keys.kind == "geocentric":
+        return ("coordinates are geocentric and stay so: project the strip before steps that need heights",)
+    if keys.kind == "geographic":
+        return ("coordinates are degrees of a datum that wavebatch does not project; packets need metres",)
+    return () if keys.keys else ("the file names no CRS",)

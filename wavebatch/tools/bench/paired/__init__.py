@@ -1,1 +1,0 @@
-"""`wavebatch bench --against`: this wavebatch and another one take turns on the same strips."""

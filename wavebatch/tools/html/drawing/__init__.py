@@ -1,1 +1,0 @@
-"""Pictures inside a page, without matplotlib: charts as SVG, maps as PNG, and the figures made of them."""
