@@ -24,13 +24,11 @@ from wavebatch.surveying.measuring.lone_echoes import find_strongest
 from wavebatch.surveying.measuring.noise_and_width import ENOUGH_TO_LEARN, FEW
 from wavebatch.surveying.measuring.residuals import subtract_echoes
 
-MISFIT_QUANTILE = 0.5
-"""Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target: in a canopy
-up to half of them do, and more of them would make the canopy the pulse's misfit."""
+MISFIT_QUANTILE = 0.8
+"""Share of the strong single echoes that the pulse's misfit explains; the others may hold a second target."""
 
-SCATTERED = 2.8
-"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest. Four
-fifths of the echoes miss it by twice as much as half of them, on real strips of three sensors."""
+SCATTERED = 1.4
+"""The strongest echoes miss the pulse by so much more than those at the quantile: receivers compress the highest."""
 
 NOISE_PROMISE = 8.0
 """Fall of chi2 that noise alone promises: the best of some twenty places, exceeded by a fifth of right fits."""
